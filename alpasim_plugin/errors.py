@@ -1,0 +1,78 @@
+"""Errors with four parts: doing what, with what, found what, do this.
+
+Every failure a user can meet is a `SimrunError`. The class decides the process exit code (DESIGN section 4) and the failure
+class written to ``rollouts.parquet``, so the printed text, the table and the exit code cannot disagree.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class SimrunError(Exception):
+    """Say what was attempted, with which object, what was found, and what the user can do.
+
+    Args:
+        doing: The attempted action, as a verb phrase ("reading a scenario").
+        with_what: The object of the action: file with line and column, option, renderer name.
+        found: What was actually met, with the offending value.
+        do_this: One action that would help.
+    """
+
+    exit_code: ClassVar[int] = 2
+    failure_class: ClassVar[str] = "input"
+
+    def __init__(self, doing: str, with_what: str, found: str, do_this: str) -> None:
+        super().__init__(doing, with_what, found, do_this)
+        self.doing, self.with_what, self.found, self.do_this = doing, with_what, found, do_this
+
+    def __str__(self) -> str:
+        return (
+            f"error: {self.doing}\n   with: {self.with_what}\n  found: {self.found}\n     do: {self.do_this}"
+        )
+
+    def as_dict(self) -> dict[str, str]:
+        """Return the four parts and the failure class, for ``--json`` and manifests."""
+        return {
+            "doing": self.doing,
+            "with": self.with_what,
+            "found": self.found,
+            "do": self.do_this,
+            "failure_class": self.failure_class,
+        }
+
+
+class InputError(SimrunError):
+    """Bad usage, configuration, file or scene content."""
+
+
+class InfrastructureError(SimrunError):
+    """The machine failed us: disk full, lost worker, unreachable server."""
+
+    exit_code: ClassVar[int] = 4
+    failure_class: ClassVar[str] = "infrastructure"
+
+
+class RendererError(InfrastructureError):
+    """A renderer could not produce a frame."""
+
+    failure_class: ClassVar[str] = "renderer"
+
+
+class FixerError(InfrastructureError):
+    """A fixer produced no usable frame and the raw frame could not be passed on."""
+
+    failure_class: ClassVar[str] = "fixer"
+
+
+class PolicyError(InfrastructureError):
+    """A policy raised, or answered something that breaks its contract."""
+
+    failure_class: ClassVar[str] = "policy"
+
+
+class EvaluatorError(SimrunError):
+    """An evaluator could not give a value where one is due."""
+
+    exit_code: ClassVar[int] = 5
+    failure_class: ClassVar[str] = "evaluator"

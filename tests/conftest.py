@@ -1,0 +1,35 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+
+
+def find_shared_data() -> Path | None:
+    """Return the folder of third-party data sets, or None where this machine has none.
+
+    ``SIMRUN_SHARED_DATA`` names it; otherwise ``../shared/data`` beside the checkout is tried.
+    """
+    named = os.environ.get("SIMRUN_SHARED_DATA")
+    folder = Path(named) if named else REPO.parent / "shared" / "data"
+    return folder if folder.is_dir() else None
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Give the data folder or skip: its files have licences that keep them out of this repository."""
+    folder = find_shared_data()
+    if folder is None:
+        pytest.skip("third-party data sets absent (set SIMRUN_SHARED_DATA to their folder)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def repo() -> Path:
+    """Give the repository root."""
+    return REPO
