@@ -1,0 +1,440 @@
+"""The only data that crosses from one stage to the next: frozen dataclasses with shapes, units and frames.
+
+Conventions (DESIGN section 7): time is integer microseconds; world is ENU metres in float64 around a local origin; rig is x forward,
+y left, z up with its origin on the ground under the rear axle; cameras are OpenCV (x right, y down, z forward); a matrix ``T_a_b`` maps
+coordinates in b to coordinates in a; quaternions are ``wxyz``; images are HWC uint8 sRGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+F64 = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
+I64 = npt.NDArray[np.int64]
+U8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
+
+Paint = Literal["none", "solid_white", "dashed_white", "solid_yellow", "dashed_yellow", "double_yellow", "unknown"]
+Aggregation = Literal["mean", "median", "max", "min", "last"]
+Direction = Literal["lower", "higher", "none"]
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of one body over time; the frame of the poses is said where a trajectory is used."""
+
+    t_us: I64  # (T,) int64 microseconds, strictly increasing
+    xyz: F64  # (T, 3) metres, world
+    quat: F64  # (T, 4) wxyz, unit, body to world
+
+    def __len__(self) -> int:
+        return int(self.t_us.shape[0])
+
+
+@dataclass(frozen=True)
+class Box:
+    """Full sizes of a cuboid in its own frame (x length, y width, z height)."""
+
+    length_m: float
+    width_m: float
+    height_m: float
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """The ego's body and chassis. The box centre lies at ``(rear_axle_to_centre_m, 0, box.height_m / 2)`` in the rig frame."""
+
+    box: Box = Box(4.855, 1.88, 1.6)
+    rear_axle_to_centre_m: float = 1.4
+    wheelbase_m: float = 2.85
+    max_steer_rad: float = 0.6
+    max_steer_rate_radps: float = 0.8
+    max_accel_mps2: float = 3.5
+    max_brake_mps2: float = 8.0
+
+
+@dataclass(frozen=True)
+class EgoState:
+    """True state of the ego at one instant."""
+
+    t_us: int
+    T_world_rig: F64  # (4, 4)
+    speed_mps: float  # along rig x; negative in reverse
+    accel_mps2: float = 0.0
+    yaw_rate_radps: float = 0.0
+    steer_rad: float = 0.0  # road-wheel angle, left positive
+
+
+# --- map ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One lane; edges are seen in driving direction."""
+
+    lane_id: str
+    centre: F64  # (N, 3) metres, world
+    left: F64 | None  # (L, 3) or None where the map has no edge
+    right: F64 | None  # (R, 3) or None
+    kind: str = "vehicle"  # vehicle | bike | bus | shoulder | parking
+    successors: tuple[str, ...] = ()
+    left_neighbour: str | None = None
+    right_neighbour: str | None = None
+    left_paint: Paint = "unknown"
+    right_paint: Paint = "unknown"
+    is_intersection: bool = False
+    speed_limit_mps: float | None = None
+
+
+@dataclass(frozen=True)
+class Marking:
+    """Paint that the map gives as a line of its own, not as a lane's edge."""
+
+    xyz: F64  # (N, 3) metres, world
+    paint: Paint
+
+
+@dataclass(frozen=True)
+class LaneMap:
+    """Vector map of one scene."""
+
+    lanes: Mapping[str, Lane]
+    road_edges: tuple[F64, ...] = ()  # each (N, 3): the border of the drivable surface
+    drivable_areas: tuple[F64, ...] = ()  # each (N, 3) ring
+    crosswalks: tuple[F64, ...] = ()  # each (N, 3) ring
+    stop_lines: tuple[F64, ...] = ()  # each (N, 3)
+    markings: tuple[Marking, ...] = ()
+    poles: tuple[F64, ...] = ()  # each (N, 3) polyline
+    signs: tuple[tuple[F64, Box], ...] = ()  # (T_world_sign (4, 4), size)
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where the ego should go: a polyline in the world, without time."""
+
+    xyz: F64  # (N, 3) metres, world
+    lane_ids: tuple[str, ...] = ()
+
+
+# --- actors ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """How an actor moves once the loop is closed."""
+
+    kind: Literal["replay", "idm"] = "replay"
+    params: Mapping[str, float] = field(default_factory=dict)  # idm: desired_speed_mps, headway_s, min_gap_m, accel_mps2, brake_mps2
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A road user or obstacle with its recorded or scripted track (pose of the box centre in the world)."""
+
+    actor_id: str
+    label: str  # car | truck | bus | pedestrian | cyclist | motorcycle | other
+    box: Box
+    track: Trajectory
+    is_static: bool = False
+    behaviour: Behaviour = Behaviour()
+
+
+# --- sensors --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FTheta:
+    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and radians."""
+
+    pixel_to_angle: tuple[float, ...]
+    angle_to_pixel: tuple[float, ...]
+    max_angle_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A camera on the rig. With ``ftheta`` set, ``K`` is the pinhole that is really rendered and ``ftheta`` the recorded lens."""
+
+    name: str
+    width: int
+    height: int
+    K: F64  # (3, 3) pixels
+    T_rig_camera: F64  # (4, 4)
+    shutter_us: int = 0
+    ftheta: FTheta | None = None
+
+
+@dataclass(frozen=True)
+class SensorSpec:
+    """What a policy asks for: a camera by name, every ``interval_us`` (0: the scenario's camera rate)."""
+
+    camera: str
+    interval_us: int = 0
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """One frame to render."""
+
+    t_us: int  # shutter end
+    camera: CameraSpec
+    T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
+    actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote, video)."""
+
+    t_us: int
+    camera: str
+    rgb: U8  # (H, W, 3) sRGB
+    alpha: F32 | None = None  # (H, W) accumulated opacity, 0..1
+    depth: F32 | None = None  # (H, W) metres along the optical axis, alpha-weighted mean; 0 where alpha is 0
+    events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
+
+
+# --- policy ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy may know at ``t_us``: frames, its own motion so far, and the route ahead."""
+
+    t_us: int
+    frames: Mapping[str, Frame]  # newest frame per camera it asked for
+    cameras: Mapping[str, CameraSpec]
+    ego: EgoState
+    history: Trajectory  # rig poses in the world up to t_us
+    route_rig: F64  # (20, 3) metres, rig frame now; rows of NaN where the route ends
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Future rig poses in the rig frame at ``t_us``; the first row is the pose at ``t_us`` itself."""
+
+    t_us: int
+    times_us: I64  # (T,) absolute, strictly increasing, times_us[0] == t_us
+    xy: F64  # (T, 2) metres
+    yaw: F64  # (T,) radians
+    samples: tuple[F64, ...] = ()  # alternatives, each (T, 3): x, y, yaw at times_us
+    debug: Mapping[str, Any] = field(default_factory=dict)
+
+
+# --- scene ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Integer periods; camera and policy periods are multiples of the control period."""
+
+    control_us: int = 100_000
+    camera_us: int = 100_000
+    policy_us: int = 100_000
+
+
+@dataclass(frozen=True)
+class HeightField:
+    """Ground height on a regular grid, bilinear in between, constant beyond its border."""
+
+    x0_m: float
+    y0_m: float
+    cell_m: float
+    z: F64  # (Ny, Nx) metres, world
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What is built around the road when a scene is dressed in Gaussians."""
+
+    buildings: float = 0.7  # share of free roadside frontage covered by facades, 0..1
+    building_height_m: tuple[float, float] = (6.0, 18.0)
+    trees_per_100m: float = 4.0  # per road side
+    poles_spacing_m: float = 30.0  # 0: none
+    sky: Literal["clear", "overcast", "dusk"] = "clear"
+    texture: float = 1.0  # contrast of ground and facade texture, 0..1
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """How the renderer ``3dgs`` differs from the scene as built. ``surrogate``: seeded stand-ins for a bad reconstruction."""
+
+    kind: Literal["surrogate", "none"] = "surrogate"
+    severity: float = 1.0  # scales all terms; 0 leaves the scene as built
+    onset_m: float = 0.3  # lateral distance from the logged path where the error starts to grow
+    full_m: float = 3.0  # lateral distance where it is full
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Delay from observation to the plan taking effect: none, a fixed time, or the measured one."""
+
+    kind: Literal["none", "fixed", "measured"] = "none"
+    fixed_us: int = 0
+
+
+@dataclass(frozen=True)
+class BackgroundFile:
+    """A Gaussian file used as background, placed by ``T_world_file``."""
+
+    path: str
+    T_world_file: F64  # (4, 4), may scale
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What evaluators may see of a scenario: the map and the human drive, never pixels."""
+
+    scene_id: str
+    lane_map: LaneMap
+    ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
+    vehicle: Vehicle
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A complete test case, the same type for every source."""
+
+    scene_id: str
+    source: str  # yaml | argoverse | commonroad | cosmos | usdz
+    seed: int  # scene seed: geometry, textures, scripted actors
+    lane_map: LaneMap
+    ground: HeightField
+    ego_log: Trajectory  # rig poses, world
+    vehicle: Vehicle
+    route: Route
+    actors: tuple[Actor, ...]
+    cameras: tuple[CameraSpec, ...]
+    rates: Rates
+    start_us: int  # first frame; the log before it is context
+    end_us: int
+    warmup_us: int  # the log is forced until start_us + warmup_us
+    latency: Latency
+    environment: Environment
+    degradation: Degradation
+    background: BackgroundFile | None = None
+    world_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what was subtracted from the source's coordinates, metres
+    content_hash: str = ""
+    notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
+
+    @property
+    def scene(self) -> Scene:
+        """Give the part that evaluators may see."""
+        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle)
+
+
+# --- log and scores -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LoggedPlan:
+    """A plan as it stands in a log: absolute poses."""
+
+    now_us: int
+    query_us: int
+    trajectory: Trajectory  # rig poses, world, the first at now_us
+    samples: tuple[Trajectory, ...] = ()
+
+
+@dataclass(frozen=True)
+class LoggedImage:
+    """An encoded camera image in a log."""
+
+    camera: str
+    start_us: int
+    end_us: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class RolloutLog:
+    """One rollout as evaluators see it, whoever wrote the log."""
+
+    scene_id: str
+    session_uuid: str
+    ego_box: Box
+    T_rig_box: F64  # (4, 4) pose of the box centre in the rig frame
+    ego: Trajectory  # box centre, world
+    actors: Mapping[str, Actor]  # ego excluded; track = logged poses of the box centre
+    plans: tuple[LoggedPlan, ...]
+    images: tuple[LoggedImage, ...]
+    ego_log: Trajectory  # recorded rig poses, world
+    start_us: int  # first recorded rig pose
+    render_start_us: int
+    force_gt_us: int
+    control_us: int
+    seed: int = 0
+    info: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MetricSeries:
+    """Values of one metric over a rollout; a value is never bare: it has validity and, where invalid, a reason."""
+
+    name: str
+    t_us: I64  # (T,)
+    value: F64  # (T,); NaN where invalid
+    valid: Bool  # (T,)
+    aggregation: Aggregation
+    unit: str  # "" for rates and flags
+    direction: Direction
+    reason: str = ""  # why values are invalid, if any is
+
+
+# --- the four seams -------------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """One rollout's renderer session."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render one frame."""
+        ...
+
+
+@runtime_checkable
+class Fixer(Protocol):
+    """Repairs frames causally: it sees the past and the current block only."""
+
+    def reset(self, seed: int) -> None:
+        """Forget all history."""
+        ...
+
+    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        """Return as many frames as came in, with the same times."""
+        ...
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Plans from observations."""
+
+    sensors: Sequence[SensorSpec]
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Start a new rollout."""
+        ...
+
+    def act(self, observation: Observation) -> Plan:
+        """Return the plan in the rig frame of the observation."""
+        ...
+
+
+@runtime_checkable
+class Evaluator(Protocol):
+    """Pure: a log in, series out."""
+
+    def __call__(self, rollout: RolloutLog, scene: Scene) -> Sequence[MetricSeries]:
+        """Score one rollout."""
+        ...

@@ -1,0 +1,1 @@
+"""Scenarios: one `Scenario` type from four kinds of source."""
