@@ -1,0 +1,1 @@
+"""The world a scene lives in: lanes, ground, route, roads and actors."""

@@ -1,0 +1,95 @@
+"""Ground height under the scene: a regular grid, bilinear in between, constant beyond its border."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import KDTree
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import F64, HeightField
+
+SLOPE_SPAN_M = 1.5  # half the length over which a pose's slope is taken: about half a wheelbase
+
+
+def flat(z: float = 0.0) -> HeightField:
+    """Return a level ground at height ``z`` metres."""
+    return HeightField(0.0, 0.0, 1.0, np.full((2, 2), float(z)))
+
+
+def from_points(points: F64, cell_m: float = 2.0) -> HeightField:
+    """Fit a height field to scattered ground points.
+
+    Points are averaged per cell (position and height, so a plane stays a plane), the averages are joined by a Delaunay triangulation
+    that is read at the grid nodes, and nodes outside the convex hull take the nearest average.
+
+    Args:
+        points: ``(N, 3)`` metres, world; order does not matter.
+        cell_m: Grid step in metres.
+
+    Raises:
+        InputError: There is no point, or a coordinate is not finite.
+    """
+    xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if len(xyz) == 0 or not np.isfinite(xyz).all() or cell_m <= 0:
+        bad = "no points" if len(xyz) == 0 else f"{int((~np.isfinite(xyz)).any(axis=1).sum())} points that are not finite"
+        with_what = f"{len(xyz)} points, cell {cell_m} m"
+        raise InputError("fitting a ground height field", with_what, bad, "give finite ground points and a cell > 0")
+    low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
+    nx, ny = (np.floor((xyz[:, :2].max(axis=0) - low) / cell_m).astype(np.int64) + 2).tolist()
+    means = _cell_means(xyz, low, cell_m, nx)
+    xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
+    nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)
+    z = _interpolate(means, nodes)
+    return HeightField(float(low[0]), float(low[1]), float(cell_m), z.reshape(ny, nx))
+
+
+def _cell_means(xyz: F64, low: F64, cell_m: float, nx: int) -> F64:
+    """Return the mean point ``(M, 3)`` of each occupied cell."""
+    ij = np.floor((xyz[:, :2] - low) / cell_m).astype(np.int64)
+    _, inverse, count = np.unique(ij[:, 1] * nx + ij[:, 0], return_inverse=True, return_counts=True)
+    # Sums of differences to one point: UTM-sized coordinates keep their last digits.
+    rest = xyz - xyz[0]
+    sums = np.stack([np.bincount(inverse, weights=rest[:, d], minlength=len(count)) for d in range(3)], axis=1)
+    return np.asarray(sums / count[:, None] + xyz[0])
+
+
+def _interpolate(samples: F64, nodes: F64) -> F64:
+    nearest = samples[KDTree(samples[:, :2]).query(nodes)[1], 2]
+    local = samples[:, :2] - samples[0, :2]
+    if len(samples) < 3 or np.linalg.matrix_rank(local, tol=1e-6) < 2:
+        return np.asarray(nearest)  # a line of points spans no triangle
+    z = LinearNDInterpolator(local, samples[:, 2])(nodes - samples[0, :2])
+    return np.asarray(np.where(np.isnan(z), nearest, z))
+
+
+def height_at(field: HeightField, xy: F64) -> F64:
+    """Return the ground height ``(N,)`` in metres at ``(N, 2+)`` points."""
+    at = np.asarray(xy, dtype=np.float64)
+    ny, nx = field.z.shape
+    u = np.clip((at[:, 0] - field.x0_m) / field.cell_m, 0, nx - 1)
+    v = np.clip((at[:, 1] - field.y0_m) / field.cell_m, 0, ny - 1)
+    i, j = np.minimum(u.astype(np.int64), max(nx - 2, 0)), np.minimum(v.astype(np.int64), max(ny - 2, 0))
+    i1, j1 = np.minimum(i + 1, nx - 1), np.minimum(j + 1, ny - 1)
+    fu, fv = u - i, v - j
+    low = field.z[j, i] * (1 - fu) + field.z[j, i1] * fu
+    high = field.z[j1, i] * (1 - fu) + field.z[j1, i1] * fu
+    return np.asarray(low * (1 - fv) + high * fv)
+
+
+def ground_pose(field: HeightField, x: float, y: float, yaw: float) -> F64:
+    """Return ``T_world_rig (4, 4)`` standing on the ground with exactly this heading.
+
+    Pitch and roll follow the surface: slopes are central differences over `SLOPE_SPAN_M` along and across the heading, about what four
+    wheels feel, so a step in the grid does not kick the body.
+    """
+    c, s, h = np.cos(yaw), np.sin(yaw), SLOPE_SPAN_M
+    offsets = np.array([[0.0, 0.0], [c * h, s * h], [-c * h, -s * h], [-s * h, c * h], [s * h, -c * h]])
+    z = height_at(field, np.array([x, y]) + offsets)
+    along, across = (z[1] - z[2]) / (2 * h), (z[3] - z[4]) / (2 * h)
+    ex = np.array([c, s, along]) / np.sqrt(1 + along * along)
+    ez = np.cross(ex, np.array([-s, c, across]))
+    ez /= np.linalg.norm(ez)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = ex, np.cross(ez, ex), ez, (x, y, z[0])
+    return pose
