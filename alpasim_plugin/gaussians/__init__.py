@@ -1,0 +1,22 @@
+"""3D Gaussians: clouds, files, cameras and rasterisers."""
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud
+from alpasim_plugin.gaussians.output import RasterOutput
+from alpasim_plugin.gaussians.ply import read_ply, write_ply
+from alpasim_plugin.gaussians.prepared import PreparedCloud, prepare
+from alpasim_plugin.gaussians.rasterize import rasterize
+from alpasim_plugin.gaussians.rasterize_cpu import rasterize_prepared
+
+__all__ = [
+    "CleanReport",
+    "GaussianCloud",
+    "PinholeCamera",
+    "PreparedCloud",
+    "RasterOutput",
+    "prepare",
+    "rasterize",
+    "rasterize_prepared",
+    "read_ply",
+    "write_ply",
+]

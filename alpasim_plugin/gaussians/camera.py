@@ -1,0 +1,102 @@
+"""Describe an ideal pinhole camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.cloud import require_rigid
+from alpasim_plugin.gaussians.constants import SLOPE_MARGIN
+from alpasim_plugin.geometry import inverse
+from alpasim_plugin.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeCamera:
+    """A pinhole camera in OpenCV axes: x right, y down, z forward; the centre of pixel (row i, column j) is (j + 0.5, i + 0.5).
+
+    Attributes:
+        width: Pixels.
+        height: Pixels.
+        K: ``(3, 3)`` intrinsics in pixels, no skew.
+        T_camera_world: ``(4, 4)`` rigid transform that maps world points, metres, to camera points.
+
+    Raises:
+        InputError: A size below 1, intrinsics with skew or without positive focal lengths, or a transform that is not rigid.
+    """
+
+    width: int
+    height: int
+    K: F64
+    T_camera_world: F64
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
+        object.__setattr__(self, "T_camera_world", np.asarray(self.T_camera_world, dtype=np.float64))
+        if self.width < 1 or self.height < 1:
+            raise InputError("building a camera", f"{self.width} x {self.height} pixels", "no pixel", "give at least one")
+        k = self.K
+        upper = k.shape == (3, 3) and np.isfinite(k).all() and k[0, 1] == 0 and k[1, 0] == 0 and np.array_equal(k[2], [0, 0, 1])
+        if not upper or k[0, 0] <= 0 or k[1, 1] <= 0:
+            raise InputError(
+                "building a camera",
+                "the intrinsics K",
+                np.array2string(k, separator=", ").replace("\n", ""),
+                "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels with fx, fy > 0",
+            )
+        require_rigid(self.T_camera_world, "building a camera")
+
+    @classmethod
+    def from_pose(cls, width: int, height: int, K: npt.ArrayLike, T_world_camera: F64) -> PinholeCamera:
+        """Build a camera from its pose, the transform that maps camera points to the world."""
+        require_rigid(T_world_camera, "building a camera")
+        return cls(width, height, np.asarray(K, dtype=np.float64), inverse(np.asarray(T_world_camera, dtype=np.float64)))
+
+    @classmethod
+    def from_hfov(cls, width: int, height: int, hfov_rad: float, T_world_camera: F64 | None = None) -> PinholeCamera:
+        """Build a camera with square pixels and a centred principal point from its horizontal field of view."""
+        f = width / (2 * np.tan(hfov_rad / 2))
+        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
+        return cls.from_pose(width, height, K, np.eye(4) if T_world_camera is None else T_world_camera)
+
+    @property
+    def fx(self) -> float:
+        """Return the horizontal focal length, pixels."""
+        return float(self.K[0, 0])
+
+    @property
+    def fy(self) -> float:
+        """Return the vertical focal length, pixels."""
+        return float(self.K[1, 1])
+
+    @property
+    def cx(self) -> float:
+        """Return the principal point's column, pixels."""
+        return float(self.K[0, 2])
+
+    @property
+    def cy(self) -> float:
+        """Return the principal point's row, pixels."""
+        return float(self.K[1, 2])
+
+    @property
+    def centre_world(self) -> F64:
+        """Return the camera centre ``(3,)``, metres, world."""
+        return np.asarray(-self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3])
+
+    def slope_limits(self) -> tuple[float, float, float, float]:
+        """Return the bounds (x low, x high, y low, y high) of x/z and y/z inside the covariance's Jacobian.
+
+        They lie 30 % of the half view outside the image's edges, so that splats just out of view do not become streaks.
+        """
+        margin_x = SLOPE_MARGIN * self.width / (2 * self.fx)
+        margin_y = SLOPE_MARGIN * self.height / (2 * self.fy)
+        return (
+            -(self.cx / self.fx + margin_x),
+            (self.width - self.cx) / self.fx + margin_x,
+            -(self.cy / self.fy + margin_y),
+            (self.height - self.cy) / self.fy + margin_y,
+        )

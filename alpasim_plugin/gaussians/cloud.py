@@ -1,0 +1,262 @@
+"""Hold a set of 3D Gaussians, and clean, move and join such sets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.constants import ALPHA_MIN, LOG_SCALE_LIMIT
+from alpasim_plugin.gaussians.sh import SH_SIZES, rotate_sh
+from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix
+from alpasim_plugin.types import F64
+
+FloatArray = npt.NDArray[np.floating]
+LARGEST_SCALE_M = np.exp(LOG_SCALE_LIMIT) * 1.0001  # room for float32 rounding
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """Count what `GaussianCloud.cleaned` removed and repaired.
+
+    Attributes:
+        n_input: Gaussians offered.
+        n_kept: Gaussians that remain.
+        dropped: Cause to count; each dropped Gaussian is counted once, under the first cause that applies in the order listed.
+        repaired: Cause to count of Gaussians kept with a changed value.
+    """
+
+    n_input: int
+    n_kept: int
+    dropped: Mapping[str, int]
+    repaired: Mapping[str, int]
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        parts = [f"{count} {cause}" for cause, count in self.dropped.items() if count]
+        fixed = [f"{count} {cause}" for cause, count in self.repaired.items() if count]
+        return (
+            f"{self.n_kept} of {self.n_input} Gaussians kept"
+            + (f"; dropped: {', '.join(parts)}" if parts else "")
+            + (f"; repaired: {', '.join(fixed)}" if fixed else "")
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianCloud:
+    """A set of N Gaussians in one frame.
+
+    Attributes:
+        means: ``(N, 3)`` centres, metres; float64 keeps UTM-sized coordinates exact.
+        quats: ``(N, 4)`` wxyz, Gaussian axes to the cloud's frame; need not be unit, must not be zero.
+        scales: ``(N, 3)`` standard deviations along the Gaussian's axes, metres, linear.
+        opacities: ``(N,)`` linear, 0..1.
+        sh: ``(N, K, 3)`` colour coefficients, K = (degree + 1)^2 in 1, 4, 9, 16; RGB = 0.5 + sum_k Y_k(view direction) sh_k.
+
+    Raises:
+        InputError: Shapes disagree or K is not a full degree. Values are not inspected here: see `cleaned`.
+    """
+
+    means: FloatArray
+    quats: FloatArray
+    scales: FloatArray
+    opacities: FloatArray
+    sh: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            value = np.asarray(getattr(self, name))
+            if value.dtype not in (np.float32, np.float64):
+                value = value.astype(np.float64)
+            object.__setattr__(self, name, value)
+        n = self.means.shape[0] if self.means.ndim else -1
+        wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+        found = {name: getattr(self, name).shape for name in wanted}
+        sh_ok = self.sh.ndim == 3 and self.sh.shape[0] == n and self.sh.shape[1] in SH_SIZES and self.sh.shape[2] == 3
+        if n < 0 or found != wanted or not sh_ok:
+            raise InputError(
+                "building a Gaussian cloud",
+                f"{n} means",
+                ", ".join(f"{k} {v}" for k, v in {**found, "sh": self.sh.shape}.items()),
+                "give means (N,3), quats (N,4), scales (N,3), opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
+            )
+
+    def __len__(self) -> int:
+        """Return N."""
+        return int(self.means.shape[0])
+
+    @property
+    def sh_degree(self) -> int:
+        """Return the degree of the colour coefficients, 0..3."""
+        return SH_SIZES.index(self.sh.shape[1])
+
+    @classmethod
+    def empty(cls, sh_size: int = 1) -> GaussianCloud:
+        """Return a cloud of no Gaussians."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, sh_size, 3)))
+
+    @classmethod
+    def cleaned(
+        cls, means: npt.ArrayLike, quats: npt.ArrayLike, scales: npt.ArrayLike, opacities: npt.ArrayLike, sh: npt.ArrayLike
+    ) -> tuple[GaussianCloud, CleanReport]:
+        """Build a cloud from untrusted arrays: drop what cannot be drawn, repair what can, count both.
+
+        Dropped: a mean, opacity or colour coefficient that is not finite, a NaN or negative scale, a scale whose logarithm exceeds 20
+        (infinite ones included), a quaternion of length zero or not finite. Repaired: scales below ``exp(-20)`` m are raised to it (they
+        draw as a dot either way), opacities outside [0, 1] are clipped. Quaternions are normalised in float64.
+
+        Returns:
+            The cloud, float64 means and quaternions, other arrays in the type given; and the report.
+
+        Raises:
+            InputError: Shapes disagree.
+
+        Example:
+            >>> cloud, report = GaussianCloud.cleaned([[0, 0, np.nan]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
+            >>> len(cloud), report.dropped["non-finite mean"]
+            (0, 1)
+        """
+        raw = cls(np.asarray(means), np.asarray(quats), np.asarray(scales), np.asarray(opacities), np.asarray(sh))
+        n = len(raw)
+        q = raw.quats.astype(np.float64)
+        # Scaling by the largest component first keeps tiny quaternions of float32 files from underflowing in the square.
+        largest = np.max(np.abs(q), axis=1, initial=0.0, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            unit = q / largest
+            unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+            low, high = np.exp(-LOG_SCALE_LIMIT), np.exp(LOG_SCALE_LIMIT)
+            faults = {
+                "non-finite mean": ~np.all(np.isfinite(raw.means), axis=1),
+                "non-finite opacity": ~np.isfinite(raw.opacities),
+                "non-finite colour": ~np.all(np.isfinite(raw.sh.reshape(n, -1)), axis=1),
+                "NaN or negative scale": np.any(np.isnan(raw.scales) | (raw.scales < 0), axis=1),
+                "overflowing scale": np.any(raw.scales > high, axis=1),
+                "zero quaternion": largest[:, 0] == 0,
+                "non-finite quaternion": ~np.all(np.isfinite(q), axis=1),
+            }
+        keep = np.ones(n, dtype=bool)
+        dropped: dict[str, int] = {}
+        for cause, bad in faults.items():
+            dropped[cause] = int(np.count_nonzero(bad & keep))
+            keep &= ~bad
+        scales_kept, opacities_kept = raw.scales[keep], raw.opacities[keep]
+        repaired = {
+            "scale raised to exp(-20) m": int(np.count_nonzero(np.any(scales_kept < low, axis=1))),
+            "opacity clipped to [0, 1]": int(np.count_nonzero((opacities_kept < 0) | (opacities_kept > 1))),
+        }
+        cloud = cls(
+            raw.means[keep].astype(np.float64),
+            unit[keep],
+            np.maximum(scales_kept, np.asarray(low, dtype=scales_kept.dtype)),
+            np.clip(opacities_kept, 0, 1),
+            raw.sh[keep],
+        )
+        return cloud, CleanReport(n, len(cloud), dropped, repaired)
+
+    def require_drawable(self, doing: str) -> None:
+        """Raise where any Gaussian could not be drawn.
+
+        Raises:
+            InputError: Names the first cause and its count; `cleaned` removes such Gaussians.
+        """
+        checks = {
+            "non-finite mean": np.isfinite(self.means).all(axis=1),
+            "zero or non-finite quaternion": np.isfinite(self.quats).all(axis=1) & (np.abs(self.quats).max(axis=1, initial=0.0) > 0),
+            "negative, non-finite or overflowing scale": np.all((self.scales >= 0) & (self.scales <= LARGEST_SCALE_M), axis=1),
+            "opacity outside 0..1": (self.opacities >= 0) & (self.opacities <= 1),
+            "non-finite colour": np.isfinite(self.sh.reshape(len(self), -1)).all(axis=1),
+        }
+        for cause, good in checks.items():
+            if not good.all():
+                raise InputError(
+                    doing,
+                    f"a cloud of {len(self)} Gaussians",
+                    f"{int(np.count_nonzero(~good))} with {cause}, the first at index {int(np.argmin(good))}",
+                    "build it with GaussianCloud.cleaned, which drops and counts them",
+                )
+
+    def take(self, index: npt.ArrayLike) -> GaussianCloud:
+        """Return the Gaussians chosen by an index or mask array, in that order."""
+        i = np.asarray(index)
+        return GaussianCloud(self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i])
+
+    def drawable_opacity(self) -> npt.NDArray[np.bool_]:
+        """Return which Gaussians can reach the alpha cut 1/255; the others draw nothing."""
+        return np.asarray(self.opacities >= ALPHA_MIN)
+
+    def transformed(self, T: F64, rotate_colour: bool = True) -> GaussianCloud:
+        """Return the cloud moved by a rigid transform, colours turning with the object.
+
+        Args:
+            T: ``(4, 4)`` rigid transform applied to the cloud.
+            rotate_colour: Turn the spherical harmonics too. False keeps them in the old axes, as checkpoints of Street Gaussians,
+                drivestudio and MTGS expect (they evaluate world directions for moving objects).
+
+        Raises:
+            InputError: ``T`` is not rigid.
+        """
+        require_rigid(T, "moving a Gaussian cloud")
+        rotation = np.asarray(T[:3, :3], dtype=np.float64)
+        means = self.means.astype(np.float64) @ rotation.T + T[:3, 3]
+        quats = quat_multiply(quat_from_matrix(rotation), self.quats.astype(np.float64))
+        sh = rotate_sh(self.sh, rotation) if rotate_colour else self.sh
+        return replace(self, means=means, quats=quats, sh=sh)
+
+    def rotations(self) -> F64:
+        """Return ``(N, 3, 3)`` float64 rotation matrices, quaternions normalised."""
+        q = self.quats.astype(np.float64)
+        return matrix_from_quat(q / np.linalg.norm(q, axis=1, keepdims=True))
+
+    def covariances(self) -> F64:
+        """Return ``(N, 3, 3)`` float64 covariances ``(R diag s)(R diag s)^T``, metres^2."""
+        factor = self.rotations() * self.scales.astype(np.float64)[:, None, :]
+        return np.asarray(factor @ np.swapaxes(factor, 1, 2))
+
+    @staticmethod
+    def concatenate(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
+        """Join clouds in the order given (which decides equal depths); lower degrees are padded with zero coefficients."""
+        if not clouds:
+            return GaussianCloud.empty()
+        size = max(cloud.sh.shape[1] for cloud in clouds)
+        sh = [np.pad(c.sh, ((0, 0), (0, size - c.sh.shape[1]), (0, 0))) for c in clouds]
+        return GaussianCloud(
+            np.concatenate([c.means for c in clouds]),
+            np.concatenate([c.quats for c in clouds]),
+            np.concatenate([c.scales for c in clouds]),
+            np.concatenate([c.opacities for c in clouds]),
+            np.concatenate(sh),
+        )
+
+
+def quat_multiply(a: F64, b: F64) -> F64:
+    """Return the Hamilton product of wxyz quaternions ``(..., 4)``: the rotation b followed by a."""
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def require_rigid(T: npt.ArrayLike, doing: str) -> None:
+    """Raise `InputError` unless ``T`` is a finite ``(4, 4)`` rigid transform (rotation to 1e-5, no reflection, no scale)."""
+    m = np.asarray(T, dtype=np.float64)
+    fault = None
+    if m.shape != (4, 4):
+        fault = f"shape {m.shape}"
+    elif not np.isfinite(m).all():
+        fault = "a value that is not finite"
+    elif np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() > 1e-5 or np.linalg.det(m[:3, :3]) < 0:
+        fault = f"an upper-left block that is no rotation (determinant {np.linalg.det(m[:3, :3]):.6g})"
+    elif np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-9:
+        fault = f"last row {m[3].tolist()}"
+    if fault:
+        raise InputError(doing, "a transform", fault, "give a (4, 4) rotation and translation, metres, column vectors")
