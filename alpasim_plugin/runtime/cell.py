@@ -1,0 +1,112 @@
+"""One cell of a run, start to finish: build the parts, drive, score, write. Runs in a worker process."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.renderers.base import make_renderer
+from alpasim_plugin.runtime.plan import Cell, RunOptions
+from alpasim_plugin.runtime.recorder import Recorder
+from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.runtime.scoring import score_log
+from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
+from alpasim_plugin.types import Scenario
+from policies.base import make_policy
+from scenarios.load import load_scenario
+from scenarios.suite import ScenarioRef
+
+MANIFEST = "manifest.json"
+
+
+def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[str, Any]:
+    """Run and score one cell and return its manifest, which is written last: a folder without one is unfinished.
+
+    A failure of any part is a result as well: its manifest has ``status: failed``, the four parts and the traceback.
+    """
+    folder = root / cell.folder
+    began = time.perf_counter()
+    manifest: dict[str, Any] = {
+        "renderer": cell.renderer,
+        "policy": cell.policy,
+        "scene": cell.scene,
+        "seed": cell.seed,
+        "path": cell.folder.as_posix(),
+        "rollout_key": cell.rollout_key,
+        "score_key": cell.score_key,
+        "preset": options.preset,
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MANIFEST).unlink(missing_ok=True)
+        scenario = _scenario(cell.ref)
+        with Recorder.to_folder(folder, scenario, cell, options) as recorder:
+            run_rollout(
+                scenario,
+                make_renderer(cell.renderer, scenario, seed=cell.seed, device=options.device, threads=threads),
+                make_policy(cell.policy, scenario),
+                cell.seed,
+                recorder,
+            )
+        manifest |= recorder.facts()
+        manifest |= _score(folder, cell, options, scenario)
+        recorder.save_pictures(folder, events=manifest["events"])
+        manifest["status"] = "ok"
+    except SimrunError as error:
+        manifest |= {"status": "failed", "error": error.as_dict(), "traceback": traceback.format_exc()}
+    except OSError as error:
+        failure = disk_error(folder, error)
+        manifest |= {"status": "failed", "error": failure.as_dict(), "traceback": traceback.format_exc()}
+    except Exception as error:
+        manifest |= {"status": "failed", "error": _unforeseen(error), "traceback": traceback.format_exc()}
+    manifest["wall_s"] = round(time.perf_counter() - began, 4)
+    write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def rescore_cell(cell: Cell, options: RunOptions, root: Path) -> dict[str, Any]:
+    """Score a finished rollout again under another preset, from its log alone."""
+    folder = root / cell.folder
+    manifest: dict[str, Any] = read_json(folder / MANIFEST)
+    manifest |= _score(folder, cell, options, _scenario(cell.ref))
+    manifest |= {"score_key": cell.score_key, "preset": options.preset}
+    write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def finished(cell: Cell, root: Path) -> dict[str, Any] | None:
+    """Return the manifest of a cell whose rollout is done and was shaped by the same content; else None.
+
+    Failed rollouts are not finished: they run again.
+    """
+    path = root / cell.folder / MANIFEST
+    if not path.exists():
+        return None
+    manifest: dict[str, Any] = read_json(path)
+    return manifest if manifest.get("rollout_key") == cell.rollout_key and manifest.get("status") == "ok" else None
+
+
+def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
+    scored = score_log(folder / "rollout.asl", scenario, options.preset, side=read_json(folder / "frames.json"))
+    keys = {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed}
+    write_table(folder / "steps.parquet", [keys | row for row in scored.steps], STEPS_SCHEMA)
+    return {"metrics": scored.values, "events": scored.events, "censored": scored.censored}
+
+
+@lru_cache(maxsize=4)
+def _scenario(ref: ScenarioRef) -> Scenario:
+    return load_scenario(ref.path, ref.seed, ref.overrides)
+
+
+def _unforeseen(error: Exception) -> dict[str, str]:
+    return {
+        "doing": "running a rollout",
+        "with": "a part that raised something other than a SimrunError",
+        "found": f"{type(error).__name__}: {error}",
+        "do": "read the traceback in the manifest and report it",
+        "failure_class": "infrastructure",
+    }

@@ -1,0 +1,77 @@
+"""What renderers and policies hand over is checked at the seam: a broken part is named, never passed on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
+from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest
+
+BLACK_LEVEL = 10  # AlpaSim's img_is_black: every byte at or below this
+
+
+def checked_frame(renderer: Renderer, request: RenderRequest) -> Frame:
+    """Render and check one frame; an all-black frame passes but carries the event ``black``.
+
+    Raises:
+        RendererError: The renderer raised, or its frame has another size, type, time or camera than asked for.
+    """
+    name = f"{type(renderer).__name__}, camera {request.camera.name!r} at {request.t_us} us"
+    try:
+        frame = renderer.render(request)
+    except SimrunError:
+        raise
+    except Exception as error:
+        raise RendererError(
+            "rendering a frame", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
+        ) from error
+    wanted = (request.camera.height, request.camera.width, 3)
+    problems = []
+    if frame.rgb.shape != wanted or frame.rgb.dtype != np.uint8:
+        problems.append(f"rgb is {frame.rgb.dtype} {frame.rgb.shape}, not uint8 {wanted}")
+    if (frame.t_us, frame.camera) != (request.t_us, request.camera.name):
+        problems.append(f"it is stamped {frame.camera!r} at {frame.t_us} us")
+    for label, plane in (("alpha", frame.alpha), ("depth", frame.depth)):
+        if plane is not None and (plane.shape != wanted[:2] or not np.isfinite(plane).all()):
+            problems.append(f"{label} has shape {plane.shape} or is not finite")
+    if problems:
+        raise RendererError("rendering a frame", name, "; ".join(problems), "fix the renderer; its contract is types.Frame")
+    if int(frame.rgb.max()) <= BLACK_LEVEL:
+        return replace(frame, events=(*frame.events, "black"))
+    return frame
+
+
+def checked_plan(policy: Policy, observation: Observation) -> Plan:
+    """Ask the policy and check its answer.
+
+    Raises:
+        PolicyError: The policy raised, or its plan is empty, not finite, not ordered in time or does not begin now.
+    """
+    name = f"{type(policy).__name__} at {observation.t_us} us"
+    try:
+        plan = policy.act(observation)
+    except SimrunError:
+        raise
+    except Exception as error:
+        raise PolicyError(
+            "asking the policy for a plan", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
+        ) from error
+    found = _plan_problem(plan, observation.t_us)
+    if found:
+        raise PolicyError("asking the policy for a plan", name, found, "run the policy through policies.conformance.check_policy")
+    return plan
+
+
+def _plan_problem(plan: Plan, now_us: int) -> str:
+    n = len(plan.times_us)
+    if n < 1 or plan.xy.shape != (n, 2) or plan.yaw.shape != (n,):
+        return f"shapes times_us {plan.times_us.shape}, xy {plan.xy.shape}, yaw {plan.yaw.shape} do not belong together"
+    if not (np.isfinite(plan.xy).all() and np.isfinite(plan.yaw).all()):
+        return "xy or yaw is not finite"
+    if int(plan.times_us[0]) != now_us or np.any(np.diff(plan.times_us) <= 0):
+        return f"times_us begins at {int(plan.times_us[0])} us or does not increase strictly"
+    if any(sample.shape != (n, 3) or not np.isfinite(sample).all() for sample in plan.samples):
+        return f"a sampled alternative is not finite or not of shape ({n}, 3)"
+    return ""

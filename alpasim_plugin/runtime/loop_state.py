@@ -1,0 +1,89 @@
+"""What one rollout carries from tick to tick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from alpasim_plugin.control import Controller
+from alpasim_plugin.geometry import quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
+from alpasim_plugin.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Scenario, Trajectory
+from alpasim_plugin.world.ego import ego_state_from_log
+from alpasim_plugin.world.ground import ground_pose
+from alpasim_plugin.world.route import route_in_rig
+
+
+@dataclass
+class LoopState:
+    """The ego's true state, its history, and the newest frame of each camera.
+
+    The history lives in arrays sized once for the whole rollout: an observation is a view of them, not a copy.
+    """
+
+    scenario: Scenario
+    ego: EgoState
+    _t_us: I64
+    _xyz: F64
+    _quat: F64
+    _filled: int = 0
+    frames: dict[str, Frame] = field(default_factory=dict)
+
+    @classmethod
+    def at_start(cls, scenario: Scenario, n_steps: int) -> LoopState:
+        """Return the state at the first frame; the history begins with the recorded context before it."""
+        log = scenario.ego_log
+        context = int(np.searchsorted(log.t_us, scenario.start_us))
+        size = context + n_steps + 1
+        state = cls(
+            scenario,
+            ego_state_from_log(log, scenario.start_us, scenario.vehicle),
+            np.concatenate([log.t_us[:context], np.zeros(size - context, dtype=np.int64)]),
+            np.concatenate([log.xyz[:context], np.zeros((size - context, 3))]),
+            np.concatenate([log.quat[:context], np.zeros((size - context, 4))]),
+            context,
+        )
+        state._remember()
+        return state
+
+    @property
+    def history(self) -> Trajectory:
+        """Give the rig poses up to now, the newest last."""
+        n = self._filled
+        return Trajectory(self._t_us[:n], self._xyz[:n], self._quat[:n])
+
+    @property
+    def closed_loop_us(self) -> int:
+        """Give the instant from which the policy drives."""
+        return self.scenario.start_us + self.scenario.warmup_us
+
+    def observe(self, cameras: Mapping[str, CameraSpec]) -> Observation:
+        """Return what the policy may know now."""
+        route = route_in_rig(self.scenario.route, self.ego.T_world_rig)
+        return Observation(self.ego.t_us, dict(self.frames), cameras, self.ego, self.history, route)
+
+    def to_world(self, plan: Plan) -> Trajectory:
+        """Map a plan from the rig frame now to absolute poses; plans are planar, so the rig's heading alone turns them."""
+        yaw0, origin = yaw_of(self.ego.T_world_rig), self.ego.T_world_rig[:3, 3]
+        c, s = np.cos(yaw0), np.sin(yaw0)
+        xy = plan.xy @ np.array([[c, s], [-s, c]]) + origin[:2]
+        xyz = np.column_stack([xy, np.full(len(xy), origin[2])])
+        return Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(plan.yaw + yaw0)))
+
+    def advance(self, controller: Controller, plan: Trajectory | None, to_us: int) -> None:
+        """Move the ego to ``to_us``: along the log while it is forced, otherwise by the vehicle model, then onto the ground."""
+        if to_us <= self.closed_loop_us:
+            self.ego = ego_state_from_log(self.scenario.ego_log, to_us, self.scenario.vehicle)
+        else:
+            moved = controller.advance(self.ego, plan, to_us)
+            x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
+            self.ego = replace(moved, T_world_rig=ground_pose(self.scenario.ground, x, y, yaw_of(moved.T_world_rig)))
+        self._remember()
+
+    def _remember(self) -> None:
+        n = self._filled
+        self._t_us[n] = self.ego.t_us
+        self._xyz[n] = self.ego.T_world_rig[:3, 3]
+        self._quat[n] = quat_from_matrix(self.ego.T_world_rig[:3, :3])
+        self._filled = n + 1

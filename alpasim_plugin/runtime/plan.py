@@ -1,0 +1,122 @@
+"""What a run consists of: the cells renderer x policy x scene x seed, each with a content key."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import Scenario
+from scenarios.load import load_scenario
+from scenarios.suite import ScenarioRef
+
+LOG_VERSION = 1  # raise when a rollout made by an older version must not be reused
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Everything but the cells that shapes a run's results."""
+
+    preset: str = "paper"
+    images: Literal["none", "jpeg", "png"] = "jpeg"  # camera frames in rollout.asl
+    video: Literal["none", "failures", "all"] = "none"
+    device: Literal["cpu", "cuda"] = "cpu"
+    baseline: str | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One rollout to run."""
+
+    renderer: str
+    policy: str
+    scene: str  # scene id
+    seed: int
+    ref: ScenarioRef
+    rollout_key: str  # content of everything that shapes the log
+    score_key: str  # rollout_key plus what shapes the scores
+
+    @property
+    def folder(self) -> Path:
+        """Give the rollout's folder below the run folder."""
+        return Path("rollouts", slug(self.renderer), slug(self.policy), slug(self.scene), str(self.seed))
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """A resolved run."""
+
+    cells: tuple[Cell, ...]
+    scenarios: dict[str, Scenario]
+    renderers: tuple[str, ...]
+    policies: tuple[str, ...]
+    seeds: tuple[int, ...]
+    options: RunOptions
+    overrides: tuple[str, ...] = field(default=())
+
+    @property
+    def key(self) -> str:
+        """Give a short hash of all cells and options: the same command has the same key."""
+        return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
+
+
+def make_plan(
+    refs: Sequence[ScenarioRef],
+    renderers: Sequence[str],
+    policies: Sequence[str],
+    seeds: Sequence[int],
+    options: RunOptions,
+) -> RunPlan:
+    """Load every scenario and lay out the cells, scene by scene so that workers reuse what they built.
+
+    Raises:
+        InputError: A scenario is bad, two scenarios share an id, or a name is given twice.
+    """
+    for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
+        if not values or len(set(values)) != len(values):
+            raise InputError(
+                "planning a run", f"{what}s {list(values)}", "none, or one of them twice", f"name every {what} once"
+            )
+    scenarios: dict[str, Scenario] = {}
+    origin: dict[str, ScenarioRef] = {}
+    for ref in refs:
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides)
+        other = origin.get(scenario.scene_id)
+        if other is not None:
+            raise InputError(
+                "planning a run",
+                f"{ref.path} and {other.path}",
+                f"both have the scene id {scenario.scene_id!r}",
+                "give one of them another id, or name it once",
+            )
+        scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
+    cells = []
+    for scene_id, scenario in scenarios.items():
+        for renderer in renderers:
+            for policy in policies:
+                for seed in seeds:
+                    shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
+                    rollout_key = digest(shaped_by)
+                    score_key = digest([rollout_key, options.preset])
+                    cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], rollout_key, score_key))
+    return RunPlan(tuple(cells), scenarios, tuple(renderers), tuple(policies), tuple(seeds), options)
+
+
+def digest(value: object) -> str:
+    """Return a SHA-256 over the canonical JSON of a value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def slug(name: str) -> str:
+    """Return a name that is safe as one folder.
+
+    Example:
+        >>> slug("nre://host:50051"), slug("onefixer@1")
+        ('nre-host-50051', 'onefixer@1')
+    """
+    return re.sub(r"[^A-Za-z0-9._@+-]+", "-", name).strip("-.") or "unnamed"

@@ -1,0 +1,75 @@
+"""One closed-loop rollout: scenario -> world -> renderer -> policy -> vehicle -> log, once per tick."""
+
+from __future__ import annotations
+
+import time
+
+from alpasim_plugin.clock import Clock
+from alpasim_plugin.control import Controller, make_controller
+from alpasim_plugin.runtime.cameras import CameraRig
+from alpasim_plugin.runtime.guards import checked_frame, checked_plan
+from alpasim_plugin.runtime.latency import PlanQueue
+from alpasim_plugin.runtime.loop_state import LoopState
+from alpasim_plugin.runtime.recorder import Recorder
+from alpasim_plugin.types import Policy, Renderer, Scenario
+from alpasim_plugin.world.actors import make_actors
+
+
+def run_rollout(
+    scenario: Scenario,
+    renderer: Renderer,
+    policy: Policy,
+    seed: int = 0,
+    recorder: Recorder | None = None,
+    controller: Controller | None = None,
+) -> Recorder:
+    """Drive one scenario once and return what was recorded.
+
+    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy already run; then the loop is closed.
+
+    Args:
+        scenario: What is driven.
+        renderer: A session of this rollout's own; see `make_renderer`.
+        policy: Reads the frames and plans; see `make_policy`.
+        seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.seeding`.
+        recorder: Receives everything; by default one that keeps it in memory.
+        controller: Vehicle model; by default what the policy asks for, else the bicycle with a tracker.
+
+    Raises:
+        PolicyError: The policy raised or broke its contract.
+        RendererError: The renderer raised or gave a frame of the wrong form.
+    """
+    clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+    recorder = recorder or Recorder(scenario, seed)
+    controller = controller or make_controller(getattr(policy, "controller", "bicycle"), scenario.vehicle)
+    actors = make_actors(scenario)
+    rig = CameraRig(scenario, policy.sensors, clock)
+    plans = PlanQueue(scenario.latency)
+    state = LoopState.at_start(scenario, clock.n_steps)
+    policy.reset(seed, scenario.route)
+    recorder.start(clock, rig.specs)
+
+    for tick in clock.ticks():
+        with recorder.stage("actors"):
+            others = actors.step(tick.t_us, state.ego)
+        recorder.poses(state.ego, others)
+        for request in rig.requests(tick, state.history, others):
+            with recorder.stage("render"):
+                frame = checked_frame(renderer, request)
+            state.frames[frame.camera] = frame
+            recorder.frame(frame, request)
+        if tick.is_last:
+            break
+        if tick.policy_due:
+            observation = state.observe(rig.specs)
+            recorder.question(observation, clock)
+            began = time.perf_counter()
+            with recorder.stage("policy"):
+                plan = checked_plan(policy, observation)
+            plan_world = state.to_world(plan)
+            plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
+            recorder.answer(plan, plan_world)
+        with recorder.stage("control"):
+            state.advance(controller, plans.active(tick.t_us), tick.t_us + clock.rates.control_us)
+    recorder.finish()
+    return recorder

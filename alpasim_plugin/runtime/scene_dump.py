@@ -1,0 +1,55 @@
+"""The part of a scenario that a report draws, as plain JSON, so that a run folder needs no source files."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.types import F64, Scenario
+
+
+def scene_as_json(scenario: Scenario) -> dict[str, Any]:
+    """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a centimetre."""
+    lanes = [
+        {
+            "id": lane.lane_id,
+            "kind": lane.kind,
+            "centre": _xy(lane.centre),
+            "left": _xy(lane.left) if lane.left is not None else None,
+            "right": _xy(lane.right) if lane.right is not None else None,
+            "paint": [lane.left_paint, lane.right_paint],
+        }
+        for lane in scenario.lane_map.lanes.values()
+    ]
+    log = scenario.ego_log
+    keep = np.unique(np.linspace(0, len(log) - 1, min(len(log), 400)).astype(int))
+    return {
+        "scene_id": scenario.scene_id,
+        "source": scenario.source,
+        "content_hash": scenario.content_hash,
+        "notes": list(scenario.notes),
+        "world_origin": list(scenario.world_origin),
+        "start_us": scenario.start_us,
+        "end_us": scenario.end_us,
+        "warmup_us": scenario.warmup_us,
+        "lanes": lanes,
+        "road_edges": [_xy(edge) for edge in scenario.lane_map.road_edges],
+        "crosswalks": [_xy(ring) for ring in scenario.lane_map.crosswalks],
+        "ego_log": {
+            "t_us": log.t_us[keep].tolist(),
+            "x_m": np.round(log.xyz[keep, 0], 3).tolist(),
+            "y_m": np.round(log.xyz[keep, 1], 3).tolist(),
+        },
+        "vehicle": {
+            "length_m": scenario.vehicle.box.length_m,
+            "width_m": scenario.vehicle.box.width_m,
+            "rear_axle_to_centre_m": scenario.vehicle.rear_axle_to_centre_m,
+        },
+        "actors": [{"id": a.actor_id, "label": a.label, "static": a.is_static} for a in scenario.actors],
+    }
+
+
+def _xy(line: F64) -> list[list[float]]:
+    rounded: list[list[float]] = np.round(line[:, :2], 2).tolist()
+    return rounded
