@@ -1,0 +1,147 @@
+"""Kinematic bicycle about the rear axle, integrated with the classical Runge-Kutta method of order 4.
+
+The reference point is the rig origin, on the ground under the rear axle, where a kinematic bicycle has no side slip
+(Rajamani, Vehicle Dynamics and Control, 2nd ed., section 2.2)::
+
+    x' = v cos(yaw)    y' = v sin(yaw)    yaw' = v tan(steer) / wheelbase    v' = accel    steer' = rate
+
+The equations hold at standstill and in reverse without a special case: nothing is divided by the speed. Tyre slip is left out; the
+tracker keeps its commands where that is fair (`tracker.MAX_LATERAL_MPS2`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import Vehicle
+
+MAX_SUBSTEP_S = 0.01
+
+
+@dataclass(frozen=True)
+class BicycleState:
+    """Planar state of the rear axle; world metres and radians, ``speed_mps`` along the body, negative in reverse."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    speed_mps: float
+    steer_rad: float
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the driver does with wheel and pedals.
+
+    ``drive_mps2`` pushes along the body (negative: reverse gear). ``brake_mps2`` >= 0 opposes the motion and can stop the vehicle
+    but never turn its motion round; at standstill it holds against any smaller drive.
+    """
+
+    steer_rad: float
+    drive_mps2: float = 0.0
+    brake_mps2: float = 0.0
+
+
+def step(state: BicycleState, command: Command, dt_s: float, vehicle: Vehicle, max_substep_s: float = MAX_SUBSTEP_S) -> BicycleState:
+    """Advance the vehicle by ``dt_s`` under a held command.
+
+    The wheel turns towards the commanded angle at no more than ``vehicle.max_steer_rate_radps``; drive and brake are cut to the
+    vehicle's limits. The instant of stopping is found exactly, so that braking ends at a speed of exactly 0.
+
+    Args:
+        state: Where the vehicle is.
+        command: Held over the whole interval.
+        dt_s: Length of the interval, >= 0.
+        vehicle: Wheelbase and limits.
+        max_substep_s: Longest integration step.
+
+    Raises:
+        InputError: The interval is negative, or a value of state or command is not finite.
+
+    Example:
+        >>> s = step(BicycleState(0.0, 0.0, 0.0, 10.0, 0.0), Command(0.0), 1.0, Vehicle())
+        >>> round(s.x_m, 9)
+        10.0
+    """
+    values = (state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.steer_rad, *_as_tuple(command), dt_s)
+    if not all(map(math.isfinite, values)) or dt_s < 0:
+        raise InputError(
+            "advancing the vehicle",
+            f"{state} under {command}",
+            f"a value that is not finite, or dt_s = {dt_s} < 0",
+            "give finite values and dt_s >= 0",
+        )
+    n = max(1, math.ceil(dt_s / max_substep_s - 1e-9))
+    h = dt_s / n
+    target = _clip(command.steer_rad, vehicle.max_steer_rad)
+    drive = min(max(command.drive_mps2, -vehicle.max_accel_mps2), vehicle.max_accel_mps2)
+    brake = min(max(command.brake_mps2, 0.0), vehicle.max_brake_mps2)
+    for _ in range(n):
+        # A constant rate over the sub-step keeps the right-hand side smooth inside it, which order 4 needs.
+        end = state.steer_rad + _clip(target - state.steer_rad, vehicle.max_steer_rate_radps * h)
+        rate = (end - state.steer_rad) / h if h > 0 else 0.0
+        state = _substep(state, rate, drive, brake, h, vehicle.wheelbase_m)
+    return state
+
+
+def _substep(state: BicycleState, steer_rate: float, drive: float, brake: float, h: float, wheelbase: float) -> BicycleState:
+    """Integrate one sub-step, cut at the instant of standstill where the brake brings one."""
+    accel = _accel(state.speed_mps, drive, brake)
+    if state.speed_mps * accel < 0:
+        stop_s = -state.speed_mps / accel
+        if stop_s < h:
+            at_stop = _rk4(state, steer_rate, accel, stop_s, wheelbase)
+            at_stop = BicycleState(at_stop.x_m, at_stop.y_m, at_stop.yaw_rad, 0.0, at_stop.steer_rad)
+            return _rk4(at_stop, steer_rate, _accel(0.0, drive, brake), h - stop_s, wheelbase)
+    return _rk4(state, steer_rate, accel, h, wheelbase)
+
+
+def _accel(speed: float, drive: float, brake: float) -> float:
+    """Return the net acceleration: the brake acts against the motion, and at standstill against the drive."""
+    if speed != 0:
+        return drive - math.copysign(brake, speed)
+    return math.copysign(max(abs(drive) - brake, 0.0), drive)
+
+
+def _rk4(s: BicycleState, steer_rate: float, accel: float, h: float, wheelbase: float) -> BicycleState:
+    """Take one classical Runge-Kutta step; speed and steer are linear in time, so only x, y and yaw need the four stages."""
+    v0, v1, v2 = s.speed_mps, s.speed_mps + 0.5 * h * accel, s.speed_mps + h * accel
+    w0 = v0 * math.tan(s.steer_rad) / wheelbase
+    w1 = v1 * math.tan(s.steer_rad + 0.5 * h * steer_rate) / wheelbase
+    w2 = v2 * math.tan(s.steer_rad + h * steer_rate) / wheelbase
+    yaw_a = s.yaw_rad + 0.5 * h * w0
+    yaw_b = s.yaw_rad + 0.5 * h * w1
+    yaw_c = s.yaw_rad + h * w1
+    cos, sin = math.cos, math.sin
+    x = s.x_m + h / 6 * (v0 * cos(s.yaw_rad) + 2 * v1 * (cos(yaw_a) + cos(yaw_b)) + v2 * cos(yaw_c))
+    y = s.y_m + h / 6 * (v0 * sin(s.yaw_rad) + 2 * v1 * (sin(yaw_a) + sin(yaw_b)) + v2 * sin(yaw_c))
+    return BicycleState(x, y, s.yaw_rad + h / 6 * (w0 + 4 * w1 + w2), v2, s.steer_rad + h * steer_rate)
+
+
+def exact_arc(state: BicycleState, accel_mps2: float, dt_s: float, wheelbase_m: float) -> BicycleState:
+    """Return the closed solution for a held wheel and a constant acceleration: an arc of a circle. The slow twin of `step`.
+
+    The heading depends on the path length alone, ``yaw = yaw0 + s tan(steer) / L``, and the chord of an arc of length s and turn
+    ``2 b`` is ``s sin(b) / b`` at the mean heading.
+    """
+    s = state.speed_mps * dt_s + 0.5 * accel_mps2 * dt_s**2
+    turn = s * math.tan(state.steer_rad) / wheelbase_m
+    half = turn / 2
+    chord = s * (math.sin(half) / half if abs(half) > 1e-8 else 1.0 - half * half / 6)
+    return BicycleState(
+        state.x_m + chord * math.cos(state.yaw_rad + half),
+        state.y_m + chord * math.sin(state.yaw_rad + half),
+        state.yaw_rad + turn,
+        state.speed_mps + accel_mps2 * dt_s,
+        state.steer_rad,
+    )
+
+
+def _as_tuple(command: Command) -> tuple[float, float, float]:
+    return command.steer_rad, command.drive_mps2, command.brake_mps2
+
+
+def _clip(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)

@@ -1,0 +1,132 @@
+"""Follow a plan with a vehicle that has limits: preview steering, preview speed, kinematic bicycle.
+
+Steering minimises, over the next 20 nodes of the path, ``sum of lateral error^2 + rho * steer rate^2`` for the bicycle itself (not for a
+linear model of it), by Gauss-Newton. The nodes are spaced by path length, so the law has the same shape at every speed and needs no special
+case at standstill. With ``rho = v^4 / (L^2 w^6)`` the closed loop is a third-order Butterworth filter of bandwidth ``w`` (the
+linear-quadratic regulator of ``y''' = v^2 u / L``; Anderson and Moore, Optimal Control, 1990, section 6.1): no oscillation at any speed.
+
+Speed is the constant acceleration that best meets the planned progress over the next 0.8 s.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop, planar, spatial
+from alpasim_plugin.control.bicycle import BicycleState, Command, step
+from alpasim_plugin.control.reference import Reference, build_reference
+from alpasim_plugin.types import F64, EgoState, Trajectory, Vehicle
+
+MAX_LATERAL_MPS2 = 8.0  # beyond it tyres slip and a kinematic bicycle is no model of a car
+CONTROL_S = 0.05  # how often the law looks again within one call
+NODES = 20
+NODE_S = 0.1
+BANDWIDTH_RADPS = 2.5
+MIN_PREVIEW_MPS = 5.0  # below it the nodes stay this speed's distance apart: 10 m of preview
+GAUSS_NEWTON_STEPS = 2
+PREVIEW_S = np.linspace(0.2, 0.8, 4)
+HOLD_SPEED_MPS = 0.5
+HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S asks to stand
+HOLD_S = 2.0
+
+_BEFORE = np.tril(np.ones((NODES, NODES)), -1)  # d steer at the start of step k / d change in step j
+_MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
+_CUMULATE = np.tril(np.ones((NODES, NODES)))
+
+
+class PlanTracker:
+    """Drive a kinematic bicycle along the plan within the vehicle's limits.
+
+    A plan that ends is held at its last pose, so a short plan brakes. The vehicle reverses only for a plan that drives backwards by more
+    than half a metre; noise around a standing plan neither moves it nor turns the wheel.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+
+    def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
+        """Return the state at ``to_us``; see `Controller.advance`."""
+        if plan is None:
+            return coast_to_stop(state, to_us, self.vehicle)
+        dt_s = check_interval(state, to_us)
+        check_plan(plan)
+        origin = state.T_world_rig[:2, 3]
+        reference = build_reference(plan, state.t_us, origin)
+        before = planar(state)
+        now = BicycleState(0.0, 0.0, before.yaw_rad, before.speed_mps, before.steer_rad)
+        n = max(1, math.ceil(dt_s / CONTROL_S - 1e-9))
+        for i in range(n):
+            now = step(now, self.command(now, reference, i * dt_s / n), dt_s / n, self.vehicle)
+        accel = (now.speed_mps - before.speed_mps) / dt_s
+        world = BicycleState(now.x_m + float(origin[0]), now.y_m + float(origin[1]), now.yaw_rad, now.speed_mps, now.steer_rad)
+        return spatial(world, to_us, float(state.T_world_rig[2, 3]), accel, self.vehicle)
+
+    def command(self, now: BicycleState, reference: Reference, t_s: float) -> Command:
+        """Return the command at ``t_s`` seconds after the reference's time for a vehicle in the reference's coordinates."""
+        planned = reference.progress(np.concatenate([[t_s], t_s + PREVIEW_S, [t_s + HOLD_S]]))
+        xy = np.array([now.x_m, now.y_m])
+        s_now = reference.project(xy, float(planned[0]), 2.0 + abs(now.speed_mps) * 0.5)
+        to_go = planned[1:] - s_now
+        direction = 1.0
+        if now.speed_mps < HOLD_SPEED_MPS and to_go[-1] < -2 * HOLD_MOVE_M:
+            direction = -1.0
+        if direction * to_go[-1] < HOLD_MOVE_M and abs(now.speed_mps) < HOLD_SPEED_MPS:
+            return Command(now.steer_rad, 0.0, self.vehicle.max_brake_mps2 / 2)
+        accel = _fit_acceleration(to_go[:-1], now.speed_mps)
+        target = self.steer_target(now, reference, s_now, direction)
+        if direction > 0 and accel < 0:
+            return Command(target, 0.0, -accel)
+        if direction < 0 and accel > 0:
+            return Command(target, 0.0, accel)
+        return Command(target, accel, 0.0)
+
+    def steer_target(self, now: BicycleState, reference: Reference, s_now: float, direction: float) -> float:
+        """Return the wheel angle to be reached ``CONTROL_S`` later: the first move of the optimal sequence."""
+        wheelbase = self.vehicle.wheelbase_m
+        speed = max(abs(now.speed_mps), MIN_PREVIEW_MPS)
+        ds = speed * NODE_S * direction
+        target, normal = reference.at(s_now + ds * np.arange(1.0, NODES + 1))
+        weight = speed**2 / (wheelbase * BANDWIDTH_RADPS**3) / NODE_S  # sqrt(rho) per change of steer in one node
+        limit = self._steer_limit(now.speed_mps)
+        change = np.zeros(NODES)
+        start = now.steer_rad
+        for _ in range(GAUSS_NEWTON_STEPS):
+            error, jacobian = _lateral_errors(now, start, change, ds, wheelbase, target, normal, self.vehicle.max_steer_rad)
+            hessian = jacobian.T @ jacobian
+            hessian[np.diag_indices(NODES)] += weight**2
+            change = change - np.linalg.solve(hessian, jacobian.T @ error + weight**2 * change)
+        # The move is per node of path; in time it takes NODE_S at the preview's speed.
+        return float(np.clip(start + change[0] * CONTROL_S / NODE_S, -limit, limit))
+
+    def _steer_limit(self, speed_mps: float) -> float:
+        grip = math.atan(MAX_LATERAL_MPS2 * self.vehicle.wheelbase_m / max(speed_mps**2, 1e-6))
+        return min(grip, self.vehicle.max_steer_rad)
+
+
+def _lateral_errors(
+    now: BicycleState, start: float, change: F64, ds: float, wheelbase: float, target: F64, normal: F64, max_steer: float
+) -> tuple[F64, F64]:
+    """Return the lateral errors (NODES,) of the bicycle under a steering sequence, and their derivative (NODES, NODES).
+
+    Each node is one midpoint step of length ``ds``: turn by ``ds tan(steer) / L`` and move along the mean heading.
+    """
+    middle = np.clip(start + _MIDDLE @ change, -max_steer, max_steer)
+    turn = ds * np.tan(middle) / wheelbase
+    yaw_middle = now.yaw_rad + _MIDDLE @ turn
+    along = np.stack([np.cos(yaw_middle), np.sin(yaw_middle)], axis=1)
+    position = np.array([now.x_m, now.y_m]) + ds * np.cumsum(along, axis=0)
+    error = np.sum(normal * (position - target), axis=1)
+    d_turn = (ds / wheelbase / np.cos(middle) ** 2)[:, None] * _MIDDLE
+    d_yaw = _MIDDLE @ d_turn
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    # d error_k = normal_k . sum_{i <= k} ds left_i d_yaw_i
+    lever = np.where(_CUMULATE > 0, ds * (normal @ left.T), 0.0)
+    return error, lever @ d_yaw
+
+
+def _fit_acceleration(to_go: F64, speed: float) -> float:
+    """Return the constant acceleration whose motion best meets the progress ``to_go`` (K,) at ``PREVIEW_S``."""
+    basis = 0.5 * PREVIEW_S**2
+    return float(basis @ (to_go - speed * PREVIEW_S) / (basis @ basis))

@@ -1,0 +1,10 @@
+"""Policies: from observations to plans."""
+
+from __future__ import annotations
+
+from policies.base import POLICIES, make_policy
+from policies.constant_velocity import ConstantVelocity
+from policies.log_replay import LogReplay
+from policies.pure_pursuit import PurePursuit
+
+__all__ = ["POLICIES", "ConstantVelocity", "LogReplay", "PurePursuit", "make_policy"]

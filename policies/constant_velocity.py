@@ -1,0 +1,29 @@
+"""Straight on at the present speed: the lower bound every policy should beat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec
+from policies.base import POLICIES, plan_times, seconds
+
+
+@POLICIES.register("constant-velocity", "straight on at the present speed; sees nothing")
+class ConstantVelocity:
+    """Keep the present heading and speed. Looks at no camera, no route and no actor."""
+
+    sensors: Sequence[SensorSpec] = ()
+
+    def __init__(self, scenario: Scenario) -> None:
+        del scenario
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Do nothing: there is no memory."""
+
+    def act(self, observation: Observation) -> Plan:
+        """Return a straight plan."""
+        times = plan_times(observation.t_us)
+        x = observation.ego.speed_mps * seconds(times)
+        return Plan(observation.t_us, times, np.stack([x, np.zeros_like(x)], axis=1), np.zeros_like(x))

@@ -1,0 +1,55 @@
+"""Drive along the route: what a policy could do with the route alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from alpasim_plugin.types import F64, Observation, Plan, Route, Scenario, SensorSpec
+from policies.base import POLICIES, plan_times, seconds
+from policies.paths import curve_speeds, follow, make_path, speed_profile
+
+MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
+
+
+@POLICIES.register("pure-pursuit", "along the route at the initial speed, slower in curves; sees nothing")
+class PurePursuit:
+    """Follow the route at the speed of the first observation, slower where curves ask for it.
+
+    Blind by design: it looks at no camera and knows no actor, so it drives into whatever stands on its route. It measures what vehicle,
+    tracker and route alone can do. Where the route ends it goes straight on; without a route it keeps its heading.
+    """
+
+    sensors: Sequence[SensorSpec] = ()
+
+    def __init__(self, scenario: Scenario) -> None:
+        del scenario
+        self.cruise_mps: float | None = None
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Forget the cruising speed."""
+        self.cruise_mps = None
+
+    def act(self, observation: Observation) -> Plan:
+        """Return an arc-by-arc pursuit of the route."""
+        speed = max(observation.ego.speed_mps, 0.0)
+        if self.cruise_mps is None:
+            self.cruise_mps = max(speed, MIN_CRUISE_MPS)
+        times = plan_times(observation.t_us)
+        path = make_path(route_points(observation.route_rig))
+        progress = speed_profile(speed, curve_speeds(path, self.cruise_mps), seconds(times))
+        xy, yaw = follow(path, progress, speed)
+        return Plan(observation.t_us, times, xy, yaw, debug={"cruise_mps": self.cruise_mps})
+
+
+def route_points(route_rig: F64) -> F64:
+    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where fewer than two remain.
+
+    The route begins at the ego's projection, so the first point may lie beside the ego.
+    """
+    points = np.asarray(route_rig[np.isfinite(route_rig).all(axis=1), :2])
+    if len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5:
+        return points
+    start = points[0] if len(points) else np.zeros(2)
+    return np.stack([start, start + np.array([1.0, 0.0])])
