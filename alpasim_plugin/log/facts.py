@@ -1,0 +1,60 @@
+"""Keep per-frame facts that the ASL format has no field for (mean opacity, stage times) in a file beside the log."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+
+Fact = str | int | float | bool | None
+
+
+def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
+    """Write one JSON object a line, such as ``{"t_us": 100000, "camera": "front", "alpha_mean": 0.98, "render_ms": 12.1}``.
+
+    The file appears under its name only once complete. NaN and infinities are refused: a fact that is missing is left out.
+
+    Raises:
+        InputError: A value that JSON cannot hold.
+        InfrastructureError: The disk refuses.
+    """
+    path = Path(path)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with partial.open("w", encoding="utf-8") as stream:
+            stream.writelines(json.dumps(dict(row), allow_nan=False) + "\n" for row in rows)
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise InfrastructureError(
+            "writing facts of a rollout", str(path), f"{error.strerror}", "check that the folder exists and has room"
+        ) from error
+    except (TypeError, ValueError) as error:
+        partial.unlink(missing_ok=True)
+        raise InputError("writing facts of a rollout", str(path), str(error), "give finite numbers, text or booleans") from error
+
+
+def read_facts(path: Path | str) -> list[dict[str, Fact]]:
+    """Read what `write_facts` wrote.
+
+    Raises:
+        InputError: Missing file, or a line that is no JSON object.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError("reading facts of a rollout", str(path), f"cannot open: {error.strerror}", "check the path") from error
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            row = json.loads(line)
+        except ValueError as error:
+            raise InputError("reading facts of a rollout", f"{path}, line {number}", str(error), "run the rollout again") from error
+        if not isinstance(row, dict):
+            raise InputError("reading facts of a rollout", f"{path}, line {number}", f"{line[:60]!r}", "run the rollout again")
+        rows.append(row)
+    return rows

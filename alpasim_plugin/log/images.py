@@ -1,0 +1,46 @@
+"""Encode and decode the camera images of a log."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import U8
+
+ImageEncoding = Literal["png", "jpeg"]
+
+
+def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) -> bytes:
+    """Encode ``(H, W, 3)`` uint8 sRGB; PNG is exact, JPEG keeps colour at full resolution.
+
+    Raises:
+        InputError: Not an HWC uint8 image.
+    """
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape:
+        raise InputError("encoding a camera image", f"array {rgb.shape} {rgb.dtype}", "not (H, W, 3) uint8", "give an sRGB image as uint8")
+    options = {
+        # Level 1: a log is written while the loop runs, and stronger levels cost more time than they save space.
+        "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+        "jpeg": [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],
+    }[encoding]
+    done, data = cv2.imencode({"png": ".png", "jpeg": ".jpg"}[encoding], rgb[..., ::-1], options)
+    if not done:
+        raise InputError("encoding a camera image", f"array {rgb.shape} as {encoding}", "the encoder refused", "use a smaller image")
+    return data.tobytes()
+
+
+def decode_image(data: bytes, what: str = "a camera image") -> U8:
+    """Decode PNG or JPEG to ``(H, W, 3)`` uint8 sRGB. The size is the image's own, never the requested one.
+
+    Raises:
+        InputError: Not a whole image.
+    """
+    bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
+    if bgr is None:
+        raise InputError(
+            "decoding a camera image", what, f"{len(data)} bytes beginning {data[:4]!r}", "store PNG or JPEG images in the log"
+        )
+    return np.ascontiguousarray(bgr[..., ::-1])

@@ -1,0 +1,189 @@
+"""Read an ASL log, whoever wrote it, into a `RolloutLog`.
+
+Reads what AlpaSim's evaluation reads and ignores the rest. Nothing is ever unpickled: the driver's unstructured debug bytes stay unread.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.alpasim.asl import AslReader
+from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, logging_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log.schema import EGO, increasing_times, read_camera, read_poses, read_trajectory, read_transform
+from alpasim_plugin.types import Actor, Box, LoggedImage, LoggedPlan, RolloutLog, Trajectory
+
+
+@dataclass
+class _Collected:
+    """What one pass over the entries gathers."""
+
+    metadata: logging_pb2.RolloutMetadata | None = None
+    poses: dict[str, list[tuple[int, common_pb2.Pose]]] = field(default_factory=dict)
+    questions: list[egodriver_pb2.DriveRequest] = field(default_factory=list)
+    plans: list[LoggedPlan] = field(default_factory=list)
+    images: list[LoggedImage] = field(default_factory=list)
+    static_ids: set[str] = field(default_factory=set)
+    counts: Counter[str] = field(default_factory=Counter)
+    info: dict[str, Any] = field(
+        default_factory=lambda: {"empty_plans": 0, "terminated": False, "cameras": (), "other_cameras": (), "seed": 0}
+    )
+
+
+def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
+    """Read a rollout log.
+
+    Args:
+        path: The ``.asl`` file.
+        images: Keep the encoded camera images; False saves their memory.
+
+    Returns:
+        The rollout. ``warnings`` tells of a cut last entry and of entries of unknown kind; ``info`` holds ``entries`` (count by kind),
+        ``n_steps``, ``empty_plans`` and ``unanswered`` (drive requests without a usable answer), ``terminated`` (the driver ended the
+        rollout), ``cameras`` (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``, and
+        ``undefined_actors`` (poses of ids that the header does not define are left out).
+
+    Raises:
+        InputError: Missing, empty or damaged file, no metadata first, no ego poses, times that do not increase, or a bad quaternion.
+    """
+    path = Path(path)
+    reader = AslReader(path)
+    got = _Collected()
+    for entry in reader:
+        kind = entry.WhichOneof("log_entry") or "unknown"
+        got.counts[kind] += 1
+        if got.metadata is None and kind != "rollout_metadata":
+            raise _bad(path, f"first entry is {kind}", "give a whole log: rollout_metadata comes first")
+        handler = _HANDLERS.get(kind)
+        if handler is not None:
+            handler(got, getattr(entry, kind), str(path))
+        elif kind == "driver_camera_image" and images:
+            image = entry.driver_camera_image.camera_image
+            got.images.append(LoggedImage(image.logical_id, image.frame_start_us, image.frame_end_us, image.image_bytes))
+    warnings = [str(reader.truncated)] if reader.truncated else []
+    if got.counts["unknown"]:
+        warnings.append(f"{path}: {got.counts['unknown']} entries of a kind that this version does not know were skipped")
+    return _assemble(path, got, tuple(warnings))
+
+
+def _metadata(got: _Collected, message: logging_pb2.RolloutMetadata, where: str) -> None:
+    if got.metadata is not None:
+        raise InputError("reading a rollout log", where, "a second rollout_metadata", "give one rollout a file")
+    got.metadata = message
+
+
+def _actor_poses(got: _Collected, message: logging_pb2.ActorPoses, where: str) -> None:
+    for pose in message.actor_poses:
+        got.poses.setdefault(pose.actor_id, []).append((message.timestamp_us, pose.actor_pose))
+
+
+def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest, where: str) -> None:
+    got.questions.append(message)
+
+
+def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where: str) -> None:
+    """Pair first in, first out; an empty answer is a driver that is not ready yet."""
+    if not got.questions:
+        raise InputError("reading a rollout log", where, "a driver_return without a driver_request", "give a whole log")
+    question = got.questions.pop(0)
+    if message.terminate_session:
+        got.info["terminated"] = True
+    if not message.trajectory.poses:
+        got.info["empty_plans"] += 1
+        return
+    what = f"{where}, plan at {question.time_now_us} us"
+    samples = tuple(read_trajectory(sample, f"{what}, sample {i}") for i, sample in enumerate(message.debug_info.sampled_trajectories))
+    got.plans.append(LoggedPlan(question.time_now_us, question.time_query_us, read_trajectory(message.trajectory, what), samples))
+
+
+def _driver_session(got: _Collected, message: egodriver_pb2.DriveSessionRequest, where: str) -> None:
+    got.info["seed"] = message.random_seed
+
+
+def _traffic_session(got: _Collected, message: Any, where: str) -> None:
+    got.static_ids.update(o.object_id for o in message.logged_object_trajectories if o.is_static)
+
+
+def _cameras(got: _Collected, message: Any, where: str) -> None:
+    specs = {camera.logical_id: read_camera(camera) for camera in message.available_cameras}
+    got.info["cameras"] = tuple(spec for spec in specs.values() if spec is not None)
+    got.info["other_cameras"] = tuple(name for name, spec in specs.items() if spec is None)
+
+
+_HANDLERS: dict[str, Any] = {
+    "rollout_metadata": _metadata,
+    "actor_poses": _actor_poses,
+    "driver_request": _driver_request,
+    "driver_return": _driver_return,
+    "driver_session_request": _driver_session,
+    "traffic_session_request": _traffic_session,
+    "available_cameras_return": _cameras,
+}
+
+
+def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
+    """Turn what was gathered into a `RolloutLog`."""
+    if got.metadata is None:
+        raise _bad(path, "no rollout_metadata", "give a whole log")
+    metadata, session = got.metadata, got.metadata.session_metadata
+    definitions = metadata.actor_definitions.actor_aabb
+    if not definitions or definitions[0].actor_id != EGO:
+        first = definitions[0].actor_id if definitions else "nothing"
+        raise _bad(path, f"actor definitions begin with {first}", f"define {EGO} first: its size is read from there")
+    if EGO not in got.poses:
+        raise _bad(path, f"no actor_poses of {EGO}", "run the rollout again; nothing can be scored without them")
+    actors = {}
+    for definition in definitions[1:]:
+        poses = got.poses.get(definition.actor_id)
+        if poses:
+            i = definition.actor_id
+            track = _track(poses, f"{path}, poses of actor {i!r}")
+            actors[i] = Actor(i, definition.actor_label, _box(definition.aabb), track, is_static=i in got.static_ids)
+    defined = {d.actor_id for d in definitions}
+    seed = got.info.pop("seed")
+    info = {
+        "entries": dict(got.counts),
+        "n_steps": session.n_sim_steps,
+        "unanswered": len(got.questions),
+        "undefined_actors": tuple(sorted(set(got.poses) - defined)),
+        "versions": {f.name.removesuffix("_version"): v.version_id for f, v in metadata.version_ids.ListFields()},
+        **got.info,
+    }
+    return RolloutLog(
+        scene_id=session.scene_id,
+        session_uuid=session.session_uuid,
+        ego_box=_box(definitions[0].aabb),
+        T_rig_box=read_transform(metadata.transform_ego_coords_rig_to_aabb, f"{path}, offset from rig to box"),
+        ego=_track(got.poses[EGO], f"{path}, poses of {EGO}"),
+        actors=actors,
+        plans=tuple(got.plans),
+        images=tuple(sorted(got.images, key=lambda image: image.end_us)),
+        ego_log=read_trajectory(metadata.ego_rig_recorded_ground_truth_trajectory, f"{path}, recorded ego poses"),
+        start_us=session.start_timestamp_us,
+        render_start_us=session.render_start_timestamp_us,
+        force_gt_us=metadata.force_gt_duration,
+        control_us=session.control_timestep_us,
+        seed=seed,
+        info=info,
+        warnings=warnings,
+    )
+
+
+def _track(poses: list[tuple[int, common_pb2.Pose]], what: str) -> Trajectory:
+    t_us = increasing_times([t for t, _ in poses], what)
+    xyz, quat = read_poses((pose for _, pose in poses), what)
+    return Trajectory(t_us, xyz, quat)
+
+
+def _box(aabb: common_pb2.AABB) -> Box:
+    """Return a box; sizes are float32 on the wire and shown with its seven digits, so that 4.855 stays 4.855."""
+    return Box(*(float(np.format_float_positional(np.float32(v))) for v in (aabb.size_x, aabb.size_y, aabb.size_z)))
+
+
+def _bad(path: Path, found: str, do_this: str) -> InputError:
+    return InputError("reading a rollout log", str(path), found, do_this)

@@ -1,0 +1,247 @@
+"""Translate between our types and the messages of a rollout log.
+
+Poses are float32 on the wire: metres keep 1 mm up to about 8 km from the local origin, so a log must use a local origin. Times are
+integer microseconds in 64 bits and exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.types import F64, Actor, Box, CameraSpec, EgoState, Scenario, Trajectory, Vehicle
+
+EGO = "EGO"
+QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
+MAX_LOCAL_M = 1e5  # float32 steps are 7.8 mm there
+
+
+@dataclass(frozen=True)
+class RolloutHeader:
+    """State what a log says once, at its beginning.
+
+    Attributes:
+        scene_id: Scene, by which a scorer finds the map.
+        session_uuid: Name of this rollout.
+        vehicle: Ego body; gives the box and the offset from rig to box centre.
+        actors: Everything that may appear; absent from here means invisible to scorers.
+        ego_log: Recorded rig poses, world.
+        render_start_us: First shutter close.
+        force_gt_us: How long after it the recording is forced.
+        control_us: Control period.
+        n_steps: Number of control steps.
+        seed: Rollout seed.
+        versions: Version text by service (``runtime``, ``egodriver``, ``sensorsim``, ``controller``, ``physics``, ``traffic``,
+            ``video_model``); services not named are logged as skipped.
+    """
+
+    scene_id: str
+    session_uuid: str
+    vehicle: Vehicle
+    actors: tuple[Actor, ...]
+    ego_log: Trajectory
+    render_start_us: int
+    force_gt_us: int
+    control_us: int
+    n_steps: int
+    seed: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def T_rig_box(self) -> F64:
+        """Return the ``(4, 4)`` pose of the ego's box centre in the rig."""
+        return T_rig_box(self.vehicle)
+
+
+def header_from_scenario(
+    scenario: Scenario, session_uuid: str, seed: int, n_steps: int, versions: Mapping[str, str] | None = None
+) -> RolloutHeader:
+    """Return the header of a rollout of `scenario`."""
+    return RolloutHeader(
+        scene_id=scenario.scene_id,
+        session_uuid=session_uuid,
+        vehicle=scenario.vehicle,
+        actors=scenario.actors,
+        ego_log=scenario.ego_log,
+        render_start_us=scenario.start_us,
+        force_gt_us=scenario.warmup_us,
+        control_us=scenario.rates.control_us,
+        n_steps=n_steps,
+        seed=seed,
+        versions=dict(versions or {}),
+    )
+
+
+def T_rig_box(vehicle: Vehicle) -> F64:
+    """Return the ``(4, 4)`` pose of a vehicle's box centre in its rig frame: a pure translation."""
+    out = np.eye(4)
+    out[:3, 3] = vehicle.rear_axle_to_centre_m, 0.0, vehicle.box.height_m / 2
+    return out
+
+
+# --- to the wire ----------------------------------------------------------------------------------------------------
+
+
+def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
+    """Return one message a pose.
+
+    Args:
+        xyz: ``(N, 3)`` metres.
+        quat: ``(N, 4)`` wxyz; normalised here.
+        what: Whose poses, for the error.
+
+    Raises:
+        InputError: A value is not finite, a quaternion is zero, or a coordinate is too large for float32.
+    """
+    norm = np.linalg.norm(quat, axis=-1, keepdims=True)
+    bad = ~(np.isfinite(xyz).all(axis=-1) & (np.abs(xyz) < MAX_LOCAL_M).all(axis=-1) & np.isfinite(norm[:, 0]) & (norm[:, 0] > 0))
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise InputError(
+            "writing a rollout log",
+            what,
+            f"pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
+            f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
+        )
+    rows = np.concatenate([xyz, quat / norm], axis=1).tolist()
+    return [
+        common_pb2.Pose(vec=common_pb2.Vec3(x=x, y=y, z=z), quat=common_pb2.Quat(w=w, x=qx, y=qy, z=qz)) for x, y, z, w, qx, qy, qz in rows
+    ]
+
+
+def wire_pose(transform: F64, what: str) -> common_pb2.Pose:
+    """Return the message of one ``(4, 4)`` transform; see `wire_poses`."""
+    return wire_poses(transform[None, :3, 3], quat_from_matrix(transform[None, :3, :3]), what)[0]
+
+
+def wire_trajectory(trajectory: Trajectory, what: str) -> common_pb2.Trajectory:
+    """Return the message of a trajectory; see `wire_poses`."""
+    poses = wire_poses(trajectory.xyz, trajectory.quat, what)
+    times = trajectory.t_us.tolist()
+    return common_pb2.Trajectory(poses=[common_pb2.PoseAtTime(pose=pose, timestamp_us=t) for pose, t in zip(poses, times, strict=True)])
+
+
+def wire_dynamics(state: EgoState) -> common_pb2.DynamicState:
+    """Return speeds and accelerations in the rig frame, for planar motion without side slip at the rear axle."""
+    return common_pb2.DynamicState(
+        angular_velocity=common_pb2.Vec3(z=state.yaw_rate_radps),
+        linear_velocity=common_pb2.Vec3(x=state.speed_mps),
+        linear_acceleration=common_pb2.Vec3(x=state.accel_mps2, y=state.speed_mps * state.yaw_rate_radps),
+        angular_acceleration=common_pb2.Vec3(),
+    )
+
+
+def wire_box(box: Box) -> common_pb2.AABB:
+    """Return the message of a box."""
+    return common_pb2.AABB(size_x=box.length_m, size_y=box.width_m, size_z=box.height_m)
+
+
+def wire_camera(camera: CameraSpec) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
+    """Return a camera with the pinhole that is really rendered."""
+    return sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
+        intrinsics=wire_intrinsics(camera),
+        rig_to_camera=wire_pose(camera.T_rig_camera, f"mounting of camera {camera.name!r}"),
+        logical_id=camera.name,
+    )
+
+
+def wire_intrinsics(camera: CameraSpec) -> sensorsim_pb2.CameraSpec:
+    """Return the intrinsics of a camera; all twelve distortion coefficients are stated, as zeros."""
+    return sensorsim_pb2.CameraSpec(
+        opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
+            principal_point_x=camera.K[0, 2],
+            principal_point_y=camera.K[1, 2],
+            focal_length_x=camera.K[0, 0],
+            focal_length_y=camera.K[1, 1],
+            radial_coeffs=[0.0] * 6,
+            tangential_coeffs=[0.0] * 2,
+            thin_prism_coeffs=[0.0] * 4,
+        ),
+        logical_id=camera.name,
+        resolution_h=camera.height,
+        resolution_w=camera.width,
+        shutter_type=sensorsim_pb2.ROLLING_TOP_TO_BOTTOM if camera.shutter_us else sensorsim_pb2.GLOBAL,
+    )
+
+
+# --- from the wire --------------------------------------------------------------------------------------------------
+
+
+def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
+    """Return positions ``(N, 3)`` and unit quaternions ``(N, 4)``, widened to float64.
+
+    Raises:
+        InputError: A value is not finite, or a squared quaternion norm is off 1 by more than 1e-4 (an unset quaternion is all zero).
+    """
+    rows = [(p.vec.x, p.vec.y, p.vec.z, p.quat.w, p.quat.x, p.quat.y, p.quat.z) for p in poses]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    xyz, quat = table[:, :3], table[:, 3:]
+    square = np.sum(quat * quat, axis=1)
+    bad = ~(np.isfinite(xyz).all(axis=1) & (np.abs(square - 1.0) <= QUAT_NORM_TOLERANCE))
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise InputError(
+            "reading a rollout log",
+            what,
+            f"pose {i}: position {xyz[i].tolist()}, quaternion {quat[i].tolist()} with |q|^2 = {square[i]:.6g}",
+            "write the log again with finite positions and unit quaternions (w = 1 where there is no rotation)",
+        )
+    return xyz, quat / np.sqrt(square)[:, None]
+
+
+def read_trajectory(message: common_pb2.Trajectory, what: str) -> Trajectory:
+    """Return a trajectory.
+
+    Raises:
+        InputError: Times do not increase strictly, or a pose is bad (see `read_poses`).
+    """
+    t_us = increasing_times([p.timestamp_us for p in message.poses], what)
+    xyz, quat = read_poses((p.pose for p in message.poses), what)
+    return Trajectory(t_us, xyz, quat)
+
+
+def increasing_times(times: Sequence[int], what: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """Return times ``(N,)`` int64.
+
+    Raises:
+        InputError: They do not increase strictly, or exceed 63 bits.
+    """
+    steps = [i for i in range(1, len(times)) if times[i] <= times[i - 1]]
+    if steps or any(t > np.iinfo(np.int64).max for t in times):
+        i = steps[0] if steps else int(np.argmax(times))
+        raise InputError(
+            "reading a rollout log",
+            what,
+            f"time {times[i]} us at index {i}" + (f" after {times[i - 1]} us" if steps else ""),
+            "write the log again with strictly increasing times in microseconds",
+        )
+    return np.array(times, dtype=np.int64)
+
+
+def read_transform(pose: common_pb2.Pose, what: str) -> F64:
+    """Return the ``(4, 4)`` transform of one pose; see `read_poses`."""
+    xyz, quat = read_poses([pose], what)
+    return se3(xyz[0], quat[0])
+
+
+def read_camera(camera: sensorsim_pb2.AvailableCamerasReturn.AvailableCamera) -> CameraSpec | None:
+    """Return a pinhole camera, or None for a lens that no `CameraSpec` can state."""
+    spec = camera.intrinsics
+    if spec.WhichOneof("camera_param") != "opencv_pinhole_param":
+        return None
+    p = spec.opencv_pinhole_param
+    if any((*p.radial_coeffs, *p.tangential_coeffs, *p.thin_prism_coeffs)):
+        return None
+    matrix = np.array([[p.focal_length_x, 0.0, p.principal_point_x], [0.0, p.focal_length_y, p.principal_point_y], [0.0, 0.0, 1.0]])
+    mounting = read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
+    return CameraSpec(camera.logical_id, spec.resolution_w, spec.resolution_h, matrix, mounting)
+
+
+def rigid_product(xyz: F64, quat: F64, T_body_other: F64) -> tuple[F64, F64]:
+    """Return poses ``(N, 3)``, ``(N, 4)`` of a frame that is shifted, not turned, in the body: exact in rotation."""
+    return xyz + matrix_from_quat(quat) @ T_body_other[:3, 3], quat

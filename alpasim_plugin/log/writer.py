@@ -1,0 +1,327 @@
+"""Write a rollout as an ASL log that AlpaSim's own tools score."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.alpasim.asl import AslFile
+from alpasim_plugin.alpasim.wire import common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2, traffic_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry import interpolate, inverse, quat_from_matrix, se3, trajectory_from_poses
+from alpasim_plugin.log.images import ImageEncoding, encode_image
+from alpasim_plugin.log.schema import (
+    EGO,
+    RolloutHeader,
+    rigid_product,
+    wire_box,
+    wire_camera,
+    wire_dynamics,
+    wire_intrinsics,
+    wire_pose,
+    wire_poses,
+    wire_trajectory,
+)
+from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
+
+WIRE_API = (0, 54, 0)  # AlpaSim's API version whose messages these are
+_SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "controller", "video_model")
+
+
+class AslWriter:
+    """Append the entries of one rollout, in the order AlpaSim's runtime writes them.
+
+    ``begin`` first; then for every step ``render_request``, ``camera_image``, ``ego_trajectory``, ``route``, ``driver_request``,
+    ``driver_return``, ``controller_request``, ``controller_return`` and the ``actor_poses`` of the next instant; last ``finish``.
+    Only ``begin``, ``actor_poses`` and the driver pair are needed for scoring. Until ``finish`` the file is called ``PATH.part``.
+
+    Example:
+        >>> with AslWriter("rollout.asl", header) as log:  # doctest: +SKIP
+        ...     log.begin(cameras)
+        ...     log.actor_poses(t_us, T_world_rig, {"car": T_world_box})
+    """
+
+    def __init__(self, path: Path | str, header: RolloutHeader) -> None:
+        """Open the log; the folder must exist.
+
+        Raises:
+            InputError: An actor bears the ego's name, or two actors the same one.
+            InfrastructureError: The file cannot be created.
+        """
+        names = [actor.actor_id for actor in header.actors]
+        if EGO in names or len(set(names)) < len(names):
+            raise InputError(
+                "writing a rollout log",
+                f"scene {header.scene_id!r}",
+                f"actor ids {sorted({n for n in names if n == EGO or names.count(n) > 1})} are taken or repeated",
+                f"give every actor an id of its own; {EGO!r} is the ego's",
+            )
+        self.header = header
+        self._known = frozenset(names)
+        self._uuid = header.session_uuid
+        self._T_rig_box = header.T_rig_box
+        self._file = AslFile(path)
+
+    # --- start ------------------------------------------------------------------------------------------------------
+
+    def begin(self, cameras: Sequence[CameraSpec], context: Mapping[str, F64] | None = None) -> None:
+        """Write everything that precedes the first step.
+
+        Args:
+            cameras: Cameras the policy receives.
+            context: ``T_world_box`` of the actors present at the first recorded ego pose. AlpaSim logs the poses of that instant too
+                when it lies before the first frame; None takes them from the recorded tracks.
+        """
+        header = self.header
+        listed = [wire_camera(camera) for camera in cameras]
+        self._write(rollout_metadata=self._metadata())
+        self._write(available_cameras_request=sensorsim_pb2.AvailableCamerasRequest(scene_id=header.scene_id))
+        self._write(available_cameras_return=sensorsim_pb2.AvailableCamerasReturn(available_cameras=listed))
+        request = egodriver_pb2.DriveSessionRequest
+        vehicle = request.RolloutSpec.VehicleDefinition(available_cameras=listed)
+        self._write(
+            driver_session_request=request(
+                session_uuid=self._uuid,
+                random_seed=header.seed,
+                debug_info=request.DebugInfo(scene_id=header.scene_id),
+                rollout_spec=request.RolloutSpec(vehicle=vehicle),
+            )
+        )
+        self._write(traffic_session_request=self._traffic_session())
+        first_us = int(header.ego_log.t_us[0])
+        if first_us < header.render_start_us:
+            present = self._recorded(first_us) if context is None else context
+            self.actor_poses(first_us, se3(header.ego_log.xyz[0], header.ego_log.quat[0]), present)
+
+    # --- each step --------------------------------------------------------------------------------------------------
+
+    def actor_poses(self, t_us: int, T_world_rig: F64, actors: Mapping[str, F64]) -> None:
+        """Write true poses at one instant: the ego's rig pose, and ``T_world_box`` of the actors present.
+
+        Raises:
+            InputError: An actor that the header does not define, or a pose that is not finite.
+        """
+        unknown = set(actors) - self._known
+        if unknown:
+            raise InputError(
+                "writing a rollout log",
+                f"actor poses at {t_us} us",
+                f"actors {sorted(unknown)} are not in the header",
+                "list every actor in RolloutHeader.actors; others are invisible to scorers",
+            )
+        ids = sorted(actors)
+        poses = np.stack([*(actors[i] for i in ids), T_world_rig @ self._T_rig_box])
+        messages = wire_poses(poses[:, :3, 3], quat_from_matrix(poses[:, :3, :3]), f"actors {[*ids, EGO]} at {t_us} us")
+        pose = logging_pb2.ActorPoses.ActorPose
+        entries = [pose(actor_id=i, actor_pose=m) for i, m in zip([*ids, EGO], messages, strict=True)]
+        self._write(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=entries))
+
+    def render_request(self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png") -> None:
+        """Write the frames asked for at one instant, bundled as AlpaSim sends them by default."""
+        items = [
+            sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=r.camera.name, request=self._render_request(r, encoding)) for r in requests
+        ]
+        self._write(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=items))
+
+    def camera_image(self, frame: Frame, encoding: ImageEncoding = "png", shutter_us: int = 0, quality: int = 95) -> None:
+        """Write one frame as the driver received it."""
+        self.encoded_image(frame.camera, frame.t_us - shutter_us, frame.t_us, encode_image(frame.rgb, encoding, quality))
+
+    def encoded_image(self, camera: str, start_us: int, end_us: int, data: bytes) -> None:
+        """Write one frame that is already encoded; ``end_us`` is its time stamp."""
+        image = egodriver_pb2.RolloutCameraImage.CameraImage(
+            frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera
+        )
+        self._write(driver_camera_image=egodriver_pb2.RolloutCameraImage(session_uuid=self._uuid, camera_image=image))
+
+    def ego_trajectory(self, states: Sequence[EgoState]) -> None:
+        """Write the ego states the driver learned since the last call; the first call carries the recorded context."""
+        poses = np.stack([s.T_world_rig for s in states])
+        trajectory = trajectory_from_poses([s.t_us for s in states], poses)
+        self._write(
+            driver_ego_trajectory=egodriver_pb2.RolloutEgoTrajectory(
+                session_uuid=self._uuid,
+                trajectory=wire_trajectory(trajectory, "ego states"),
+                dynamic_states=[wire_dynamics(s) for s in states],
+            )
+        )
+
+    def route(self, t_us: int, route_rig: F64) -> None:
+        """Write the route ahead, ``(N, 3)`` in the rig frame; rows of NaN stand for its missing end."""
+        points = [common_pb2.Vec3(x=x, y=y, z=z) for x, y, z in np.asarray(route_rig).tolist()]
+        route = egodriver_pb2.Route(waypoints=points, timestamp_us=t_us)
+        self._write(route_request=egodriver_pb2.RouteRequest(session_uuid=self._uuid, route=route))
+
+    def driver_request(self, now_us: int, query_us: int) -> None:
+        """Write that the driver is asked at ``now_us`` for a plan through ``query_us`` (one control step later)."""
+        self._write(driver_request=egodriver_pb2.DriveRequest(session_uuid=self._uuid, time_now_us=now_us, time_query_us=query_us))
+
+    def driver_return(self, plan: Trajectory, samples: Sequence[Trajectory] = (), terminate: bool = False) -> None:
+        """Write the driver's answer.
+
+        Args:
+            plan: Absolute rig poses in the world, the first at the time of the request; empty where the driver gave none.
+            samples: Alternatives it considered, the same way; they feed minADE.
+            terminate: The driver ends the rollout.
+        """
+        debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=[wire_trajectory(s, "a sampled plan") for s in samples])
+        self._write(
+            driver_return=egodriver_pb2.DriveResponse(
+                trajectory=wire_trajectory(plan, "the driver's plan"), debug_info=debug, terminate_session=terminate
+            )
+        )
+
+    def controller_request(self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False) -> None:
+        """Write what the vehicle model is asked: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
+
+        Args:
+            state: True state now.
+            plan: Active plan; stored in the rig frame of its first pose, or empty.
+            to_us: Time to reach.
+            forced: The recording is forced, so the answer will be ignored.
+        """
+        if len(plan):
+            poses = se3(plan.xyz, plan.quat)
+            plan = trajectory_from_poses(plan.t_us, inverse(poses[0]) @ poses)
+        self._write(
+            controller_request=controller_pb2.RunControllerAndVehicleModelRequest(
+                session_uuid=self._uuid,
+                state=common_pb2.StateAtTime(
+                    timestamp_us=state.t_us, pose=wire_pose(state.T_world_rig, "ego state"), state=wire_dynamics(state)
+                ),
+                planned_trajectory_in_rig=wire_trajectory(plan, "the active plan"),
+                future_time_us=to_us,
+                coerce_dynamic_state=forced,
+                pose_reporting_interval_us=self.header.control_us,
+            )
+        )
+
+    def controller_return(self, state: EgoState) -> None:
+        """Write the state the vehicle model reached; estimated equals true, as no pose error is modelled."""
+        pose, dynamics = wire_pose(state.T_world_rig, "ego state"), wire_dynamics(state)
+        reached = controller_pb2.RunControllerAndVehicleModelResponse.PropagatedState(
+            timestamp_us=state.t_us,
+            pose_local_to_rig=pose,
+            pose_local_to_rig_estimated=pose,
+            dynamic_state=dynamics,
+            dynamic_state_estimated=dynamics,
+        )
+        self._write(controller_return=controller_pb2.RunControllerAndVehicleModelResponse(states=[reached]))
+
+    # --- end --------------------------------------------------------------------------------------------------------
+
+    def finish(self) -> None:
+        """Flush the log and give it its name."""
+        self._file.finish()
+
+    def abandon(self) -> None:
+        """Close an unfinished log; it stays as ``PATH.part``."""
+        self._file.abandon()
+
+    def __enter__(self) -> AslWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._file.__exit__(kind, error, traceback)
+
+    # --- messages ---------------------------------------------------------------------------------------------------
+
+    def _write(self, **entry: Any) -> None:
+        self._file.write(logging_pb2.LogEntry(**entry))
+
+    def _metadata(self) -> logging_pb2.RolloutMetadata:
+        header, message = self.header, logging_pb2.RolloutMetadata
+        box = message.ActorDefinitions.ActorAABB
+        actors = [box(actor_id=EGO, aabb=wire_box(header.vehicle.box))]
+        actors += [box(actor_id=a.actor_id, aabb=wire_box(a.box), actor_label=a.label) for a in header.actors]
+        return message(
+            session_metadata=message.SessionMetadata(
+                session_uuid=self._uuid,
+                scene_id=header.scene_id,
+                batch_size=1,
+                n_sim_steps=header.n_steps,
+                start_timestamp_us=int(header.ego_log.t_us[0]),
+                control_timestep_us=header.control_us,
+                render_start_timestamp_us=header.render_start_us,
+            ),
+            actor_definitions=message.ActorDefinitions(actor_aabb=actors),
+            force_gt_duration=header.force_gt_us,
+            version_ids=message.VersionIds(**{f"{name}_version": self._version(name) for name in _SERVICES}),
+            transform_ego_coords_rig_to_aabb=wire_pose(self._T_rig_box, "offset from rig to box"),
+            ego_rig_recorded_ground_truth_trajectory=wire_trajectory(header.ego_log, "the recorded ego poses"),
+        )
+
+    def _version(self, service: str) -> common_pb2.VersionId:
+        given = self.header.versions.get(service, _own_version() if service == "runtime" else "<skip>")
+        major, minor, patch = WIRE_API
+        api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
+        return common_pb2.VersionId(version_id=given, git_hash="<skip>" if given == "<skip>" else "", grpc_api_version=api)
+
+    def _traffic_session(self) -> traffic_pb2.TrafficSessionRequest:
+        header = self.header
+        xyz, quat = rigid_product(header.ego_log.xyz, header.ego_log.quat, self._T_rig_box)
+        ego = Trajectory(header.ego_log.t_us, xyz, quat)
+        objects = [
+            traffic_pb2.ObjectTrajectory(
+                aabb=wire_box(header.vehicle.box), trajectory=wire_trajectory(ego, "the recorded ego"), object_id=EGO, is_static=False
+            )
+        ]
+        objects += [
+            traffic_pb2.ObjectTrajectory(
+                aabb=wire_box(a.box),
+                trajectory=wire_trajectory(a.track, f"track of actor {a.actor_id!r}"),
+                object_id=a.actor_id,
+                is_static=a.is_static,
+                label_class=a.label,
+            )
+            for a in header.actors
+        ]
+        return traffic_pb2.TrafficSessionRequest(
+            session_uuid=self._uuid,
+            scene_id=header.scene_id,
+            random_seed=header.seed,
+            logged_object_trajectories=objects,
+            handover_time_us=header.render_start_us + header.force_gt_us,
+        )
+
+    def _recorded(self, t_us: int) -> dict[str, F64]:
+        """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or around it."""
+        tracks = ((a.actor_id, a.track) for a in self.header.actors if len(a.track))
+        return {i: interpolate(track, t_us) for i, track in tracks if track.t_us[0] <= t_us <= track.t_us[-1]}
+
+    def _render_request(self, request: RenderRequest, encoding: ImageEncoding) -> sensorsim_pb2.RGBRenderRequest:
+        camera = request.camera
+        start, end = (wire_pose(T, f"pose of camera {camera.name!r}") for T in request.T_world_camera)
+        objects = []
+        if request.actors:
+            ids = sorted(request.actors)
+            stack = np.stack([request.actors[i] for i in ids])
+            poses = wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
+            pair = sensorsim_pb2.PosePair
+            objects = [
+                sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p)) for i, p in zip(ids, poses, strict=True)
+            ]
+        return sensorsim_pb2.RGBRenderRequest(
+            scene_id=self.header.scene_id,
+            resolution_h=camera.height,
+            resolution_w=camera.width,
+            camera_intrinsics=wire_intrinsics(camera),
+            frame_start_us=request.t_us - camera.shutter_us,
+            frame_end_us=request.t_us,
+            sensor_pose=sensorsim_pb2.PosePair(start_pose=start, end_pose=end),
+            dynamic_objects=objects,
+            image_format=sensorsim_pb2.PNG if encoding == "png" else sensorsim_pb2.JPEG,
+            image_quality=95,
+        )
+
+
+def _own_version() -> str:
+    try:
+        return metadata.version("alpasim-onefixer")
+    except metadata.PackageNotFoundError:
+        return "uninstalled"
