@@ -10,7 +10,7 @@ from alpasim_plugin.registry import Registry
 from alpasim_plugin.types import Vehicle
 
 CONTROLLERS: Registry[Controller] = Registry("controller", "simrun.controllers")
-CONTROLLERS.register("tracker", "kinematic bicycle that follows the plan with preview, within the vehicle's limits")(PlanTracker)
+CONTROLLERS.register("bicycle", "kinematic bicycle that follows the plan with preview, within the vehicle's limits")(PlanTracker)
 CONTROLLERS.register("perfect", "the ego is exactly where its plan says")(PerfectController)
 
 __all__ = ["CONTROLLERS", "BicycleState", "Command", "Controller", "PerfectController", "PlanTracker", "make_controller"]
