@@ -11,7 +11,7 @@ from typing import Any
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.renderers.base import make_renderer
 from alpasim_plugin.runtime.plan import Cell, RunOptions
-from alpasim_plugin.runtime.recorder import Recorder
+from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
@@ -44,7 +44,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).unlink(missing_ok=True)
         scenario = _scenario(cell.ref)
-        with Recorder.to_folder(folder, scenario, cell, options) as recorder:
+        with Recorder(scenario, cell.seed, folder, cell.rollout_key, options.images, options.video != "none") as recorder:
             run_rollout(
                 scenario,
                 make_renderer(cell.renderer, scenario, seed=cell.seed, device=options.device, threads=threads),
@@ -54,7 +54,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[
             )
         manifest |= recorder.facts()
         manifest |= _score(folder, cell, options, scenario)
-        recorder.save_pictures(folder, events=manifest["events"])
+        recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"
     except SimrunError as error:
         manifest |= {"status": "failed", "error": error.as_dict(), "traceback": traceback.format_exc()}
@@ -91,10 +91,10 @@ def finished(cell: Cell, root: Path) -> dict[str, Any] | None:
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
-    scored = score_log(folder / "rollout.asl", scenario, options.preset, side=read_json(folder / "frames.json"))
+    scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset)
     keys = {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed}
     write_table(folder / "steps.parquet", [keys | row for row in scored.steps], STEPS_SCHEMA)
-    return {"metrics": scored.values, "events": scored.events, "censored": scored.censored}
+    return {"metrics": scored.values, "events": scored.events}
 
 
 @lru_cache(maxsize=4)

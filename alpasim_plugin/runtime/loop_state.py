@@ -63,23 +63,36 @@ class LoopState:
         route = route_in_rig(self.scenario.route, self.ego.T_world_rig)
         return Observation(self.ego.t_us, dict(self.frames), cameras, self.ego, self.history, route)
 
-    def to_world(self, plan: Plan) -> Trajectory:
-        """Map a plan from the rig frame now to absolute poses; plans are planar, so the rig's heading alone turns them."""
+    def to_world(self, plan: Plan) -> list[Trajectory]:
+        """Map a plan and then its alternatives from the rig frame now to absolute poses.
+
+        Plans are planar, so the rig's heading alone turns them.
+        """
         yaw0, origin = yaw_of(self.ego.T_world_rig), self.ego.T_world_rig[:3, 3]
         c, s = np.cos(yaw0), np.sin(yaw0)
-        xy = plan.xy @ np.array([[c, s], [-s, c]]) + origin[:2]
-        xyz = np.column_stack([xy, np.full(len(xy), origin[2])])
-        return Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(plan.yaw + yaw0)))
+        turn = np.array([[c, s], [-s, c]])
 
-    def advance(self, controller: Controller, plan: Trajectory | None, to_us: int) -> None:
-        """Move the ego to ``to_us``: along the log while it is forced, otherwise by the vehicle model, then onto the ground."""
-        if to_us <= self.closed_loop_us:
+        def place(xy: F64, yaw: F64) -> Trajectory:
+            xyz = np.column_stack([xy @ turn + origin[:2], np.full(len(xy), origin[2])])
+            return Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(yaw + yaw0)))
+
+        return [place(plan.xy, plan.yaw), *(place(sample[:, :2], sample[:, 2]) for sample in plan.samples)]
+
+    def advance(self, controller: Controller, plan: Trajectory | None, to_us: int) -> bool:
+        """Move the ego to ``to_us``: along the log while it is forced, otherwise by the vehicle model, then onto the ground.
+
+        Returns:
+            Whether the log was forced.
+        """
+        forced = to_us <= self.closed_loop_us
+        if forced:
             self.ego = ego_state_from_log(self.scenario.ego_log, to_us, self.scenario.vehicle)
         else:
             moved = controller.advance(self.ego, plan, to_us)
             x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
             self.ego = replace(moved, T_world_rig=ground_pose(self.scenario.ground, x, y, yaw_of(moved.T_world_rig)))
         self._remember()
+        return forced
 
     def _remember(self) -> None:
         n = self._filled

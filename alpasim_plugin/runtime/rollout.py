@@ -66,10 +66,12 @@ def run_rollout(
             began = time.perf_counter()
             with recorder.stage("policy"):
                 plan = checked_plan(policy, observation)
-            plan_world = state.to_world(plan)
+            plan_world, *alternatives = state.to_world(plan)
             plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
-            recorder.answer(plan, plan_world)
+            recorder.answer(plan_world, alternatives)
+        before, in_force = state.ego, plans.active(tick.t_us)
         with recorder.stage("control"):
-            state.advance(controller, plans.active(tick.t_us), tick.t_us + clock.rates.control_us)
+            forced = state.advance(controller, in_force, tick.t_us + clock.rates.control_us)
+        recorder.moved(before, in_force, state.ego, forced)
     recorder.finish()
     return recorder

@@ -1,0 +1,86 @@
+"""``simrun doctor``: is this machine able to run, and what would make it better."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.runtime.provenance import hardware, versions
+
+EPILOG = "Example: `simrun doctor --json`"
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Try each part on a small case and say what works, what does not, and what to do about it."""
+    del debug
+    checks: dict[str, Callable[[], str]] = {
+        "rasteriser (cpu)": lambda: _raster("cpu"),
+        "rasteriser (gsplat)": lambda: _raster("gsplat"),
+        "video": _video,
+        "log messages": _wire,
+        "disk": _disk,
+    }
+    needed = {"rasteriser (cpu)", "video", "log messages", "disk"}
+    rows = []
+    for name, check in checks.items():
+        try:
+            rows.append({"check": name, "ok": True, "needed": name in needed, "found": check(), "do": ""})
+        except SimrunError as error:
+            rows.append({"check": name, "ok": False, "needed": name in needed, "found": error.found, "do": error.do_this})
+    broken = [row for row in rows if row["needed"] and not row["ok"]]
+    if as_json:
+        print(json.dumps({"hardware": hardware(), "versions": versions(), "checks": rows}))
+    else:
+        for key, value in (hardware() | versions()).items():
+            print(f"{key:>32}  {value}")
+        for row in rows:
+            mark = "ok" if row["ok"] else "BROKEN" if row["needed"] else "absent"
+            print(f"{row['check']:>32}  {mark}: {row['found']}" + (f" -> {row['do']}" if row["do"] else ""))
+    raise typer.Exit(4 if broken else 0)
+
+
+def _raster(backend: str) -> str:
+    from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
+
+    cloud = GaussianCloud(
+        np.array([[0.0, 0.0, 2.0]]),
+        np.array([[1.0, 0.0, 0.0, 0.0]]),
+        np.full((1, 3), 0.2),
+        np.array([0.9]),
+        np.zeros((1, 1, 3)),
+    )
+    camera = PinholeCamera(32, 32, np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]), np.eye(4))
+    out = rasterize(cloud, camera, background=(0.0, 0.0, 0.0), backend=backend)
+    return f"one Gaussian rendered, peak alpha {float(np.asarray(out.alpha).max()):.2f}"
+
+
+def _video() -> str:
+    from alpasim_plugin.log.video import read_mp4, write_mp4
+
+    frames = [np.full((32, 48, 3), 40 * i, dtype=np.uint8) for i in range(4)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "test.mp4"
+        write_mp4(path, frames, 10)
+        return f"H.264: {len(list(read_mp4(path)))} frames written and read back"
+
+
+def _wire() -> str:
+    from alpasim_plugin.alpasim import wire
+
+    return f"compiled messages load: {wire.__name__}"
+
+
+def _disk() -> str:
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    return f"{free:.1f} GiB free here"

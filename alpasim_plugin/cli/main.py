@@ -1,0 +1,67 @@
+"""Entry point of ``simrun``: verbs, the default verb ``run``, and one place that turns errors into exit codes."""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+
+import typer
+
+from alpasim_plugin.cli import bench, doctor, listing, report, run
+from alpasim_plugin.errors import SimrunError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
+    "Without a verb `run` is meant: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
+    "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, 5 evaluator failure, 130 interrupted.",
+)
+app.command("run", epilog=run.EPILOG)(run.run)
+app.command("report", epilog=report.EPILOG)(report.report)
+app.command("list", epilog=listing.EPILOG)(listing.list_parts)
+app.command("doctor", epilog=doctor.EPILOG)(doctor.doctor)
+app.add_typer(bench.app, name="bench")
+
+VERBS = ("run", "report", "list", "doctor", "bench")
+OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
+
+
+def with_verb(args: list[str]) -> list[str]:
+    """Insert the verb ``run`` where the first word is none.
+
+    Example:
+        >>> with_verb(["--renderer", "clean", "smoke/straight"])
+        ['run', '--renderer', 'clean', 'smoke/straight']
+        >>> with_verb(["list", "renderers"])
+        ['list', 'renderers']
+    """
+    return ["run", *args] if args and args[0] not in VERBS + OWN_OPTIONS else args
+
+
+def run_command(args: list[str]) -> int:
+    """Run one command line and return its exit code; errors are printed, as JSON on stdout with ``--json``."""
+    try:
+        app(args=with_verb(args), prog_name="simrun")
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else 0 if leaving.code is None else 2
+    except SimrunError as error:
+        if "--debug" in args:
+            traceback.print_exc()
+        if "--json" in args:
+            print(json.dumps({"error": error.as_dict(), "exit_code": error.exit_code}))
+        else:
+            print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def main() -> None:
+    """Run the process's command line and exit with the code of DESIGN section 4."""
+    sys.exit(run_command(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""Progress of a run: a bar on a terminal, one plain line per rollout on a pipe."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from alpasim_plugin.runtime.execute import Threads
+from alpasim_plugin.runtime.plan import RunPlan
+
+
+class Silent:
+    """Say nothing."""
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        """Ignore."""
+
+    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Ignore."""
+
+
+class Lines:
+    """One line per finished rollout on stderr, for pipes and CI logs."""
+
+    def __init__(self) -> None:
+        self._done, self._total = 0, 0
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        """Print what is about to run."""
+        self._total = len(plan.cells)
+        print(headline(plan, root, threads), file=sys.stderr, flush=True)
+
+    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Print one rollout's fate."""
+        self._done += 1
+        print(f"[{self._done}/{self._total}] {describe(manifest, reused)}", file=sys.stderr, flush=True)
+
+
+class Bar:
+    """A live bar on stderr."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self._console,
+            transient=True,
+        )
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        """Show the bar."""
+        self._console.print(headline(plan, root, threads), highlight=False)
+        self._task = self._progress.add_task("rollouts", total=len(plan.cells))
+        self._progress.start()
+
+    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Advance the bar; failures stay on the screen."""
+        if manifest["status"] != "ok":
+            self._progress.console.print(describe(manifest, reused), highlight=False, markup=False)
+        self._progress.update(self._task, advance=1, description=f"{manifest['renderer']} {manifest['scene']}")
+        if self._progress.finished:
+            self._progress.stop()
+
+
+def make_progress(quiet: bool) -> Silent | Lines | Bar:
+    """Choose how to show progress on standard error."""
+    if quiet:
+        return Silent()
+    return Bar() if sys.stderr.isatty() else Lines()
+
+
+def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
+    """Say in one line what runs where."""
+    shape = f"{len(plan.renderers)} renderer(s) x {len(plan.policies)} policy(ies) x {len(plan.scenarios)} scene(s) x {len(plan.seeds)} seed(s)"
+    return f"{len(plan.cells)} rollouts ({shape}), {threads.workers} worker(s) x {threads.per_worker} thread(s) -> {root}"
+
+
+def describe(manifest: dict[str, Any], reused: bool) -> str:
+    """Say in one line how a rollout went."""
+    cell = f"{manifest['renderer']} {manifest['policy']} {manifest['scene']} seed {manifest['seed']}"
+    if manifest["status"] != "ok":
+        return f"{cell}: FAILED ({manifest['error']['failure_class']}) {manifest['error']['found']}"
+    events = ", ".join(event["metric"] for event in manifest.get("events", [])) or "no event"
+    return f"{cell}: {events}" + (" (reused)" if reused else f", {manifest['wall_s']:.1f} s")

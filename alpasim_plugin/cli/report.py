@@ -1,0 +1,32 @@
+"""``simrun report``: write a run's report again from its tables."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from alpasim_plugin.runtime.store import read_json
+from evaluators.report import render_table, write_junit, write_report, write_summary_md
+
+EPILOG = "Example: `simrun report runs/us101`"
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="A run folder.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Write report.html, summary.md and junit.xml of a run again and print its table."""
+    del debug
+    summary = read_json(run / "summary.json")
+    write_summary_md(run)
+    write_junit(run)
+    page = write_report(run)
+    if as_json:
+        print(json.dumps({"report": str(page), "summary": summary}))
+    else:
+        print(render_table(summary))
+        print(f"report  {page}")

@@ -1,0 +1,148 @@
+"""``simrun [run]``: drive scenarios behind renderers and tabulate what happened."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from alpasim_plugin.cli.progress import make_progress
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.renderers.base import RENDERERS
+from alpasim_plugin.runtime.execute import thread_budget
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
+from evaluators import PRESETS
+from evaluators.report import render_table
+from policies.base import check_policy_name
+from scenarios.suite import expand
+
+INTERRUPTED = 130
+
+EPILOG = """
+Examples:
+
+- `simrun --renderer clean,3dgs --policy lane-camera --seeds 3 real/us101`
+
+- `simrun --renderer 3dgs --policy pure-pursuit suites/smoke --out runs/smoke --video all`
+
+- `simrun --renderer clean --policy log-replay ../data/av2/7fab2350`
+"""
+
+
+def run(
+    scenarios: Annotated[
+        list[str], typer.Argument(help="Scenario or suite YAML, shipped name, folder of them, Argoverse 2 log, CommonRoad XML, Cosmos clip.")
+    ],
+    renderer: Annotated[str, typer.Option("--renderer", help="Renderers, comma-separated.")] = "3dgs",
+    policy: Annotated[str, typer.Option("--policy", help="Policies, comma-separated; `package.module:Class` works too.")] = "lane-camera",
+    seeds: Annotated[str, typer.Option("--seeds", help="How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",
+    preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; by default one per core.")] = None,
+    executor: Annotated[Literal["local", "ray", "slurm"], typer.Option("--executor", help="Where rollouts run.")] = "local",
+    video: Annotated[Literal["none", "failures", "all"], typer.Option("--video", help="Write front.mp4.")] = "none",
+    images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue in a folder that another command began.")] = False,
+    baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Resolve and print the plan, run nothing.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Drive scenarios behind one or more renderers, score the drives, and write a run folder with a report.
+
+    An interrupted run continues when the same command is given again.
+    """
+    del debug  # read from the command line by cli.main, before any option is parsed
+    if executor != "local":
+        raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is built", "use --executor local")
+    names = [name.strip() for name in renderer.split(",") if name.strip()]
+    drivers = [name.strip() for name in policy.split(",") if name.strip()]
+    for name in names:
+        RENDERERS.get(name)
+    for name in drivers:
+        check_policy_name(name)
+    _check_preset(preset)
+    if baseline is not None and baseline not in names:
+        raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")
+    refs = [ref for item in scenarios for ref in expand(item, tuple(overrides or ()))]
+    plan = make_plan(refs, names, drivers, parse_seeds(seeds), RunOptions(preset, images, video, device, baseline))
+    root = out or default_folder(plan)
+    if dry_run:
+        _print_plan(plan, root, workers, as_json)
+        return
+    try:
+        result = execute_run(plan, root, workers, ["simrun", *sys.argv[1:]], make_progress(quiet or as_json), resume)
+    except KeyboardInterrupt:
+        print(f"interrupted; finished rollouts are in {root}; the same command continues", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
+    _print_result(result, as_json)
+    raise typer.Exit(result.exit_code)
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Return the seeds meant by ``--seeds``.
+
+    Example:
+        >>> parse_seeds("3"), parse_seeds("4,7")
+        ([0, 1, 2], [4, 7])
+
+    Raises:
+        InputError: Not a positive count nor a list of non-negative integers.
+    """
+    try:
+        values = [int(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        values = []
+    if "," not in text and len(values) == 1 and values[0] > 0:
+        return list(range(values[0]))
+    if "," in text and values and min(values) >= 0:
+        return values
+    raise InputError("reading --seeds", f"--seeds {text}", "neither a count nor a list", "write a count such as 3, or a list such as 4,7")
+
+
+def _check_preset(preset: str) -> None:
+    if preset not in PRESETS:
+        raise InputError("choosing a preset", f"--preset {preset}", "no such preset", f"known: {', '.join(PRESETS)}")
+
+
+def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -> None:
+    threads = thread_budget(workers, len(plan.cells))
+    frames = sum((s.end_us - s.start_us) // s.rates.camera_us for s in plan.scenarios.values())
+    per_cell = len(plan.renderers) * len(plan.policies) * len(plan.seeds)
+    facts = {
+        "out": str(root),
+        "key": plan.key,
+        "rollouts": len(plan.cells),
+        "scenes": list(plan.scenarios),
+        "renderers": list(plan.renderers),
+        "policies": list(plan.policies),
+        "seeds": list(plan.seeds),
+        "camera_frames": int(frames * per_cell),
+        "workers": threads.workers,
+        "threads_per_worker": threads.per_worker,
+    }
+    if as_json:
+        print(json.dumps(facts))
+        return
+    for key, value in facts.items():
+        print(f"{key:>18}  {', '.join(map(str, value)) if isinstance(value, list) else value}")
+
+
+def _print_result(result: RunResult, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
+        return
+    print(render_table(result.summary))
+    for cell in result.summary["failures"]["cells"][:5]:
+        print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
+    if result.n_failed:
+        print(f"{result.n_failed} of {result.n_rollouts} rollouts failed; the same command runs them again", file=sys.stderr)
+    print(f"report  {shlex.quote(str(result.root / 'report.html'))}")

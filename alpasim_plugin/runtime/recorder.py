@@ -1,0 +1,170 @@
+"""What one rollout leaves behind: the log, per-frame facts, stage times and pictures."""
+
+from __future__ import annotations
+
+import tempfile
+import uuid
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+
+from alpasim_plugin.clock import Clock
+from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
+from alpasim_plugin.runtime.stages import StageTimes
+from alpasim_plugin.runtime.store import write_bytes
+from alpasim_plugin.types import F64, U8, CameraSpec, EgoState, Frame, Observation, RenderRequest, RolloutLog, Scenario, Trajectory
+from alpasim_plugin.world.ego import ego_state_from_log
+
+LOG_NAME, FRAMES_NAME, STRIP_NAME, VIDEO_NAME = "rollout.asl", "frames.jsonl", "strip.jpg", "front.mp4"
+STRIP_FRAMES = 4
+NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+
+
+class Recorder:
+    """Receives everything a rollout does, in the loop's order, and writes it down.
+
+    Args:
+        scenario: What is driven.
+        seed: Rollout seed, for the log's header.
+        folder: Where to write; by default a temporary folder that lives as long as the recorder.
+        session: Names the rollout in the log; equal rollouts have equal names.
+        images: How camera frames enter the log.
+        keep_frames: Keep every frame for a video, or only those of the strip.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int = 0,
+        folder: Path | None = None,
+        session: str = "",
+        images: Literal["none", "jpeg", "png"] = "jpeg",
+        keep_frames: bool = False,
+    ) -> None:
+        self._temporary = tempfile.TemporaryDirectory(prefix="simrun-") if folder is None else None
+        self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
+        self._scenario, self._seed = scenario, seed
+        self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, session or f"{scenario.scene_id}/{seed}"))
+        self._images, self._keep_frames = images, keep_frames
+        self._times = StageTimes()
+        self._frames: list[dict[str, Any]] = []
+        self._kept: list[tuple[int, U8]] = []
+        self._told_us = -1
+        self._steps = 0
+        self._writer: AslWriter | None = None
+        self._clock: Clock | None = None
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        if error is not None and self._writer is not None:
+            self._writer.abandon()
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Time one pass through a stage of the loop."""
+        return self._times.measure(name)
+
+    # --- in the loop's order ----------------------------------------------------------------------------------------
+
+    def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
+        """Open the log and write its header."""
+        self._clock = clock
+        self._strip_us = {
+            clock.start_us + int(f * clock.n_steps) * clock.rates.control_us for f in np.linspace(0.1, 0.9, STRIP_FRAMES)
+        }
+        header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps)
+        self._writer = AslWriter(self.folder / LOG_NAME, header)
+        self._writer.begin(list(cameras.values()))
+
+    def poses(self, ego: EgoState, actors: Mapping[str, F64]) -> None:
+        """Log where everybody truly is."""
+        with self.stage("log"):
+            self._log.actor_poses(ego.t_us, ego.T_world_rig, actors)
+
+    def frame(self, frame: Frame, request: RenderRequest) -> None:
+        """Log one camera frame."""
+        with self.stage("log"):
+            if self._images != "none":
+                self._log.render_request([request], self._images)
+                self._log.camera_image(frame, self._images, request.camera.shutter_us)
+            self._frames.append(
+                {
+                    "t_us": frame.t_us,
+                    "camera": frame.camera,
+                    "opacity_mean": None if frame.alpha is None else round(float(frame.alpha.mean()), 5),
+                    "events": " ".join(frame.events),
+                }
+            )
+            near = any(abs(frame.t_us - t) < self._scenario.rates.camera_us / 2 for t in self._strip_us)
+            if self._keep_frames or near:
+                self._kept.append((frame.t_us, frame.rgb))
+
+    def question(self, observation: Observation, clock: Clock) -> None:
+        """Log what the policy was told."""
+        with self.stage("log"):
+            log, history = self._scenario.ego_log, observation.history.t_us
+            context = [ego_state_from_log(log, int(t), self._scenario.vehicle) for t in history[(history > self._told_us) & (history < clock.start_us)]]
+            self._log.ego_trajectory([*context, observation.ego])
+            self._told_us = observation.t_us
+            self._log.route(observation.t_us, observation.route_rig)
+            self._log.driver_request(observation.t_us, observation.t_us + clock.rates.control_us)
+
+    def answer(self, plan: Trajectory, samples: Sequence[Trajectory]) -> None:
+        """Log the policy's plan and its alternatives, in the world."""
+        with self.stage("log"):
+            self._log.driver_return(plan, samples)
+
+    def moved(self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool) -> None:
+        """Log one step of the vehicle."""
+        with self.stage("log"):
+            self._log.controller_request(before, plan if plan is not None else NO_PLAN, after.t_us, forced)
+            self._log.controller_return(after)
+            self._steps += 1
+
+    def finish(self) -> None:
+        """Close the log and write the per-frame facts."""
+        with self.stage("log"):
+            self._log.finish()
+            write_facts(self.folder / FRAMES_NAME, self._frames)
+
+    # --- afterwards -------------------------------------------------------------------------------------------------
+
+    def log(self, images: bool = True) -> RolloutLog:
+        """Read the finished log back, exactly as any scorer would."""
+        return read_asl(self.folder / LOG_NAME, images=images)
+
+    def facts(self) -> dict[str, Any]:
+        """Return counts and stage times for the manifest."""
+        events: dict[str, int] = {}
+        for frame in self._frames:
+            for event in frame["events"].split():
+                events[event] = events.get(event, 0) + 1
+        return {
+            "frames": len(self._frames),
+            "steps": self._steps,
+            "frame_events": events,
+            "stage_ms": self._times.as_ms(),
+            "session_uuid": self._session,
+        }
+
+    def save_pictures(self, video: bool) -> None:
+        """Write the strip of frames, and the video if asked for."""
+        if not self._kept:
+            return
+        strip = [rgb for t_us, rgb in self._kept if any(abs(t_us - t) < self._scenario.rates.camera_us / 2 for t in self._strip_us)]
+        if strip:
+            write_bytes(self.folder / STRIP_NAME, encode_image(np.concatenate(strip[:STRIP_FRAMES], axis=1), "jpeg", 90))
+        if video:
+            write_mp4(self.folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._scenario.rates.camera_us)
+
+    @property
+    def _log(self) -> AslWriter:
+        if self._writer is None:
+            raise RuntimeError("Recorder.start was not called")
+        return self._writer
+

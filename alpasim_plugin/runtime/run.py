@@ -1,0 +1,134 @@
+"""A whole run: plan, execute, tabulate, report; the same command continues where an interrupted one stopped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.execute import Threads, execute, thread_budget
+from alpasim_plugin.runtime.plan import RunPlan, slug
+from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runtime.scene_dump import scene_as_json
+from alpasim_plugin.runtime.store import read_json, write_json
+from alpasim_plugin.runtime.tables import write_tables
+from evaluators.report import write_junit, write_report, write_summary_md
+
+SCHEMA_VERSION = 1
+
+
+class Progress(Protocol):
+    """Shows a run to a person or a log file."""
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        """Announce the run."""
+        ...
+
+    def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
+        """Announce one rollout."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to."""
+
+    root: Path
+    summary: dict[str, Any]
+    n_rollouts: int
+    n_failed: int
+
+    @property
+    def exit_code(self) -> int:
+        """Give the process exit code of DESIGN section 4: 4 where rollouts could not be run, 5 where they could not be scored."""
+        classes = self.summary["failures"]["by_class"]
+        if set(classes) == {"evaluator"}:
+            return 5
+        return 4 if self.n_failed else 0
+
+
+def default_folder(plan: RunPlan) -> Path:
+    """Return the folder a command writes to when none is named: the same command, the same folder."""
+    first = next(iter(plan.scenarios))
+    more = f"-and-{len(plan.scenarios) - 1}-more" if len(plan.scenarios) > 1 else ""
+    return Path("runs", f"{slug(first)}{more}-{plan.key}")
+
+
+def execute_run(
+    plan: RunPlan, root: Path, workers: int | None, command: Sequence[str], progress: Progress, resume: bool = False
+) -> RunResult:
+    """Run a plan into a folder.
+
+    Raises:
+        InputError: The folder holds the run of another command and ``resume`` is not set.
+    """
+    threads = thread_budget(workers, len(plan.cells))
+    _claim(root, plan, command, threads, resume)
+    progress.started(plan, root, threads)
+    manifests: list[dict[str, Any]] = []
+    began = time.perf_counter()
+
+    def on_done(manifest: dict[str, Any], reused: bool) -> None:
+        manifest["reused"] = reused
+        progress.rollout_done(manifest, reused)
+
+    manifests = execute(plan, root, threads, on_done)
+    summary = write_tables(root, manifests, plan.options.preset, plan.options.baseline, threads, time.perf_counter() - began)
+    write_summary_md(root)
+    write_junit(root)
+    write_report(root)
+    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+
+
+def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, resume: bool) -> None:
+    """Write run.json, or check that the run in the folder is this one."""
+    path = root / "run.json"
+    if path.exists():
+        key = read_json(path).get("key")
+        if key == plan.key:
+            return
+        if not resume:
+            raise InputError(
+                "starting a run",
+                f"folder {root}",
+                f"it holds another run (key {key}; this command has {plan.key})",
+                "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
+            )
+    for scene_id, scenario in plan.scenarios.items():
+        write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scenario))
+    write_json(
+        path,
+        {
+            "schema_version": SCHEMA_VERSION,
+            "key": plan.key,
+            "command": list(command),
+            "version": versions()["alpasim-onefixer"],
+            "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "config": asdict(plan.options) | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
+            "preset": plan.options.preset,
+            "renderers": list(plan.renderers),
+            "policies": list(plan.policies),
+            "seeds": list(plan.seeds),
+            "scenes": {
+                name: {
+                    "source": s.source,
+                    "content_hash": s.content_hash,
+                    "seed": s.seed,
+                    "duration_s": (s.end_us - s.start_us) * 1e-6,
+                    "rates": asdict(s.rates),
+                    "latency": asdict(s.latency),
+                    "degradation": asdict(s.degradation),
+                    "notes": list(s.notes),
+                }
+                for name, s in plan.scenarios.items()
+            },
+            "weights": {},
+            "hardware": hardware(),
+            "versions": versions(),
+            "left_out": sorted({note for s in plan.scenarios.values() for note in s.notes}),
+        },
+    )

@@ -1,0 +1,120 @@
+"""From manifests to the tables and the summary of a run folder (DESIGN section 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from alpasim_plugin.runtime.execute import Threads
+from alpasim_plugin.runtime.store import STEPS_SCHEMA, rollouts_schema, write_bytes, write_json, write_table
+from evaluators import aggregate, censoring, paired
+
+LOOP_STAGES = ("actors", "render", "policy", "control", "log")
+
+
+def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return one flat row per rollout: its key, its fate, and every metric with its validity."""
+    rows = []
+    for manifest in manifests:
+        error = manifest.get("error") or {}
+        row: dict[str, Any] = {
+            **{key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "status", "path", "wall_s")},
+            "failure_class": error.get("failure_class"),
+            "failure": error.get("found"),
+            "frames": manifest.get("frames"),
+            "steps": manifest.get("steps"),
+        }
+        for name, entry in manifest.get("metrics", {}).items():
+            row[name] = entry["value"]
+            row[f"{name}_valid"] = entry["valid"]
+        rows.append(row)
+    return rows
+
+
+def write_tables(
+    root: Path, manifests: Sequence[dict[str, Any]], preset: str, baseline: str | None, threads: Threads, wall_s: float
+) -> dict[str, Any]:
+    """Write rollouts.parquet, steps.parquet and summary.json and return the summary."""
+    rows = rollout_rows(manifests)
+    metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
+    write_table(root / "rollouts.parquet", rows, rollouts_schema(metrics))
+    parts = [pq.read_table(root / m["path"] / "steps.parquet") for m in manifests if m["status"] == "ok"]
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.concat_tables(parts) if parts else STEPS_SCHEMA.empty_table(), sink, compression="zstd")
+    write_bytes(root / "steps.parquet", sink.getvalue().to_pybytes())
+    renderers = list(dict.fromkeys(row["renderer"] for row in rows))
+    chosen = baseline if baseline in renderers else renderers[0] if renderers else None
+    summary = {
+        "preset": preset,
+        "metrics": aggregate(rows),
+        "paired": paired(rows, chosen) if chosen is not None and len(renderers) > 1 else {},
+        "censoring": censoring(manifests),
+        "failures": _failures(manifests),
+        "speed": {name: speed([m for m in manifests if m["renderer"] == name and m["status"] == "ok"]) for name in renderers},
+        "pool": _pool(manifests, threads, wall_s),
+    }
+    write_json(root / "summary.json", summary)
+    return summary
+
+
+def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
+
+    A frame's time is the sum of all stages of the loop between two frames. The first frame of each rollout is kept apart: it may
+    compile or fill caches.
+    """
+    stages: dict[str, list[float]] = {}
+    first, per_frame = [], []
+    for manifest in manifests:
+        frames = max(int(manifest["frames"]), 1)
+        total = np.zeros(frames)
+        for stage, durations in manifest["stage_ms"].items():
+            # Stages that run more often than frames are spread evenly over them.
+            total += np.array([chunk.sum() for chunk in np.array_split(np.asarray(durations), frames)])
+            stages.setdefault(stage, []).extend(durations[1:])
+        first.append(float(total[0]))
+        per_frame.extend(total[1:].tolist())
+    if not per_frame:
+        return {"ms_per_frame_p50": None, "ms_per_frame_p95": None, "frames_per_s": None, "first_frame_ms": None, "stages": {}}
+    all_ms = sum(sum(d) for d in stages.values())
+    return {
+        "ms_per_frame_p50": round(float(np.percentile(per_frame, 50)), 3),
+        "ms_per_frame_p95": round(float(np.percentile(per_frame, 95)), 3),
+        "frames_per_s": round(1e3 / float(np.mean(per_frame)), 2),
+        "first_frame_ms": round(float(np.median(first)), 3),
+        "stages": {
+            name: {
+                "p50_ms": round(float(np.percentile(d, 50)), 3),
+                "p95_ms": round(float(np.percentile(d, 95)), 3),
+                "share": round(sum(d) / all_ms, 4),
+            }
+            for name, d in stages.items()
+            if d
+        },
+    }
+
+
+def _pool(manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float) -> dict[str, Any]:
+    frames = sum(int(m.get("frames") or 0) for m in manifests if not m.get("reused"))
+    return {
+        "workers": threads.workers,
+        "threads_per_worker": threads.per_worker,
+        "wall_s": round(wall_s, 3),
+        "frames": frames,
+        "frames_per_s_total": round(frames / wall_s, 2) if frames and wall_s > 0 else None,
+    }
+
+
+def _failures(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    failed = [m for m in manifests if m["status"] != "ok"]
+    classes: dict[str, int] = {}
+    for manifest in failed:
+        name = manifest["error"]["failure_class"]
+        classes[name] = classes.get(name, 0) + 1
+    cells = [{k: m[k] for k in ("renderer", "policy", "scene", "seed", "path", "error")} for m in failed]
+    return {"n_failed": len(failed), "n_rollouts": len(manifests), "by_class": classes, "cells": cells}
