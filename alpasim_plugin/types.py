@@ -14,13 +14,20 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-F64 = npt.NDArray[np.float64]
+from alpasim_plugin.map_types import F64 as F64
+from alpasim_plugin.map_types import Box as Box
+from alpasim_plugin.map_types import HeightField as HeightField
+from alpasim_plugin.map_types import Lane as Lane
+from alpasim_plugin.map_types import LaneMap as LaneMap
+from alpasim_plugin.map_types import Marking as Marking
+from alpasim_plugin.map_types import Paint as Paint
+from alpasim_plugin.map_types import Route as Route
+
 F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 
-Paint = Literal["none", "solid_white", "dashed_white", "solid_yellow", "dashed_yellow", "double_yellow", "unknown"]
 Aggregation = Literal["mean", "median", "max", "min", "last"]
 Direction = Literal["lower", "higher", "none"]
 
@@ -38,15 +45,6 @@ class Trajectory:
 
     def __len__(self) -> int:
         return int(self.t_us.shape[0])
-
-
-@dataclass(frozen=True)
-class Box:
-    """Full sizes of a cuboid in its own frame (x length, y width, z height)."""
-
-    length_m: float
-    width_m: float
-    height_m: float
 
 
 @dataclass(frozen=True)
@@ -72,57 +70,6 @@ class EgoState:
     accel_mps2: float = 0.0
     yaw_rate_radps: float = 0.0
     steer_rad: float = 0.0  # road-wheel angle, left positive
-
-
-# --- map ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Lane:
-    """One lane; edges are seen in driving direction."""
-
-    lane_id: str
-    centre: F64  # (N, 3) metres, world
-    left: F64 | None  # (L, 3) or None where the map has no edge
-    right: F64 | None  # (R, 3) or None
-    kind: str = "vehicle"  # vehicle | bike | bus | shoulder | parking
-    successors: tuple[str, ...] = ()
-    left_neighbour: str | None = None
-    right_neighbour: str | None = None
-    left_paint: Paint = "unknown"
-    right_paint: Paint = "unknown"
-    is_intersection: bool = False
-    speed_limit_mps: float | None = None
-
-
-@dataclass(frozen=True)
-class Marking:
-    """Paint that the map gives as a line of its own, not as a lane's edge."""
-
-    xyz: F64  # (N, 3) metres, world
-    paint: Paint
-
-
-@dataclass(frozen=True)
-class LaneMap:
-    """Vector map of one scene."""
-
-    lanes: Mapping[str, Lane]
-    road_edges: tuple[F64, ...] = ()  # each (N, 3): the border of the drivable surface
-    drivable_areas: tuple[F64, ...] = ()  # each (N, 3) ring
-    crosswalks: tuple[F64, ...] = ()  # each (N, 3) ring
-    stop_lines: tuple[F64, ...] = ()  # each (N, 3)
-    markings: tuple[Marking, ...] = ()
-    poles: tuple[F64, ...] = ()  # each (N, 3) polyline
-    signs: tuple[tuple[F64, Box], ...] = ()  # (T_world_sign (4, 4), size)
-
-
-@dataclass(frozen=True)
-class Route:
-    """Where the ego should go: a polyline in the world, without time."""
-
-    xyz: F64  # (N, 3) metres, world
-    lane_ids: tuple[str, ...] = ()
 
 
 # --- actors ---------------------------------------------------------------------------------------------------------
@@ -240,16 +187,6 @@ class Rates:
     control_us: int = 100_000
     camera_us: int = 100_000
     policy_us: int = 100_000
-
-
-@dataclass(frozen=True)
-class HeightField:
-    """Ground height on a regular grid, bilinear in between, constant beyond its border."""
-
-    x0_m: float
-    y0_m: float
-    cell_m: float
-    z: F64  # (Ny, Nx) metres, world
 
 
 @dataclass(frozen=True)
