@@ -1,0 +1,226 @@
+"""Argoverse 2 sensor logs: HD map, ego poses, tracked actors, calibration.
+
+Formats and facts: the Argoverse 2 sensor data set (Wilson et al. 2021) and its public documentation. The data are licensed CC BY-NC-SA
+4.0 and do not ship with this package.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.types import F64, I64, Actor, Box, CameraSpec, Trajectory, Vehicle
+from scenarios.argoverse_map import read_ground, read_map
+from scenarios.reading import SourceFiles
+from scenarios.recorded import RecordedLog
+from scenarios.tracks import actors_of_track, checked_trajectory
+
+EGO_CATEGORY = "EGO_VEHICLE"
+# Ford Fusion Hybrid of the recording fleet; size as annotated in logs that carry EGO_VEHICLE rows.
+VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheelbase_m=2.85)
+# The recorded frame sits in the rear axle, one wheel radius above the road: measured against the ground rasters of three logs the median
+# height is 0.324, 0.324 and 0.321 m.
+WHEEL_RADIUS_M = 0.33
+POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+LABELS = {
+    "REGULAR_VEHICLE": "car",
+    "LARGE_VEHICLE": "truck",
+    "BOX_TRUCK": "truck",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "truck",
+    "VEHICULAR_TRAILER": "truck",
+    "BUS": "bus",
+    "ARTICULATED_BUS": "bus",
+    "SCHOOL_BUS": "bus",
+    "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian",
+    "WHEELCHAIR": "pedestrian",
+    "BICYCLE": "cyclist",
+    "BICYCLIST": "cyclist",
+    "WHEELED_RIDER": "cyclist",
+    "MOTORCYCLE": "motorcycle",
+    "MOTORCYCLIST": "motorcycle",
+    "RAILED_VEHICLE": "other",
+    "ANIMAL": "other",
+    "DOG": "other",
+    "STROLLER": "other",
+    "WHEELED_DEVICE": "other",
+    "MESSAGE_BOARD_TRAILER": "other",
+    "TRAFFIC_LIGHT_TRAILER": "other",
+    "BOLLARD": "other",
+    "CONSTRUCTION_BARREL": "other",
+    "CONSTRUCTION_CONE": "other",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "other",
+    "SIGN": "other",
+    "STOP_SIGN": "other",
+}
+FIXED = frozenset({"BOLLARD", "CONSTRUCTION_BARREL", "CONSTRUCTION_CONE", "MOBILE_PEDESTRIAN_CROSSING_SIGN", "SIGN", "STOP_SIGN"})
+
+
+@dataclass(frozen=True)
+class EgoPoses:
+    """The ego's recorded poses as they stand in the file."""
+
+    t_ns: I64  # (T,) nanoseconds, strictly increasing
+    xyz: F64  # (T, 3) metres, city; rear axle
+    quat: F64  # (T, 4) wxyz, ego to city
+
+
+def read_argoverse(path: str | Path) -> RecordedLog:
+    """Read one log folder.
+
+    The folder holds ``city_SE3_egovehicle.feather``, ``annotations*.feather`` and ``map/`` with the vector map, the ground raster and its
+    transform. Cuboids come in the ego frame of their sweep and are brought to the world with the pose of exactly that time.
+
+    Raises:
+        InputError: A file is missing, damaged, or holds what no log may hold; the message names it.
+    """
+    folder = Path(path)
+    files = SourceFiles("reading an Argoverse 2 log")
+    pose_path = files.only(folder, ("city_SE3_egovehicle.feather",), "the ego poses")
+    box_path = files.only(folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids")
+    map_path = files.only(folder / "map", ("log_map_archive_*.json",), "the vector map")
+    poses = read_ego_poses(files, pose_path)
+    origin = np.round(poses.xyz[0])  # whole metres: the subtraction loses nothing
+    ego_log, dropped = _rig_log(files, pose_path, poses, origin)
+    lane_map, notes = read_map(files, map_path, origin)
+    ground = read_ground(files, folder / "map", lane_map, ego_log.xyz, origin)
+    actors, actor_notes = read_actors(files, box_path, poses, origin)
+    own = [f"{dropped} ego poses share their microsecond with the pose before and were dropped"] if dropped else []
+    own += [
+        f"ego poses lowered by {WHEEL_RADIUS_M} m along the body's z axis: from the rear axle to the ground under it",
+        "no camera taken from the calibration: the fleet's front camera is a portrait of 47 degrees width; see read_calibration",
+        "no speed limits, stop lines or traffic signals: the map has none",
+    ]
+    return RecordedLog(
+        scene_id=f"av2-{folder.resolve().name}",
+        source="argoverse",
+        lane_map=lane_map,
+        ground=ground,
+        ego_log=ego_log,
+        vehicle=VEHICLE,
+        actors=actors,
+        cameras=(),
+        world_origin=(float(origin[0]), float(origin[1]), float(origin[2])),
+        content_hash=files.content_hash,
+        notes=(*own, *notes, *actor_notes),
+    )
+
+
+def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
+    """Read ``city_SE3_egovehicle.feather`` without changing it.
+
+    Raises:
+        InputError: Fewer than two poses, times that do not increase, values that are not finite, quaternions that are not unit.
+    """
+    table = files.read_feather(path, ("timestamp_ns", *POSE))
+    t_ns = _times(files, path, table["timestamp_ns"])
+    xyz, quat = _columns(table, POSE[4:]), _columns(table, POSE[:4])
+    checked = checked_trajectory(files, path, t_ns, xyz, quat, least=2)
+    return EgoPoses(checked.t_us, checked.xyz, checked.quat)
+
+
+def _rig_log(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) -> tuple[Trajectory, int]:
+    """Return the rig's trajectory (ground under the rear axle, local, microseconds) and how many poses fell on a taken microsecond."""
+    t_us = poses.t_ns // 1000
+    keep = np.concatenate([[True], np.diff(t_us) > 0])
+    up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
+    xyz = poses.xyz - origin - WHEEL_RADIUS_M * up
+    return checked_trajectory(files, path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int((~keep).sum())
+
+
+def read_actors(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) -> tuple[tuple[Actor, ...], tuple[str, ...]]:
+    """Read the annotated cuboids as actors in the world, in order of first appearance; rows of the ego itself are left out.
+
+    Raises:
+        InputError: No cuboid, a sweep without an ego pose at its time, a bad size, or a track whose times do not increase.
+    """
+    sizes = ("length_m", "width_m", "height_m")
+    table = files.read_feather(path, ("timestamp_ns", "track_uuid", "category", *sizes, *POSE))
+    t_ns = _times(files, path, table["timestamp_ns"])
+    uuid, category = table["track_uuid"].astype(str), table["category"].astype(str)
+    others = np.nonzero(category != EGO_CATEGORY)[0]
+    if len(others) == 0:
+        raise files.fail(path, "no cuboids of other road users", "use a log with annotations")
+    row = np.searchsorted(poses.t_ns, t_ns)
+    row = np.minimum(row, len(poses.t_ns) - 1)
+    lost = poses.t_ns[row] != t_ns
+    if lost.any():
+        found = f"a sweep at {int(t_ns[lost][0])} ns without an ego pose at that time"
+        raise files.fail(path, found, "use annotations and poses of the same log")
+    boxes = se3(_columns(table, POSE[4:]), _columns(table, POSE[:4]))
+    bad = ~np.isfinite(boxes).all(axis=(1, 2))
+    if bad.any():
+        raise files.fail(path, f"a cuboid pose that is not finite in row {int(np.argmax(bad))}", "repair or drop this row")
+    T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
+    T_local_box = T_local_ego @ boxes
+    size = _columns(table, sizes)
+    actors: list[Actor] = []
+    unknown: Counter[str] = Counter()
+    changed = split = 0
+    order, first = np.unique(uuid[others], return_index=True)
+    for name in order[np.argsort(first)]:
+        mine = others[uuid[others] == name]
+        where = f"{path}, track {name}"
+        norm = np.linalg.norm(_columns(table, POSE[:4])[mine], axis=1)
+        if (np.abs(norm - 1) > 1e-2).any():
+            raise files.fail(where, f"a quaternion of length {norm[np.argmax(np.abs(norm - 1))]:.3g}", "give unit quaternions")
+        length, width, height = np.median(size[mine], axis=0).tolist()
+        if not (min(length, width, height) > 0 and np.isfinite([length, width, height]).all()):
+            raise files.fail(where, f"a size of {length} x {width} x {height} m", "give positive sizes")
+        changed += bool((np.ptp(size[mine], axis=0) > 0.01).any())
+        kind = str(category[mine[0]])
+        if kind not in LABELS:
+            unknown[kind] += 1
+        poses_of = T_local_box[mine]
+        track = checked_trajectory(files, where, t_ns[mine] // 1000, poses_of[:, :3, 3].copy(), quat_from_matrix(poses_of[:, :3, :3]))
+        parts = actors_of_track(str(name), LABELS.get(kind, "other"), Box(length, width, height), track, fixed=kind in FIXED)
+        split += len(parts) > 1
+        actors += parts
+    notes = [f"{count} tracks of the unknown category {kind!r} are labelled 'other'" for kind, count in sorted(unknown.items())]
+    if split:
+        notes.append(f"{split} tracks have holes longer than 0.5 s and were split")
+    if changed:
+        notes.append(f"{changed} tracks change their size by more than 1 cm: the median is used")
+    return tuple(actors), tuple(notes)
+
+
+def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
+    """Read the pinhole part of a log's camera calibration at full resolution; radial distortion is left out.
+
+    Raises:
+        InputError: The log has no ``calibration`` folder, or a file in it is damaged.
+    """
+    folder = Path(path) / "calibration"
+    files = SourceFiles("reading an Argoverse 2 calibration")
+    inner_path = files.only(folder, ("intrinsics.feather",), "the intrinsics")
+    outer_path = files.only(folder, ("egovehicle_SE3_sensor.feather",), "the sensor poses")
+    inner = files.read_feather(inner_path, ("sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px"))
+    outer = files.read_feather(outer_path, ("sensor_name", *POSE))
+    mounts = dict(zip(outer["sensor_name"].astype(str), se3(_columns(outer, POSE[4:]), _columns(outer, POSE[:4])), strict=True))
+    cameras: list[CameraSpec] = []
+    for i, name in enumerate(inner["sensor_name"].astype(str)):
+        if name not in mounts:
+            raise files.fail(outer_path, f"no pose of camera {name!r}", "use calibration files of the same log")
+        fx, fy, cx, cy = (float(inner[k][i]) for k in ("fx_px", "fy_px", "cx_px", "cy_px"))
+        T_rig_camera = mounts[name].copy()
+        T_rig_camera[2, 3] += WHEEL_RADIUS_M  # the rig's origin is on the ground
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        cameras.append(CameraSpec(str(name), int(inner["width_px"][i]), int(inner["height_px"][i]), K, T_rig_camera))
+    return tuple(cameras)
+
+
+def _times(files: SourceFiles, path: Path, column: npt.NDArray[Any]) -> I64:
+    if column.dtype.kind not in "iu":
+        raise files.fail(path, f"timestamp_ns of type {column.dtype}", "give integer nanoseconds")
+    return column.astype(np.int64)
+
+
+def _columns(table: dict[str, npt.NDArray[Any]], names: tuple[str, ...]) -> F64:
+    return np.stack([table[n].astype(np.float64) for n in names], axis=1)
