@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from alpasim_plugin.errors import InputError
@@ -164,8 +163,8 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
 
 def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floating]:
     """Return ``(N, len(names))`` of float32, or float64 where the file has doubles."""
-    dtype = np.result_type(np.float32, *(rows.dtype[name] for name in names))
-    return np.asarray(structured_to_unstructured(rows[list(names)], dtype=dtype))
+    doubles = any(rows.dtype[name].itemsize > 4 for name in names)
+    return np.stack([rows[name].astype(np.float64 if doubles else np.float32) for name in names], axis=1)
 
 
 def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating]:

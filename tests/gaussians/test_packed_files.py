@@ -1,0 +1,312 @@
+"""Compressed PLY, .splat and SPZ: real files against each other, made-up ones against hand-worked bytes."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud, read_ply
+from alpasim_plugin.gaussians.arrays import SH_C0
+from alpasim_plugin.gaussians.compressed_ply import read_compressed_ply, unpack_rotation
+from alpasim_plugin.gaussians.formats import read_gaussians
+from alpasim_plugin.gaussians.ply_header import read_ply_header
+from alpasim_plugin.gaussians.sh import sh_basis
+from alpasim_plugin.gaussians.splat import read_splat, write_splat
+from alpasim_plugin.gaussians.spz import read_spz, unpack_smallest_three
+
+
+@pytest.fixture
+def biker(shared_data: Path) -> Path:
+    return shared_data / "gaussians"
+
+
+# --- one model in two files -------------------------------------------------------------------------------------------
+
+
+def test_both_bikers_have_the_published_facts(biker: Path) -> None:
+    ply, spz = read_compressed_ply(biker / "biker.compressed.ply"), read_spz(biker / "biker.spz", axes="rub")
+    assert len(ply.means) == len(spz.means) == 152746
+    assert read_ply_header(biker / "biker.compressed.ply").element("chunk").count == 597
+    low, high = (-0.62126, -3.18008, -0.53226), (0.41440, 0.0, 0.61328)
+    np.testing.assert_allclose(ply.means.min(axis=0), low, atol=6e-6)
+    np.testing.assert_allclose(ply.means.max(axis=0), high, atol=6e-6)
+    assert f"{ply.opacities.mean():.10f}" == f"{spz.opacities.mean():.10f}" == "0.2966253344"
+
+
+def test_both_bikers_agree_after_the_axis_flip(biker: Path) -> None:
+    ply, spz = read_compressed_ply(biker / "biker.compressed.ply"), read_spz(biker / "biker.spz", axes="rub")
+    flipped = spz.means * (1, -1, -1)
+    assert np.abs(np.median(ply.means, axis=0) - np.median(flipped, axis=0)).max() == pytest.approx(7.3e-5, abs=5e-7)
+    assert ply.means[:, 0].min() - flipped[:, 0].min() == pytest.approx(8.2e-5, abs=5e-7)
+    for end in (np.min, np.max):
+        assert np.abs(end(ply.means, axis=0) - end(flipped, axis=0)).max() < 0.5 / 4096
+
+
+def test_both_bikers_are_one_model_in_one_place(biker: Path) -> None:
+    ply, _ = read_gaussians(biker / "biker.compressed.ply")
+    spz, report = read_gaussians(biker / "biker.spz")
+    assert report.n_kept == 152746
+    assert np.abs(ply.means - spz.means).max() <= 0.5 / 4096 * 1.01  # half a step of 12 fractional bits
+    np.testing.assert_array_equal(ply.opacities, spz.opacities)
+    same = np.abs(np.sum(ply.quats * spz.quats, axis=1))
+    assert np.quantile(same, 0.001) > 0.99999
+    log_scales = np.maximum(np.log(ply.scales), -10)  # SPZ holds nothing smaller than exp(-10)
+    assert np.abs(log_scales - np.log(spz.scales)).max() < 1 / 32 + 1e-6  # half a step of 1/16
+    assert np.abs(ply.sh - spz.sh).max() < 0.5 / 255 / 0.15 * 1.05
+
+
+@pytest.mark.parametrize("name", ["biker.compressed.ply", "biker.spz"])
+@pytest.mark.parametrize("percent", range(0, 100, 10))
+def test_biker_cut_short_is_refused_in_four_parts(biker: Path, tmp_path: Path, name: str, percent: int) -> None:
+    data = (biker / name).read_bytes()
+    cut = tmp_path / name
+    cut.write_bytes(data[: len(data) * percent // 100])
+    with pytest.raises(InputError) as caught:
+        read_gaussians(cut)
+    assert name in str(caught.value)
+    assert all(part in str(caught.value) for part in ("error: reading", "with:", "found:", "do:"))
+
+
+def test_plain_reader_points_to_the_right_one_for_a_compressed_ply(biker: Path) -> None:
+    with pytest.raises(InputError, match="it is a compressed PLY") as caught:
+        read_ply(biker / "biker.compressed.ply")
+    assert "read_gaussians" in caught.value.do_this
+
+
+# --- compressed PLY, worked by hand -----------------------------------------------------------------------------------
+
+BOUNDS = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+BOUNDS += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+
+
+def write_compressed(path: Path, n: int, chunks: int, packed: tuple[int, int, int, int], sh: bytes = b"", n_sh: int = 0) -> Path:
+    head = f"ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n" + "".join(f"property float {b}\n" for b in BOUNDS)
+    head += f"element vertex {n}\n" + "".join(f"property uint packed_{p}\n" for p in ("position", "rotation", "scale", "color"))
+    if n_sh:
+        head += f"element sh {n}\n" + "".join(f"property uchar f_rest_{i}\n" for i in range(n_sh))
+    bounds = struct.pack("<12f", 0, 10, 20, 2, 12, 22, -3, -3, -3, -1, -1, -1)
+    path.write_bytes(head.encode() + b"end_header\n" + bounds * chunks + struct.pack("<4I", *packed) * n + sh)
+    return path
+
+
+def test_packed_bits_are_spread_over_the_chunk(tmp_path: Path) -> None:
+    position = 2047 << 21 | 0 << 11 | 2047
+    colour = 255 << 24 | 0 << 16 | 51 << 8 | 102
+    path = write_compressed(tmp_path / "a.compressed.ply", 1, 1, (position, 511 << 20 | 511 << 10 | 511, 0, colour))
+    raw = read_compressed_ply(path)
+    np.testing.assert_allclose(raw.means, [[2, 10, 22]])
+    np.testing.assert_allclose(raw.scales, np.exp([[-3, -3, -3]]))
+    np.testing.assert_allclose(raw.sh[0, 0], (np.array([1, 0, 0.2]) - 0.5) / SH_C0, rtol=1e-6)
+    assert raw.opacities[0] == pytest.approx(0.4)
+    np.testing.assert_allclose(raw.quats[0], [1, 0, 0, 0], atol=1e-3)
+
+
+def test_harmonics_element_is_channel_major(tmp_path: Path) -> None:
+    table = np.full(9, 128, np.uint8)
+    table[1] = 255  # red, second coefficient
+    raw = read_compressed_ply(write_compressed(tmp_path / "a.compressed.ply", 1, 1, (0, 0, 0, 0), table.tobytes(), 9))
+    assert raw.sh.shape == (1, 4, 3)
+    assert raw.sh[0, 2, 0] == 4
+    np.testing.assert_allclose(np.delete(raw.sh[0, 1:].ravel(), 3), 0.5 / 256 * 8)
+
+
+def test_chunks_that_do_not_cover_the_gaussians_are_refused(tmp_path: Path) -> None:
+    path = write_compressed(tmp_path / "a.compressed.ply", 257, 1, (0, 0, 0, 0))
+    with pytest.raises(InputError, match="1 chunks where 2 are needed"):
+        read_compressed_ply(path)
+
+
+@pytest.mark.parametrize("largest", range(4))
+def test_left_out_component_is_restored_in_its_place(largest: int) -> None:
+    quat = np.array([0.1, -0.2, 0.3, 0.15])
+    quat[largest] = 0
+    quat[largest] = np.sqrt(1 - quat @ quat)
+    others = [round((q / np.sqrt(2) + 0.5) * 1023) for i, q in enumerate(quat) if i != largest]
+    packed = largest << 30 | others[0] << 20 | others[1] << 10 | others[2]
+    np.testing.assert_allclose(unpack_rotation(np.array([packed], np.uint32))[0], quat, atol=1e-3)
+
+
+# --- .splat -----------------------------------------------------------------------------------------------------------
+
+
+def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, biker: Path) -> None:
+    cloud, _ = read_gaussians(biker / "train-1000.ply")
+    write_splat(tmp_path / "a.splat", cloud)
+    assert (tmp_path / "a.splat").stat().st_size == 32 * 1000
+    back, report = read_gaussians(tmp_path / "a.splat")
+    assert report.n_kept == 1000
+    np.testing.assert_array_equal(back.means, cloud.means)
+    np.testing.assert_array_equal(back.scales, cloud.scales.astype(np.float32))
+    assert np.abs(back.opacities - cloud.opacities).max() <= 0.5 / 255 + 1e-9
+    rgb = np.clip(0.5 + SH_C0 * cloud.sh[:, 0], 0, 1)
+    assert np.abs(0.5 + SH_C0 * back.sh[:, 0] - rgb).max() <= 0.5 / 255 + 1e-6
+    angle = 2 * np.arccos(np.clip(np.abs(np.sum(back.quats * cloud.quats, axis=1)), 0, 1))
+    # Each component is off by up to 1/256, and +1 is stored as 127/128.
+    assert angle.max() < 2 * np.sqrt(4) / 128
+
+
+def test_splat_written_twice_is_the_same(tmp_path: Path, biker: Path) -> None:
+    cloud, _ = read_gaussians(biker / "train-1000.ply")
+    write_splat(tmp_path / "a.splat", cloud)
+    write_splat(tmp_path / "b.splat", GaussianCloud(*read_splat(tmp_path / "a.splat")))
+    assert (tmp_path / "a.splat").read_bytes() == (tmp_path / "b.splat").read_bytes()
+
+
+def test_splat_bytes_worked_by_hand(tmp_path: Path) -> None:
+    row = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 128, 192, 128, 64, 128)
+    (tmp_path / "a.splat").write_bytes(row)
+    raw = read_splat(tmp_path / "a.splat")
+    np.testing.assert_array_equal(raw.quats, [[0.5, 0, -0.5, 0]])
+    np.testing.assert_allclose(0.5 + SH_C0 * raw.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    assert raw.opacities[0] == 128 / 255
+
+
+@pytest.mark.parametrize("size", [0, 1, 31, 33, 63])
+def test_splat_of_broken_size_is_refused(tmp_path: Path, size: int) -> None:
+    (tmp_path / "a.splat").write_bytes(bytes(size))
+    with pytest.raises(InputError, match=f"{size} bytes, not a whole number of 32-byte rows"):
+        read_splat(tmp_path / "a.splat")
+
+
+# --- SPZ, worked by hand ----------------------------------------------------------------------------------------------
+
+
+def body_streams(version: int, n: int, degree: int) -> list[bytes]:
+    rng = np.random.default_rng(7)
+    sizes = [9 * n, n, 3 * n, 3 * n, (3 if version < 3 else 4) * n, 3 * n * ((degree + 1) ** 2 - 1)]
+    return [rng.integers(0, 256, size, dtype=np.uint8).tobytes() for size in sizes]
+
+
+def write_spz(path: Path, version: int, n: int, degree: int, streams: list[bytes], claim: int | None = None) -> Path:
+    head = struct.pack("<IIIBBB", 0x5053474E, version, n if claim is None else claim, degree, 12, 0)
+    if version == 4:
+        used = streams if degree else streams[:5]
+        packed = [zstandard.ZstdCompressor().compress(s) for s in used]
+        table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, used, strict=True))
+        path.write_bytes(head + struct.pack("<BI12x", len(used), 32) + table + b"".join(packed))
+    else:
+        path.write_bytes(gzip.compress(head + b"\0" + b"".join(streams)))
+    return path
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_every_version_unpacks_to_the_same_numbers(tmp_path: Path, version: int, degree: int) -> None:
+    streams = body_streams(version, 6, degree)
+    streams[0] = b"".join(int(v).to_bytes(3, "little", signed=True) for v in range(-9, 9))
+    raw = read_spz(write_spz(tmp_path / "a.spz", version, 6, degree, streams), axes="rub")
+    np.testing.assert_array_equal(raw.means, np.arange(-9, 9).reshape(6, 3) / 4096)
+    np.testing.assert_array_equal(raw.opacities, np.frombuffer(streams[1], np.uint8) / 255)
+    colour, scale = (np.frombuffer(s, np.uint8).reshape(6, 3) for s in streams[2:4])
+    np.testing.assert_allclose(raw.sh[:, 0], (colour / 255 - 0.5) / 0.15, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(raw.scales, np.exp(scale / 16 - 10))
+    harmonics = np.frombuffer(streams[5], np.uint8).reshape(6, -1, 3)
+    np.testing.assert_array_equal(raw.sh[:, 1:], (harmonics - 128.0) / 128)
+    cloud, report = read_gaussians(tmp_path / "a.spz")
+    assert report.n_kept == len(cloud) == 6
+
+
+def test_version_2_rotation_is_xyz_bytes(tmp_path: Path) -> None:
+    streams = body_streams(2, 1, 0)
+    streams[4] = bytes([255, 128, 127])
+    quat = read_spz(write_spz(tmp_path / "a.spz", 2, 1, 0, streams), axes="rub").quats[0]
+    np.testing.assert_allclose(quat, [0, 1, 1 / 255, -1 / 255], atol=1e-2)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: max(map(abs, q)) > 0.1))
+def test_smallest_three_rotation_is_restored(q: list[float]) -> None:
+    xyzw = np.array(q) / np.linalg.norm(q)
+    largest = int(np.argmax(np.abs(xyzw)))
+    xyzw = xyzw * np.copysign(1, xyzw[largest])
+    word = largest
+    for i in range(4):
+        if i != largest:
+            word = word << 10 | (xyzw[i] < 0) << 9 | round(abs(xyzw[i]) * np.sqrt(2) * 511)
+    packed = np.frombuffer(struct.pack("<I", word), np.uint8)
+    wxyz = unpack_smallest_three(packed)[0]
+    assert abs(np.linalg.norm(wxyz) - 1) < 1e-6
+    np.testing.assert_allclose(wxyz, xyzw[[3, 0, 1, 2]], atol=2.5e-3)
+
+
+def test_turning_axes_turns_colour_with_direction(tmp_path: Path) -> None:
+    path = write_spz(tmp_path / "a.spz", 3, 6, 3, body_streams(3, 6, 3))
+    rub, rdf = read_spz(path, axes="rub"), read_spz(path)
+    directions = np.random.default_rng(1).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before = np.einsum("dk,nkc->dnc", sh_basis(directions), rub.sh)
+    after = np.einsum("dk,nkc->dnc", sh_basis(directions * (1, -1, -1)), rdf.sh)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+
+
+def test_turning_axes_turns_the_ellipsoids(tmp_path: Path) -> None:
+    path = write_spz(tmp_path / "a.spz", 3, 6, 0, body_streams(3, 6, 0))
+    flip = np.diag([1.0, -1.0, -1.0])
+    before, after = (GaussianCloud(*read_spz(path, axes=axes)).covariances() for axes in ("rub", "rdf"))
+    np.testing.assert_allclose(after, flip @ before @ flip, rtol=1e-5, atol=1e-12)
+
+
+def test_fourth_degree_is_cut_and_counted(tmp_path: Path) -> None:
+    cloud, report = read_gaussians(write_spz(tmp_path / "a.spz", 4, 2, 4, body_streams(4, 2, 4)))
+    assert cloud.sh.shape == (2, 16, 3)
+    assert sum(report.repaired.values()) == 2
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_count_beyond_the_data_is_refused_without_unpacking_it(tmp_path: Path, version: int) -> None:
+    path = write_spz(tmp_path / "a.spz", version, 2, 0, body_streams(version, 2, 0), claim=100_000_000)
+    with pytest.raises(InputError, match="100000000 Gaussians need"):
+        read_spz(path)
+
+
+def test_absurd_count_is_refused(tmp_path: Path) -> None:
+    path = write_spz(tmp_path / "a.spz", 3, 2, 0, body_streams(3, 2, 0), claim=4_000_000_000)
+    with pytest.raises(InputError, match="4000000000 Gaussians of degree 0"):
+        read_spz(path)
+
+
+def test_unknown_version_and_wrong_magic_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(b"NGSP" + struct.pack("<II", 9, 1) + bytes(40))
+    with pytest.raises(InputError, match="version 9; versions 2, 3 and 4 are known"):
+        read_spz(tmp_path / "a.spz")
+    (tmp_path / "a.spz").write_bytes(b"GLTF" + bytes(60))
+    with pytest.raises(InputError, match="magic b'GLTF'"):
+        read_spz(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_flipped_compressed_bytes_are_refused(tmp_path: Path, version: int) -> None:
+    path = write_spz(tmp_path / "a.spz", version, 500, 1, body_streams(version, 500, 1))
+    data = bytearray(path.read_bytes())
+    start = 12 if version == 3 else 32 + 16 * 6
+    data[start : start + 8] = b"\xff" * 8
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="damaged|unpacks to"):
+        read_spz(path)
+
+
+# --- dispatch ---------------------------------------------------------------------------------------------------------
+
+
+def test_content_decides_before_the_suffix(tmp_path: Path, biker: Path) -> None:
+    (tmp_path / "model.bin").write_bytes((biker / "train-1000.ply").read_bytes())
+    assert len(read_gaussians(tmp_path / "model.bin")[0]) == 1000
+
+
+def test_unknown_form_lists_the_known_ones(tmp_path: Path) -> None:
+    (tmp_path / "a.sog").write_bytes(b"PK\x03\x04....")
+    with pytest.raises(InputError, match=r"\.ply, \.compressed\.ply, \.splat, \.spz"):
+        read_gaussians(tmp_path / "a.sog")
+
+
+def test_missing_file_says_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="No such file"):
+        read_gaussians(tmp_path / "absent.spz")

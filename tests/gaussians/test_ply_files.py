@@ -1,0 +1,289 @@
+"""PLY reading and writing, on a trained model and on small made-up ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
+from alpasim_plugin.gaussians.formats import read_gaussians
+from alpasim_plugin.gaussians.ply import ply_rows, read_ply_arrays
+from alpasim_plugin.gaussians.ply_header import read_ply_element, read_ply_header
+
+
+def make_cloud(n: int = 5, k: int = 16, seed: int = 3) -> GaussianCloud:
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(n, 4))
+    return GaussianCloud(
+        means=rng.normal(size=(n, 3)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=np.exp(rng.normal(size=(n, 3)) - 3),
+        opacities=rng.uniform(0.01, 0.99, n),
+        sh=rng.normal(size=(n, k, 3)).astype(np.float32),
+    )
+
+
+def element(name: str, names: list[str], rows: np.ndarray) -> tuple[str, bytes]:
+    header = f"element {name} {len(rows)}\n" + "".join(f"property float {p}\n" for p in names)
+    return header, rows.astype("<f4").tobytes()
+
+
+def write_elements(path: Path, *parts: tuple[str, bytes], fmt: str = "binary_little_endian") -> Path:
+    head = f"ply\nformat {fmt} 1.0\ncomment made by a test\n" + "".join(h for h, _ in parts) + "end_header\n"
+    path.write_bytes(head.encode() + b"".join(body for _, body in parts))
+    return path
+
+
+NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+# --- a trained model --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def train(shared_data: Path) -> Path:
+    return shared_data / "gaussians" / "train-1000.ply"
+
+
+def test_trained_model_has_the_published_facts(train: Path) -> None:
+    raw = read_ply_arrays(train)
+    header = read_ply_header(train)
+    rows = read_ply_element(header, "vertex")
+    assert len(header.element("vertex").properties) == 62
+    assert all(np.isfinite(rows[name]).all() for name in rows.dtype.names)
+    assert all((rows[name] == 0).all() for name in ("nx", "ny", "nz"))
+    np.testing.assert_allclose(raw.means.min(axis=0), (-13.0210, -3.9220, -3.8217), atol=5e-5)
+    np.testing.assert_allclose(raw.means.max(axis=0), (10.2932, 1.9683, 13.8217), atol=5e-5)
+    assert raw.opacities.mean() == pytest.approx(0.2467, abs=5e-5)
+    assert np.median(raw.scales) == pytest.approx(0.01177, abs=5e-6)
+    assert raw.scales.max() == pytest.approx(0.5667, abs=5e-5)
+    norms = np.linalg.norm(raw.quats, axis=1)
+    assert (norms.min(), norms.max()) == (pytest.approx(0.642, abs=5e-4), pytest.approx(1.319, abs=5e-4))
+    np.testing.assert_allclose(raw.sh[:, 0].mean(axis=0), (0.1658, 0.2361, 0.0812), atol=5e-5)
+
+
+def test_trained_model_is_read_whole_and_normalised(train: Path) -> None:
+    cloud, report = read_gaussians(train)
+    assert (report.n_input, report.n_kept, len(cloud)) == (1000, 1000, 1000)
+    assert cloud.sh.shape == (1000, 16, 3)
+    np.testing.assert_allclose(np.linalg.norm(cloud.quats, axis=1), 1.0, atol=1e-6)
+    assert cloud.opacities.mean() == pytest.approx(read_ply(train).opacities.mean(), abs=0)
+
+
+def test_trained_model_comes_back_byte_for_byte(train: Path, tmp_path: Path) -> None:
+    write_ply(tmp_path / "copy.ply", GaussianCloud(*read_ply_arrays(train)))
+    body = 1000 * 62 * 4
+    assert (tmp_path / "copy.ply").read_bytes()[-body:] == train.read_bytes()[-body:]
+
+
+@pytest.mark.parametrize("percent", range(0, 100, 10))
+def test_trained_model_cut_short_is_refused_in_four_parts(train: Path, tmp_path: Path, percent: int) -> None:
+    data = train.read_bytes()
+    cut = tmp_path / "cut.ply"
+    cut.write_bytes(data[: len(data) * percent // 100])
+    with pytest.raises(InputError) as caught:
+        read_ply(cut)
+    text = str(caught.value)
+    assert "cut.ply" in text
+    assert all(part in text for part in ("error: reading", "with:", "found:", "do:"))
+    if percent:
+        rows = (len(cut.read_bytes()) - (len(data) - 1000 * 248)) // 248
+        assert f"announces 1000 rows of 248 bytes, the file ends after {rows}" in text
+
+
+# --- round trips ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 4, 9, 16])
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int, precision: str) -> None:
+    cloud = make_cloud(k=k)
+    write_ply(tmp_path / "a.ply", cloud, precision=precision)
+    back = read_ply_arrays(tmp_path / "a.ply")
+    for name in ("means", "quats", "sh"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
+    exact = 0 if precision == "float64" else 5e-7
+    np.testing.assert_allclose(back.scales, cloud.scales, rtol=max(exact, 1e-15))
+    np.testing.assert_allclose(back.opacities, cloud.opacities, rtol=max(exact, 1e-15))
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    sh=hnp.arrays(
+        np.float32, st.tuples(st.integers(0, 4), st.sampled_from([1, 4, 9, 16]), st.just(3)), elements=st.floats(-9, 9, width=32)
+    ),
+    mean=st.floats(-1e6, 1e6, width=32),
+)
+def test_means_and_colours_are_bit_exact(tmp_path_factory: pytest.TempPathFactory, sh: np.ndarray, mean: float) -> None:
+    n = len(sh)
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    write_ply(path, GaussianCloud(np.full((n, 3), mean, np.float32), np.tile([1, 0, 0, 0.0], (n, 1)), np.ones((n, 3)), np.full(n, 0.5), sh))
+    back = read_ply_arrays(path)
+    assert back.sh.tobytes() == sh.tobytes()
+    assert (back.means == np.float32(mean)).all()
+    assert len(back.means) == n
+
+
+def test_writing_what_was_read_changes_no_byte(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", make_cloud(200))
+    write_ply(tmp_path / "b.ply", GaussianCloud(*read_ply_arrays(tmp_path / "a.ply")))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_red_only_coefficient_lands_in_the_first_third_of_f_rest(tmp_path: Path) -> None:
+    cloud = make_cloud(n=1)
+    sh = np.zeros((1, 16, 3), np.float32)
+    sh[0, 3, 0] = 0.75  # third coefficient beyond the constant, red
+    rows = ply_rows(GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh))
+    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == ["f_rest_2"]
+    sh[0, 3] = 0, 0.75, 0
+    rows = ply_rows(GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh))
+    assert [name for name in rows.dtype.names if name.startswith("f_rest") and rows[name][0]] == ["f_rest_17"]
+
+
+def test_red_only_coefficient_in_a_foreign_file_is_read_as_red(tmp_path: Path) -> None:
+    names = [*NAMES, *(f"f_rest_{i}" for i in range(9))]
+    row = np.zeros((1, len(names)))
+    row[0, names.index("rot_0")] = 1
+    row[0, names.index("f_rest_1")] = 0.5
+    path = write_elements(tmp_path / "a.ply", element("vertex", names, row))
+    sh = read_ply(path).sh
+    assert sh.shape == (1, 4, 3)
+    assert sh[0, 2, 0] == np.float32(0.5)
+    assert np.count_nonzero(sh) == 1
+
+
+def test_property_order_and_extra_properties_do_not_matter(tmp_path: Path) -> None:
+    cloud = make_cloud(n=4, k=4)
+    rows = ply_rows(cloud)
+    names = [*reversed(rows.dtype.names), "semantic_0"]
+    table = np.stack([rows[n] if n != "semantic_0" else np.full(4, 7.0) for n in names], axis=1)
+    path = write_elements(tmp_path / "a.ply", element("vertex", names, table))
+    np.testing.assert_array_equal(read_ply_arrays(path).sh, cloud.sh)
+
+
+def test_big_endian_doubles_are_read(tmp_path: Path) -> None:
+    header = "element vertex 1\n" + "".join(f"property double {n}\n" for n in NAMES)
+    row = (np.arange(1, len(NAMES) + 1) / 100).astype(">f8")
+    path = write_elements(tmp_path / "a.ply", (header, row.tobytes()), fmt="binary_big_endian")
+    raw = read_ply_arrays(path)
+    np.testing.assert_array_equal(raw.means, [[0.01, 0.02, 0.03]])
+    np.testing.assert_allclose(raw.scales[0], np.exp([0.08, 0.09, 0.10]), rtol=1e-15)
+
+
+# --- several models in one file ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> Path:
+    background, actor = np.zeros((3, len(NAMES))), np.zeros((2, len(NAMES)))
+    background[:, NAMES.index("rot_0")] = actor[:, NAMES.index("rot_0")] = 1
+    actor[:, 0] = 5
+    return write_elements(tmp_path / "street.ply", element("vertex_background", NAMES, background), element("vertex_obj_000", NAMES, actor))
+
+
+def test_street_model_asks_which_part(street: Path) -> None:
+    with pytest.raises(InputError, match=r"2 models in one file: \['vertex_background', 'vertex_obj_000'\]") as caught:
+        read_ply(street)
+    assert "element='vertex_background'" in caught.value.do_this
+
+
+def test_street_model_gives_the_named_part(street: Path) -> None:
+    assert len(read_ply(street, element="vertex_background")) == 3
+    actor, _ = read_gaussians(street, element="vertex_obj_000")
+    assert len(actor) == 2
+    assert (actor.means[:, 0] == 5).all()
+
+
+def test_unknown_part_lists_the_known_ones(street: Path) -> None:
+    with pytest.raises(InputError, match="no such element; the file has"):
+        read_ply(street, element="vertex_obj_001")
+
+
+def test_colours_over_time_are_refused_not_misread(tmp_path: Path) -> None:
+    names = [*NAMES, "f_dc_3", "f_dc_4"]
+    path = write_elements(tmp_path / "a.ply", element("vertex", names, np.zeros((1, len(names)))))
+    with pytest.raises(InputError, match="Fourier terms f_dc_3..f_dc_4"):
+        read_ply(path)
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+def test_missing_file_says_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="No such file"):
+        read_ply(tmp_path / "absent.ply")
+
+
+def test_mesh_is_refused_by_its_missing_properties(tmp_path: Path) -> None:
+    path = write_elements(tmp_path / "mesh.ply", element("vertex", ["x", "y", "z"], np.zeros((2, 3))))
+    with pytest.raises(InputError, match="missing properties"):
+        read_ply(path)
+
+
+def test_ascii_body_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    with pytest.raises(InputError, match="format 'ascii'") as caught:
+        read_ply(path)
+    assert "binary" in caught.value.do_this
+
+
+def test_wrong_magic_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"PNG and then some")
+    with pytest.raises(InputError, match="expected b'ply'"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_absurd_count_is_refused_without_allocating(tmp_path: Path) -> None:
+    header = "element vertex 99999999999999\n" + "".join(f"property float {n}\n" for n in NAMES)
+    path = write_elements(tmp_path / "a.ply", (header, bytes(560)))
+    with pytest.raises(InputError, match="announces 99999999999999 rows of 56 bytes, the file ends after 10"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("line", ["element vertex -5", "element vertex many", "element vertex", "property quark x", "hello"])
+def test_broken_header_line_is_named(tmp_path: Path, line: str) -> None:
+    path = write_elements(tmp_path / "a.ply", (line + "\n", b""))
+    with pytest.raises(InputError, match="line 4"):
+        read_ply_header(path)
+
+
+def test_incomplete_band_of_harmonics_is_refused(tmp_path: Path) -> None:
+    names = [*NAMES, *(f"f_rest_{i}" for i in range(10))]
+    path = write_elements(tmp_path / "a.ply", element("vertex", names, np.zeros((1, len(names)))))
+    with pytest.raises(InputError, match="10 f_rest properties"):
+        read_ply(path)
+
+
+def test_fourth_degree_is_cut_to_the_third_and_counted(tmp_path: Path) -> None:
+    names = [*NAMES, *(f"f_rest_{i}" for i in range(72))]
+    rows = np.zeros((2, len(names)))
+    rows[:, names.index("rot_0")] = 1
+    cloud, report = read_gaussians(write_elements(tmp_path / "a.ply", element("vertex", names, rows)))
+    assert cloud.sh.shape == (2, 16, 3)
+    assert report.repaired["colour harmonics beyond 16 coefficients left out"] == 2
+
+
+def test_broken_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
+    rows = np.zeros((4, len(NAMES)))
+    rows[:, NAMES.index("rot_0")] = 1
+    rows[0, 0] = np.nan
+    rows[1, NAMES.index("rot_0")] = 0
+    rows[2, NAMES.index("scale_1")] = 90
+    cloud, report = read_gaussians(write_elements(tmp_path / "a.ply", element("vertex", NAMES, rows)))
+    assert len(cloud) == 1
+    assert {k: v for k, v in report.dropped.items() if v} == {"non-finite mean": 1, "zero quaternion": 1, "overflowing scale": 1}
+
+
+def test_unfinished_file_never_bears_the_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="writing a PLY file"):
+        write_ply(tmp_path / "absent" / "a.ply", make_cloud())
+    write_ply(tmp_path / "a.ply", make_cloud())
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
