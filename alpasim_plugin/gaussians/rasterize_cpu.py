@@ -1,17 +1,43 @@
-"""Render prepared nodes on the CPU."""
+"""Render on the CPU: project, sort, list per tile, composite; each stage on all threads."""
 
 from __future__ import annotations
 
+import threading
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
+from alpasim_plugin.gaussians.binning import CHUNK, depth_order, fill_tiles, gather_and_count, tile_offsets
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import NEAR_M
-from alpasim_plugin.gaussians.output import Background, RasterOutput
-from alpasim_plugin.gaussians.prepared import Node, prepare
-from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
+from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
+from alpasim_plugin.gaussians.layout import POSE_CENTRE, POSE_COLOUR, POSE_ROTATION, POSE_SIZE, RECORD, TILE
+from alpasim_plugin.gaussians.output import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.prepared import Node, PreparedCloud, prepare
+from alpasim_plugin.gaussians.project_kernels import project_node
+from alpasim_plugin.gaussians.raster_kernels import raster_tiles
+from alpasim_plugin.gaussians.workers import run_on_threads, thread_count
+from alpasim_plugin.types import F64
+
+
+class _Buffers(threading.local):
+    """Arrays kept between frames, one set per calling thread: fresh memory would be paid for page by page in every frame."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, npt.NDArray[np.generic]] = {}
+
+    def get(self, name: str, size: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
+        """Return an uninitialised array of at least ``size``."""
+        array = self._arrays.get(name)
+        if array is None or array.size < size:
+            array = self._arrays[name] = np.empty(size + size // 4, dtype)
+        return array
+
+
+_buffers = _Buffers()
+_prepared: weakref.WeakKeyDictionary[GaussianCloud, PreparedCloud] = weakref.WeakKeyDictionary()
 
 
 def rasterize_prepared(
@@ -37,8 +63,72 @@ def rasterize_prepared(
     Raises:
         InputError: A transform is not rigid or the background does not fit.
     """
-    clouds = [p.cloud if T is None else p.cloud.transformed(np.asarray(T), p.sh_frame == "object") for p, T in nodes]
-    return rasterize_reference(GaussianCloud.concatenate(clouds), camera, background, near_m=near_m, lod_px=lod_px)
+    threads = thread_count(threads)
+    behind = background_image(background, camera)
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    view = np.array(
+        [
+            *(camera.fx, camera.fy, camera.cx, camera.cy),
+            *(low_x, high_x, low_y, high_y),
+            *(camera.width, camera.height, near_m, FAR_M, lod_px),
+        ],
+        np.float32,
+    )
+    total = sum(len(prepared) for prepared, _ in nodes)
+    records = _buffers.get("records", total * RECORD, np.float32)
+    ids = _buffers.get("ids", total, np.int64)
+    cursor = np.zeros(2, np.int64)
+    first_id = 0
+    for prepared, T_world_node in nodes:
+        pose = _node_pose(prepared, T_world_node, camera)
+        cursor[0] = 0
+        workers = threads if len(prepared) > 4096 else 1
+        run_on_threads(
+            workers, project_node, cursor, prepared.means, prepared.geometry, prepared.sh, prepared.sh_size, prepared.index,
+            prepared.spheres, first_id, pose, view, records, ids,
+        )  # fmt: skip
+        first_id += prepared.n_input
+    count = int(cursor[1])
+
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
+    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
+    ordered = _buffers.get("ordered", count * RECORD, np.float32)
+    n_chunks, n_tiles = -(-count // CHUNK), tiles_x * tiles_y
+    histogram = _buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
+    starts = np.empty(n_tiles + 1, np.int64)
+    cursor[:] = 0
+    run_on_threads(threads if count > 4096 else 1, gather_and_count, cursor, count, order, records, tiles_x, tiles_y, ordered, histogram)
+    pairs = int(tile_offsets(count, histogram, starts))
+    lists = _buffers.get("lists", pairs, np.int32)
+    cursor[:] = 0
+    run_on_threads(threads if count > 4096 else 1, fill_tiles, cursor, count, ordered, tiles_x, tiles_y, histogram, lists)
+
+    shape = (camera.height, camera.width)
+    rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    cursor[:] = 0
+    run_on_threads(threads, raster_tiles, cursor, tiles_x, starts, lists, ordered, behind, rgb, alpha, depth)
+    stats = {"gaussians": sum(p.n_input for p, _ in nodes), "visible": count, "pairs": pairs, "pairs_looked_at": int(cursor[1])}
+    return RasterOutput(rgb, alpha, depth, stats)
+
+
+def _node_pose(prepared: PreparedCloud, T_world_node: npt.NDArray[np.floating] | None, camera: PinholeCamera) -> F64:
+    """Pack a node's pose relative to the camera; all differences of large coordinates happen here, in float64."""
+    pose = np.empty(POSE_SIZE)
+    rotation = camera.T_camera_world[:3, :3]
+    centre = camera.centre_world
+    colour = np.eye(3)
+    if T_world_node is not None:
+        require_rigid(T_world_node, "placing a node")
+        node = np.asarray(T_world_node, dtype=np.float64)
+        centre = node[:3, :3].T @ (centre - node[:3, 3])
+        rotation = rotation @ node[:3, :3]
+        if prepared.sh_frame == "world":
+            colour = node[:3, :3]
+    pose[POSE_ROTATION:POSE_CENTRE] = rotation.reshape(-1)
+    pose[POSE_CENTRE:POSE_COLOUR] = centre
+    pose[POSE_COLOUR:] = colour.reshape(-1)
+    return pose
 
 
 def rasterize_cpu(
@@ -50,5 +140,12 @@ def rasterize_cpu(
     lod_px: float = 0.0,
     threads: int | None = None,
 ) -> RasterOutput:
-    """Render one cloud in world coordinates; for repeated frames `prepare` it once and call `rasterize_prepared`."""
-    return rasterize_prepared([(prepare(cloud), None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads)
+    """Render one cloud in world coordinates.
+
+    The prepared form of a cloud is kept as long as the cloud lives, so repeated frames of one cloud are fast; clouds are therefore not to
+    be changed in place.
+    """
+    prepared = _prepared.get(cloud)
+    if prepared is None:
+        prepared = _prepared[cloud] = prepare(cloud)
+    return rasterize_prepared([(prepared, None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads)
