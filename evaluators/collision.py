@@ -1,0 +1,91 @@
+"""Contact with other actors: which step, which actor, which side of the ego; and the least gap.
+
+Protocol (paper, appendix "Collision"): at each step the plan-view polygons of ego and actors are intersected; an actor that touches the
+front-bumper segment is a front contact, else one that touches the rear-bumper segment a rear contact, else a lateral one. At fault is
+front or lateral. Touching counts as contact. Only logged instants are looked at.
+
+All pairs of a rollout are handled at once: centre distances rule out nearly all of them, shapely's exact predicates decide the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from evaluators.base import register, series
+from evaluators.footprint import ActorTable, Footprints, ego_footprints, origin_of
+from evaluators.presets import Preset
+
+FRONT, REAR, LATERAL = 0, 1, 2
+# Slack of the distance filter: far above rounding, far below any size, so that the filter never rules out a touching pair.
+_SLACK_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Touching pairs, by step and then in the actors' order."""
+
+    step: I64  # (M,) index into the ego's times
+    actor: I64  # (M,) index into the actor table
+    side: I64  # (M,) FRONT, REAR or LATERAL
+
+
+def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Contacts, F64]:
+    """Find all contacts and the least gap per step.
+
+    Args:
+        ego: Footprints at the times.
+        actors: Everybody else.
+        t_us: ``(T,)`` times.
+
+    Returns:
+        The contacts, and ``(T,)`` metres from the ego to the nearest actor: 0 on touch, inf where nobody is present.
+    """
+    gap_m = np.full(len(t_us), np.inf)
+    none = np.zeros(0, dtype=np.int64)
+    if len(actors) == 0:
+        return Contacts(none, none, none), gap_m
+    there = actors.at(t_us)
+    centre_m = there.centre_distance_m(ego.xy)  # (A, T)
+    at_least = centre_m - ego.radius_m[None] - actors.radius_m[:, None]
+    at_most = centre_m - ego.inner_radius_m[None] - actors.inner_radius_m[:, None]
+    # The nearest footprint is among those that could be as near as the surest one; every touching one is among them too.
+    candidate = there.present & (at_least <= np.maximum(at_most.min(axis=0), 0.0)[None] + _SLACK_M)
+    step, actor = np.nonzero(candidate.T)
+    ego_shapes = ego.shapes()
+    boxes = there.footprints(actor, step).shapes()
+    distance_m = shapely.distance(ego_shapes[step], boxes)
+    np.minimum.at(gap_m, step, distance_m)
+    # Distance 0 and "intersects" may differ by rounding; the predicate is exact and decides, and the gap follows it.
+    touch = shapely.intersects(ego_shapes[step], boxes)
+    gap_m[step[touch]] = 0.0
+    step, actor, boxes = step[touch], actor[touch], boxes[touch]
+    front, rear = ego.take(step).bumpers()
+    side = np.where(shapely.intersects(boxes, front), FRONT, np.where(shapely.intersects(boxes, rear), REAR, LATERAL))
+    return Contacts(step, actor, side.astype(np.int64)), gap_m
+
+
+@register("collision", "contact with other actors, by side, and the least gap")
+def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step."""
+    origin = origin_of(rollout.ego)
+    t_us = rollout.ego.t_us
+    contacts, gap_m = find_contacts(ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin), t_us)
+    front, rear, lateral = (_any_per_step(contacts, side, len(t_us)) for side in (FRONT, REAR, LATERAL))
+    return [
+        series("collision_any", t_us, front | rear | lateral),
+        series("collision_at_fault", t_us, front | lateral),
+        series("collision_front", t_us, front),
+        series("collision_lateral", t_us, lateral),
+        series("collision_rear", t_us, rear),
+        series("min_distance_to_obstacle_m", t_us, gap_m, np.isfinite(gap_m), "no other actor is present"),
+    ]
+
+
+def _any_per_step(contacts: Contacts, side: int, n_steps: int) -> Bool:
+    out = np.zeros(n_steps, dtype=np.bool_)
+    out[contacts.step[contacts.side == side]] = True
+    return out

@@ -1,0 +1,166 @@
+"""Plan-view footprints: the ego's and all actors' rectangles at any set of times, as arrays.
+
+Corners run front-left, front-right, rear-right, rear-left; the front bumper is the side between the first two, the rear bumper the one
+between the last two. All coordinates are metres relative to an origin near the drive, so that UTM-sized worlds cost no precision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from alpasim_plugin.geometry import slerp, yaw_from_quat
+from alpasim_plugin.types import F64, I64, Bool, RolloutLog, Trajectory
+from evaluators.presets import Preset
+
+Geometries = npt.NDArray[Any]  # of shapely geometries
+
+_UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # along x, y of the box
+
+
+def origin_of(track: Trajectory) -> F64:
+    """Return the whole-metre point ``(3,)`` nearest to the start of a track; subtracting it is exact in float64 up to 4e15 m."""
+    return np.asarray(np.round(track.xyz[0]))
+
+
+def corners(xy: F64, yaw: F64, size: F64) -> F64:
+    """Return the corners ``(N, 4, 2)`` of boxes with centres ``(N, 2)``, headings ``(N,)`` and (length, width) ``(N, 2)``."""
+    local = _UNIT_CORNERS * size[:, None, :]  # (N, 4, 2)
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = local[..., 0], local[..., 1]
+    return np.stack([xy[:, None, 0] + c * x - s * y, xy[:, None, 1] + s * x + c * y], axis=-1)
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """Boxes of one body at N instants."""
+
+    xy: F64  # (N, 2) centre, metres from the origin
+    yaw: F64  # (N,)
+    size: F64  # (N, 2) length, width after shrinking
+    roundness: float = 0.0
+
+    @property
+    def radius_m(self) -> F64:
+        """Radius ``(N,)`` of the circle around each box."""
+        return np.asarray(np.hypot(self.size[:, 0], self.size[:, 1]) / 2)
+
+    @property
+    def inner_radius_m(self) -> F64:
+        """Radius ``(N,)`` of a circle around the centre inside each footprint."""
+        return np.asarray(self.size.min(axis=1) / 2)
+
+    def take(self, index: I64) -> Footprints:
+        """Return the boxes at some rows."""
+        return Footprints(self.xy[index], self.yaw[index], self.size[index], self.roundness)
+
+    def shapes(self) -> Geometries:
+        """Return the footprints ``(N,)`` as shapely polygons."""
+        boxes = shapely.polygons(corners(self.xy, self.yaw, self.size))
+        r = self._corner_radius_m()
+        return boxes if r is None else np.asarray(shapely.buffer(shapely.buffer(boxes, -r), r))
+
+    def bumpers(self) -> tuple[Geometries, Geometries]:
+        """Return front and rear bumpers ``(N,)``: segments; with rounded corners the footprint's part within a corner radius of them."""
+        at = corners(self.xy, self.yaw, self.size)
+        front, rear = shapely.linestrings(at[:, 0:2]), shapely.linestrings(at[:, 2:4])
+        r = self._corner_radius_m()
+        if r is None:
+            return front, rear
+        body = self.shapes()
+        return shapely.intersection(shapely.buffer(front, r), body), shapely.intersection(shapely.buffer(rear, r), body)
+
+    def _corner_radius_m(self) -> F64 | None:
+        return self.roundness * self.size.min(axis=1) / 2 if self.roundness > 0 else None
+
+
+def ego_footprints(rollout: RolloutLog, preset: Preset, origin: F64) -> Footprints:
+    """Return the ego's footprint at every logged time, centred at the box centre."""
+    return ego_footprints_at(rollout.ego.xyz[:, :2] - origin[:2], yaw_from_quat(rollout.ego.quat), rollout, preset)
+
+
+def ego_footprints_at(xy: F64, yaw: F64, rollout: RolloutLog, preset: Preset) -> Footprints:
+    """Return the ego's footprint at given box centres ``(N, 2)`` and headings ``(N,)``."""
+    length_m, width_m = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
+    size = np.broadcast_to(np.array([length_m, width_m]) * (1.0 - preset.shrink), (len(xy), 2))
+    return Footprints(np.asarray(xy), np.asarray(yaw), size, preset.roundness)
+
+
+class ActorTable:
+    """Tracks of all actors of a rollout, laid end to end, so that many times are looked up at once.
+
+    An actor exists from its first to its last logged time, both included; between logged times its pose is interpolated (position
+    linearly, rotation by slerp).
+    """
+
+    def __init__(self, rollout: RolloutLog, preset: Preset, origin: F64) -> None:
+        actors = list(rollout.actors.values())
+        self.ids = tuple(actor.actor_id for actor in actors)
+        self._t = [actor.track.t_us for actor in actors]
+        self._start = np.concatenate([[0], np.cumsum([len(t) for t in self._t])]).astype(np.int64)
+        self._xy = np.concatenate([np.zeros((0, 2)), *(actor.track.xyz[:, :2] - origin[:2] for actor in actors)])
+        self._quat = np.concatenate([np.zeros((0, 4)), *(actor.track.quat for actor in actors)])
+        self.size = np.array([[actor.box.length_m, actor.box.width_m] for actor in actors]).reshape(-1, 2) * (1.0 - preset.shrink)
+        self.roundness = preset.roundness
+        self.radius_m = np.hypot(self.size[:, 0], self.size[:, 1]) / 2  # (A,)
+        self.inner_radius_m = self.size.min(axis=1, initial=np.inf) / 2
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def at(self, t_us: I64) -> ActorsAt:
+        """Locate every actor at times ``(Q,)``, in any order."""
+        shape = (len(self), len(t_us))
+        row = np.zeros(shape, dtype=np.int64)
+        fraction = np.zeros(shape)
+        present = np.zeros(shape, dtype=np.bool_)
+        for a, track_t in enumerate(self._t):
+            i = np.searchsorted(track_t, t_us, side="right") - 1
+            present[a] = (i >= 0) & (t_us <= track_t[-1])
+            i = np.clip(i, 0, len(track_t) - 1)
+            follows = np.minimum(i + 1, len(track_t) - 1)
+            span = (track_t[follows] - track_t[i]).astype(np.float64)
+            passed = np.where(present[a], t_us - track_t[i], 0).astype(np.float64)
+            fraction[a] = np.divide(passed, span, out=np.zeros_like(span), where=span > 0)
+            row[a] = self._start[a] + i
+        return ActorsAt(self, row, fraction, present)
+
+
+@dataclass(frozen=True)
+class ActorsAt:
+    """All A actors at Q times."""
+
+    table: ActorTable
+    row: I64  # (A, Q) logged row before or at the time
+    fraction: F64  # (A, Q) of the way to the next row, 0 at a logged time
+    present: Bool  # (A, Q)
+
+    def centres(self) -> F64:
+        """Return box centres ``(A, Q, 2)``; meaningless where not present."""
+        f = self.fraction[..., None]
+        if not self.fraction.any():
+            return np.asarray(self.table._xy[self.row])
+        return np.asarray(self.table._xy[self.row] * (1 - f) + self.table._xy[self._next()] * f)
+
+    def centre_distance_m(self, xy: F64) -> F64:
+        """Return distances ``(A, Q)`` from points ``(Q, 2)`` to the centres; inf where an actor is absent."""
+        delta = self.centres() - xy[None]
+        return np.where(self.present, np.hypot(delta[..., 0], delta[..., 1]), np.inf)
+
+    def footprints(self, actor: I64, query: I64) -> Footprints:
+        """Return the boxes of pairs ``(M,)`` of actor and time."""
+        row, f = self.row[actor, query], self.fraction[actor, query]
+        follows = self._next()[actor, query]
+        xy = self.table._xy[row] * (1 - f)[:, None] + self.table._xy[follows] * f[:, None]
+        yaw = yaw_from_quat(self.table._quat[row])
+        between = np.flatnonzero(f)
+        if len(between):
+            yaw[between] = yaw_from_quat(slerp(self.table._quat[row[between]], self.table._quat[follows[between]], f[between]))
+        return Footprints(xy, yaw, self.table.size[actor], self.table.roundness)
+
+    def _next(self) -> I64:
+        return np.asarray(np.where(self.fraction > 0, self.row + 1, self.row))

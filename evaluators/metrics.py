@@ -1,0 +1,103 @@
+"""Facts about every metric: unit, better side, reduction over time, and one line of help.
+
+`METRICS` is what ``simrun list metrics`` prints and what reports read; an evaluator builds its series through `evaluators.base.series`,
+which takes these facts from here, so a name cannot carry two units.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.types import Aggregation, Direction
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """What one metric means."""
+
+    unit: str  # "" for flags and ratios
+    direction: Direction  # the better side
+    aggregation: Aggregation  # over the scored steps of one rollout
+    help: str
+    is_flag: bool = False  # 0 or 1 per step; its mean over rollouts is a rate
+    derived: bool = False  # exists per rollout only, computed in the reduction
+
+
+def _flag(help_text: str, direction: Direction = "lower", derived: bool = False, aggregation: Aggregation = "max") -> MetricInfo:
+    return MetricInfo("", direction, aggregation, help_text, is_flag=True, derived=derived)
+
+
+MIN_ADE = "min_ade@{:.1f}s({})"
+
+METRICS: dict[str, MetricInfo] = {
+    "collision_any": _flag("any contact with another actor"),
+    "collision_at_fault": _flag("front or lateral contact"),
+    "collision_front": _flag("an actor touches the front bumper"),
+    "collision_lateral": _flag("an actor touches the ego at neither bumper"),
+    "collision_rear": _flag("an actor touches the rear bumper and not the front one"),
+    "min_distance_to_obstacle_m": MetricInfo("m", "higher", "min", "least plan-view gap between the ego and any actor"),
+    "offroad": _flag("outside all nearby lanes and their union while touching a road edge"),
+    "wrong_lane": _flag("ego centre in a nearby lane whose direction differs by more than 120 degrees"),
+    "min_distance_to_lane_boundary_m": MetricInfo("m", "higher", "min", "gap to the border of the joined nearby lanes; 0 when not inside"),
+    "dist_to_gt_trajectory": MetricInfo("m", "lower", "max", "distance of the ego centre from the recorded path"),
+    "route_distance_m": MetricInfo("m", "lower", "mean", "mean over the rollout of the distance from the recorded path"),
+    "dist_to_gt_location": MetricInfo("m", "lower", "max", "distance of the ego centre from where the recording is at that time"),
+    "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached"),
+    "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then"),
+    "progress_rel_to_total": MetricInfo("", "higher", "last", "same as progress, under AlpaSim's other name"),
+    "dist_traveled_m": MetricInfo("m", "none", "last", "metres driven"),
+    "gt_dist_traveled_m": MetricInfo("m", "none", "last", "length of the recorded path"),
+    "plan_deviation": MetricInfo("m", "lower", "mean", "how far consecutive plans differ at common times, near ones weigh more"),
+    "open_loop_collision": _flag("a plan touches where another actor really is within 3 s", aggregation="mean"),
+    **{
+        MIN_ADE.format(horizon, "gt"): MetricInfo(
+            "m", "lower", "mean", f"mean error over {horizon} s of the best sampled plan against the recording"
+        )
+        for horizon in (0.5, 1.0, 2.5, 5.0)
+    },
+    "img_is_black": _flag("a camera image is black (no byte above 10)"),
+    "safety_monitor_triggered": _flag("the policy's own safety monitor fired", direction="none"),
+    "eval_relevant": _flag("the policy drives: the warm-up is over", direction="none"),
+    "offroad_or_collision": _flag("off-road or any contact", derived=True),
+    "offroad_or_collision_at_fault": _flag("off-road or contact at fault", derived=True),
+    "duration_frac_20s": MetricInfo("", "none", "last", "scored time over 20 s", derived=True),
+    "progress_clipped_rel": MetricInfo("", "higher", "last", "progress at the last scored step", derived=True),
+}
+
+_MIN_ADE_NAME = re.compile(r"min_ade@(\d+\.\d+)s\((gt|self)\)")
+
+
+def info(name: str) -> MetricInfo:
+    """Return the facts of a metric; minADE exists for any horizon and for the targets ``gt`` and ``self``.
+
+    Raises:
+        EvaluatorError: Nobody declared this metric.
+
+    Example:
+        >>> info("route_distance_m").unit
+        'm'
+        >>> info("min_ade@3.0s(gt)").aggregation
+        'mean'
+    """
+    if name in METRICS:
+        return METRICS[name]
+    match = _MIN_ADE_NAME.fullmatch(name)
+    if match:
+        target = "the recording" if match[2] == "gt" else "the driven path"
+        return replace(METRICS[MIN_ADE.format(0.5, "gt")], help=f"mean error over {match[1]} s of the best sampled plan against {target}")
+    raise EvaluatorError(
+        "looking up a metric", f"name {name!r}", "no evaluator declares it", "add it with evaluators.metrics.declare, or check the spelling"
+    )
+
+
+def declare(name: str, facts: MetricInfo) -> None:
+    """Add a metric of a third-party evaluator.
+
+    Raises:
+        EvaluatorError: The name is declared already with other facts.
+    """
+    if METRICS.get(name, facts) != facts:
+        raise EvaluatorError("declaring a metric", f"name {name!r}", "it is declared already with other facts", "choose another name")
+    METRICS[name] = facts

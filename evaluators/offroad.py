@@ -1,0 +1,97 @@
+"""Lane keeping: off the road, in a wrong lane, and the gap to the border of the lanes around the ego.
+
+Protocol (paper, appendix "Off-road"). Nearby lanes are those whose centre line passes within 6 m of the ego's box centre, in 3-D and
+whatever their direction. A step is on the road if one nearby lane's area contains the footprint (touching its border from inside is
+inside), or else if the union of all nearby areas does. Only if neither holds, the road edges decide: the step is off-road if the footprint
+is nearer than 1 mm to a road-edge polyline. "Off-road" thus means *touching the edge* outside the lanes: far beyond the edge, where nothing
+is touched, a step counts as on the road. The drive to there has crossed the edge, and steps after the first event are dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.geometry import wrap_angle, yaw_from_quat
+from alpasim_plugin.types import F64, Bool, MetricSeries, RolloutLog, Scene
+from evaluators.base import register, series
+from evaluators.footprint import Geometries, ego_footprints, origin_of
+from evaluators.presets import Preset
+from evaluators.road import Road, road_of
+
+WRONG_HEADING_RAD = 2 * np.pi / 3
+
+NO_LANES = "the map has no lanes"
+NO_EDGES = "no lane contains the footprint and the map has no road edges to decide"
+
+
+@dataclass(frozen=True)
+class Containment:
+    """How the lanes around the ego hold its footprint, per step."""
+
+    near: Bool  # (T, L) lanes within the radius
+    in_one: Bool  # (T,) one lane's area contains the footprint
+    in_union: Bool  # (T,) the union of nearby areas contains it
+    boundary_gap_m: F64  # (T,) distance to the union's border where it contains the footprint, else 0
+
+
+def containment(road: Road, footprints: Geometries, xyz: F64) -> Containment:
+    """Test footprints ``(T,)`` with box centres ``(T, 3)`` against single lanes and against the union of nearby lanes."""
+    near = road.lanes_near(xyz)
+    in_one = np.zeros(len(footprints), dtype=np.bool_)
+    step, lane = np.nonzero(near)
+    in_one[step[shapely.contains(road.areas[lane], footprints[step])]] = True
+    in_union = np.zeros_like(in_one)
+    gap_m = np.zeros(len(footprints))
+    # Steps with the same nearby lanes share one union.
+    _, first, group = np.unique(np.packbits(near, axis=1), axis=0, return_index=True, return_inverse=True)
+    group = group.reshape(-1)
+    for g, representative in enumerate(first):
+        if not near[representative].any():
+            continue
+        rows = np.flatnonzero(group == g)
+        union = road.union(near[representative])
+        inside = rows[shapely.contains(union, footprints[rows])]
+        in_union[inside] = True
+        gap_m[inside] = shapely.distance(shapely.boundary(union), footprints[inside])
+    return Containment(near, in_one, in_union, gap_m)
+
+
+def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, wrap: bool) -> Bool:
+    """Return whether any nearby lane that contains the centre ``(T, 2)`` points more than 120 degrees away from the heading ``(T,)``."""
+    step, lane = np.nonzero(near)
+    inside = shapely.contains(road.areas[lane], shapely.points(xy[step]))
+    step, lane = step[inside], lane[inside]
+    delta = road.heading_at(lane, xy[step]) - yaw[step]
+    out = np.zeros(len(xy), dtype=np.bool_)
+    out[step[np.abs(wrap_angle(delta) if wrap else delta) > WRONG_HEADING_RAD]] = True
+    return out
+
+
+@register("offroad", "off the road, wrong lane, gap to the lanes' border")
+def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+    """Give ``offroad``, ``wrong_lane`` and ``min_distance_to_lane_boundary_m`` per step; a missing map is invalid, never zero."""
+    t_us = rollout.ego.t_us
+    names = ("offroad", "wrong_lane", "min_distance_to_lane_boundary_m")
+    if not scene.lane_map.lanes:
+        return [series(name, t_us, np.nan, False, NO_LANES) for name in names]
+    origin = origin_of(scene.ego_log)
+    road = road_of(scene.lane_map, origin, preset)
+    ego = ego_footprints(rollout, preset, origin)
+    shapes = ego.shapes()
+    xyz = rollout.ego.xyz - origin
+    held = containment(road, shapes, xyz)
+    off = np.zeros(len(t_us), dtype=np.bool_)
+    known = held.in_one | held.in_union
+    undecided = np.flatnonzero(~known)
+    if len(road.edges) and len(undecided):
+        off[undecided] = road.touches_edge(shapes[undecided], xyz[undecided])
+        known[undecided] = True
+    against = wrong_lane(road, held.near, ego.xy, yaw_from_quat(rollout.ego.quat), preset.wrap_heading)
+    return [
+        series("offroad", t_us, off, known, NO_EDGES),
+        series("wrong_lane", t_us, against),
+        series("min_distance_to_lane_boundary_m", t_us, held.boundary_gap_m),
+    ]

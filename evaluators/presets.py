@@ -1,0 +1,73 @@
+"""Evaluator presets: every convention that changes a number, in one frozen record that is stamped on the results.
+
+`paper` follows the closed-loop appendix of the OneFixer paper. A preset only selects; the evaluators hold the code of each choice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from alpasim_plugin.errors import InputError
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Conventions of one scoring protocol."""
+
+    name: str
+    # Footprint. The sizes of all boxes are scaled by 1 - shrink; corners are rounded by roundness * shorter side / 2.
+    ego_size_m: tuple[float, float] | None = None  # length, width; None: as logged
+    shrink: float = 0.0
+    roundness: float = 0.0
+    # Collision. "every": each touching actor is classified. "last": only the last one of the spatial index's answer is.
+    hits: Literal["every", "last"] = "every"
+    # Road. Lanes whose centre passes within lane_radius_m (3-D) of the ego box centre: its line, or only its stored vertices.
+    lane_radius_m: float = 6.0
+    lane_query: Literal["line", "vertices"] = "line"
+    lane_half_width_m: float = 1.85  # buffer of the centre where an edge is missing
+    edge_touch_m: float = 0.001  # off-road below this distance from a road edge, if no lane contains the footprint
+    edge_query: Literal["any", "nearest_vertex"] = "any"
+    edge_height_m: float = 3.0  # edge_query "any": edges farther above or below the box centre belong to another road
+    wrap_heading: bool = True  # compare headings modulo a full turn
+    # Recorded path.
+    invented_starts: bool = False  # the first two rows of the recording-based metrics are constants
+    distance_from: Literal["handover", "log_start"] = "handover"  # where dist_traveled_m starts
+    # Plans.
+    open_loop_horizon_us: int = 3_000_000
+    min_ade_horizons_s: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0)
+    min_ade_target: Literal["gt", "self"] = "gt"
+    plan_decay: float = 0.1  # weight exp(-plan_decay * k) of the k-th common plan time
+    # Images. None: every logged camera counts.
+    image_camera: str | None = None
+    image_rule: Literal["own_times", "at_or_after_step"] = "own_times"
+    # From steps to one value per rollout.
+    aliases: bool = False  # give AlpaSim's second names of the same value as well
+    replay_is_scored: bool = False  # a rollout that never leaves the warm-up: scored whole, or invalid
+    honour_valid: bool = True  # skip invalid steps, or reduce over every row
+    stop_after: tuple[str, ...] = ("collision_any", "offroad")  # rows after the first event are dropped
+    stop_beyond_gt_m: float | None = None  # rows after the first one this far from the recorded path are dropped
+    drop_black: bool = False  # a black image in a scored row removes the rollout
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every convention by name, for run.json."""
+        return dataclasses.asdict(self)
+
+
+PRESETS: dict[str, Preset] = {
+    "paper": Preset(name="paper", ego_size_m=(4.855, 1.88)),
+}
+
+
+def preset(name: str | Preset) -> Preset:
+    """Return a preset by name; a `Preset` is passed through.
+
+    Raises:
+        InputError: Unknown name.
+    """
+    if isinstance(name, Preset):
+        return name
+    if name not in PRESETS:
+        raise InputError("choosing an evaluator preset", f"name {name!r}", "no preset has that name", f"known: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,156 @@
+"""The road as evaluators see it: lane areas, lane centres and road edges of one map, prepared once and looked up for whole rollouts.
+
+Unions of neighbouring lanes are costly and recur along a drive, so they are kept per map, keyed by the set of lanes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import weakref
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from alpasim_plugin.geometry_lanes import lane_polygon
+from alpasim_plugin.types import F64, I64, Bool, Lane, LaneMap
+from evaluators.footprint import Geometries
+from evaluators.presets import Preset
+
+
+class Road:
+    """Lanes and edges of one map, metres relative to ``origin``."""
+
+    def __init__(self, lane_map: LaneMap, origin: F64, preset: Preset) -> None:
+        lanes = [_moved(lane, origin) for lane in lane_map.lanes.values()]
+        self.origin = origin
+        self.lane_ids = tuple(lane.lane_id for lane in lanes)
+        self.areas: Geometries = np.array([lane_polygon(lane, preset.lane_half_width_m) for lane in lanes], dtype=object)
+        shapely.prepare(self.areas)
+        self.centres: Geometries = np.array([_line(lane.centre[:, :2]) for lane in lanes], dtype=object)
+        self._preset = preset
+        self._centre = _Polylines([lane.centre for lane in lanes])
+        self.edges: Geometries = np.array([_line(edge[:, :2] - origin[:2]) for edge in lane_map.road_edges], dtype=object)
+        self._edge = _Polylines([edge - origin for edge in lane_map.road_edges])
+        self._unions: dict[bytes, Any] = {}
+
+    def lanes_near(self, xyz: F64) -> Bool:
+        """Return which lanes ``(T, L)`` pass near points ``(T, 3)``, by the preset's radius and query, in 3-D whatever their direction."""
+        if self._preset.lane_query == "vertices":
+            return self._centre.vertex_within(xyz, self._preset.lane_radius_m)
+        return self._centre.line_within(xyz, self._preset.lane_radius_m)
+
+    def union(self, lanes: Bool) -> Any:
+        """Return the prepared union of the lanes marked in ``(L,)``."""
+        key = np.packbits(lanes).tobytes()
+        if key not in self._unions:
+            chosen = self.areas[lanes]
+            shape = chosen[0] if len(chosen) == 1 else shapely.union_all(chosen)
+            shapely.prepare(shape)
+            self._unions[key] = shape
+        return self._unions[key]
+
+    def touches_edge(self, footprints: Geometries, xyz: F64) -> Bool:
+        """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the preset's threshold to the road edge.
+
+        ``edge_query`` "any": to any edge at the ego's height. "nearest_vertex": to the edge that owns the vertex nearest to the centre.
+        """
+        limit_m = self._preset.edge_touch_m
+        if self._preset.edge_query == "nearest_vertex":
+            return np.asarray(shapely.distance(self.edges[self._edge.nearest_vertex_owner(xyz)], footprints) < limit_m)
+        return self._edge.touched(footprints, xyz[:, 2], limit_m, self._preset.edge_height_m)
+
+    def heading_at(self, lane: I64, xy: F64) -> F64:
+        """Return the direction of lanes ``(M,)`` beside points ``(M, 2)``: from 1 cm before to 1 cm after the centre's nearest point."""
+        lines = self.centres[lane]
+        s = shapely.line_locate_point(lines, shapely.points(xy))
+        before = shapely.get_coordinates(shapely.line_interpolate_point(lines, np.maximum(s - 0.01, 0.0)))
+        after = shapely.get_coordinates(shapely.line_interpolate_point(lines, s + 0.01))
+        delta = after - before
+        return np.asarray(np.arctan2(delta[:, 1], delta[:, 0]))
+
+
+class _Polylines:
+    """Segments and vertices of many polylines in 3-D, indexed in plan view."""
+
+    def __init__(self, lines: list[F64]) -> None:
+        self.n_lines = len(lines)
+        lines = [np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in lines]
+        empty = np.zeros((0, 3))
+        self.start = np.concatenate([empty, *(line[:-1] for line in lines)])
+        self.end = np.concatenate([empty, *(line[1:] for line in lines)])
+        self.owner = np.repeat(np.arange(len(lines)), [len(line) - 1 for line in lines])
+        self.vertices = np.concatenate([empty, *lines])
+        self.vertex_owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+        self._segments = shapely.linestrings(np.stack([self.start[:, :2], self.end[:, :2]], axis=1))
+        self._tree = shapely.STRtree(self._segments)
+
+    def line_within(self, xyz: F64, radius_m: float) -> Bool:
+        """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D."""
+        out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
+        # Plan-view distance is never above the 3-D one; the slack keeps rounding from hiding a segment.
+        point, segment = self._tree.query(shapely.points(xyz[:, :2]), predicate="dwithin", distance=radius_m + 1e-6)
+        near = _segment_distance(self.start[segment], self.end[segment], xyz[point]) <= radius_m
+        out[point[near], self.owner[segment[near]]] = True
+        return out
+
+    def vertex_within(self, xyz: F64, radius_m: float) -> Bool:
+        """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in 3-D."""
+        out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
+        if len(self.vertices):
+            found = cKDTree(self.vertices).query_ball_point(xyz, radius_m)
+            for i, vertices in enumerate(found):
+                out[i, self.vertex_owner[vertices]] = True
+        return out
+
+    def nearest_vertex_owner(self, xyz: F64) -> I64:
+        """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in 3-D."""
+        return np.asarray(self.vertex_owner[cKDTree(self.vertices).query(xyz)[1]])
+
+    def touched(self, footprints: Geometries, z: F64, limit_m: float, height_m: float) -> Bool:
+        """Return whether each footprint is nearer than a limit to a segment whose middle is at most ``height_m`` above or below it."""
+        out = np.zeros(len(footprints), dtype=np.bool_)
+        body, segment = self._tree.query(footprints, predicate="dwithin", distance=limit_m)
+        middle = (self.start[segment, 2] + self.end[segment, 2]) / 2
+        level = np.abs(middle - z[body]) <= height_m
+        body, segment = body[level], segment[level]
+        out[body[shapely.distance(self._segments[segment], footprints[body]) < limit_m]] = True
+        return out
+
+
+def _segment_distance(start: F64, end: F64, points: F64) -> F64:
+    """Return distances ``(M,)`` between points ``(M, 3)`` and segments ``(M, 3)``, ``(M, 3)``."""
+    along, offset = end - start, points - start
+    length2 = np.einsum("ij,ij->i", along, along)
+    f = np.einsum("ij,ij->i", along, offset)
+    f = np.clip(np.divide(f, length2, out=np.zeros_like(f), where=length2 > 0), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - f[:, None] * along, axis=1))
+
+
+def _moved(lane: Lane, origin: F64) -> Lane:
+    left = None if lane.left is None else lane.left - origin
+    right = None if lane.right is None else lane.right - origin
+    return dataclasses.replace(lane, centre=lane.centre - origin, left=left, right=right)
+
+
+def _line(xy: F64) -> Any:
+    return shapely.linestrings(np.repeat(xy, 2, axis=0) if len(xy) == 1 else xy)
+
+
+_cache: dict[tuple[int, bytes, Preset], tuple[weakref.ref[LaneMap], Road]] = {}
+_CACHED_ROADS = 8
+
+
+def road_of(lane_map: LaneMap, origin: F64, preset: Preset) -> Road:
+    """Return the prepared road of a map; the last few are kept, as rollouts of one scene come in a row."""
+    key = (id(lane_map), origin.tobytes(), preset)
+    held = _cache.get(key)
+    # An id can be reused after its object is gone; the weak reference tells.
+    if held is not None and held[0]() is lane_map:
+        return held[1]
+    while len(_cache) >= _CACHED_ROADS:
+        del _cache[next(iter(_cache))]
+    road = Road(lane_map, origin, preset)
+    _cache[key] = (weakref.ref(lane_map), road)
+    return road

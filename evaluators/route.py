@@ -1,0 +1,108 @@
+"""The drive against the recorded one: distance from its path, from its position at the time, and progress along it.
+
+The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved to the box centre with the log's
+rig-to-box pose. All distances are in plan view. The paper's route distance is the mean over the scored steps of the distance to that path.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.geometry import arc_lengths, interpolate, offset_trajectory
+from alpasim_plugin.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
+from evaluators.base import register, relevant, series
+from evaluators.footprint import origin_of
+from evaluators.presets import Preset
+
+_MAX_CELLS = 2_000_000  # points x segments handled at once
+
+
+def recorded_path(rollout: RolloutLog) -> Trajectory:
+    """Return the recorded drive as poses of the box centre."""
+    return offset_trajectory(rollout.ego_log, rollout.T_rig_box)
+
+
+def to_path(path: F64, points: F64) -> tuple[F64, F64]:
+    """Project points on a polyline.
+
+    Args:
+        path: ``(N, 2)`` vertices; one vertex is a point.
+        points: ``(T, 2)``.
+
+    Returns:
+        Distances ``(T,)`` and arc lengths ``(T,)`` of the nearest point of the path; of several nearest ones the first.
+    """
+    line = shapely.linestrings(np.repeat(path, 2, axis=0) if len(path) == 1 else path)
+    at = shapely.points(points)
+    return np.asarray(shapely.distance(line, at)), np.asarray(shapely.line_locate_point(line, at))
+
+
+def progress_so_far(path: F64, points: F64) -> F64:
+    """Return ``(T,)`` how far point k has come along the first k + 1 vertices of a path, as a share of their length.
+
+    Args:
+        path: ``(T, 2)`` where the recording is at each step.
+        points: ``(T, 2)`` where the ego is.
+
+    1 where that part of the path has no length: the recording has not moved, so there is nothing to be behind of.
+    """
+    n = len(path)
+    s = arc_lengths(path)
+    if n == 1:
+        return np.ones(1)
+    start, along = path[:-1], np.diff(path, axis=0)
+    length2 = np.einsum("ij,ij->i", along, along)
+    out = np.ones(n)
+    rows_at_once = max(1, _MAX_CELLS // n)
+    for low in range(0, n, rows_at_once):
+        rows = np.arange(low, min(low + rows_at_once, n))
+        offset = points[rows, None] - start[None]  # (R, N-1, 2)
+        f = np.einsum("rnj,nj->rn", offset, along)
+        f = np.clip(np.divide(f, length2[None], out=np.zeros_like(f), where=length2[None] > 0), 0.0, 1.0)
+        away = offset - f[..., None] * along[None]
+        distance2 = np.einsum("rnj,rnj->rn", away, away)
+        distance2[np.arange(n - 1)[None] >= rows[:, None]] = np.inf  # segments that start at or after vertex k do not exist yet
+        best = np.argmin(distance2, axis=1)
+        reached = s[best] + f[np.arange(len(rows)), best] * np.sqrt(length2[best])
+        total = s[rows]
+        out[rows] = np.divide(reached, total, out=np.ones(len(rows)), where=total > 0)
+    return out
+
+
+@register("route", "distance from the recorded path and progress along it")
+def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+    """Give the recording-based metrics and ``eval_relevant`` per step."""
+    t_us = rollout.ego.t_us
+    origin = origin_of(rollout.ego_log)
+    recorded = recorded_path(rollout)
+    path = recorded.xyz[:, :2] - origin[:2]
+    ego = rollout.ego.xyz[:, :2] - origin[:2]
+    distance_m, s = to_path(path, ego)
+    length_m = float(arc_lengths(path)[-1])
+    covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
+    there = interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :2, 3] - origin[:2]
+    away_m = np.hypot(*(ego - there).T)
+    share = s / length_m if length_m > 0 else np.full(len(s), np.nan)
+    no_length = "the recorded path has no length"
+    outside = "the recording does not cover this time"
+    engaged = relevant(rollout)
+    out = [
+        series("dist_to_gt_trajectory", t_us, distance_m),
+        series("route_distance_m", t_us, distance_m),
+        series("dist_to_gt_location", t_us, away_m, covered, outside),
+        series("progress", t_us, share, length_m > 0, no_length),
+        series("progress_rel", t_us, progress_so_far(there, ego), covered, outside),
+        series("dist_traveled_m", t_us, driven(ego, int(np.argmax(engaged)) if preset.distance_from == "handover" else 0)),
+        series("gt_dist_traveled_m", t_us, np.full(len(t_us), length_m)),
+        series("eval_relevant", t_us, engaged),
+    ]
+    if preset.aliases:
+        out.append(series("progress_rel_to_total", t_us, share, length_m > 0, no_length))
+    return out
+
+
+def driven(ego: F64, first: int) -> F64:
+    """Return metres driven ``(T,)`` along positions ``(T, 2)`` since step ``first``, 0 before it."""
+    s = arc_lengths(ego)
+    return np.asarray(np.maximum(s - s[first], 0.0))
