@@ -1,0 +1,39 @@
+"""Which plan is in force when."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alpasim_plugin.runtime.latency import PlanQueue
+from alpasim_plugin.types import Latency, Trajectory
+
+
+def plan(t_us: int) -> Trajectory:
+    return Trajectory(np.array([t_us]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
+
+
+def test_without_latency_a_plan_is_in_force_at_once() -> None:
+    queue = PlanQueue(Latency("none"))
+    assert queue.active(0) is None
+    first = plan(0)
+    queue.submit(first, 0, wall_us=10**9)
+    assert queue.active(0) is first
+
+
+def test_fixed_latency_holds_the_older_plan_until_the_newer_is_due() -> None:
+    queue = PlanQueue(Latency("fixed", 150_000))
+    first, second = plan(0), plan(100_000)
+    queue.submit(first, 0, 0)
+    assert queue.active(100_000) is None
+    queue.submit(second, 100_000, 0)
+    assert queue.active(200_000) is first
+    assert queue.active(250_000) is second
+
+
+def test_a_slow_answer_never_replaces_a_newer_fast_one() -> None:
+    queue = PlanQueue(Latency("measured"))
+    slow, fast = plan(0), plan(100_000)
+    queue.submit(slow, 0, wall_us=500_000)
+    queue.submit(fast, 100_000, wall_us=10_000)
+    assert queue.active(110_000) is fast
+    assert queue.active(500_000) is fast
