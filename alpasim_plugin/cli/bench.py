@@ -1,0 +1,39 @@
+"""``simrun bench``: speed, never without the error beside it."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from alpasim_plugin.gaussians.bench import bench_raster
+
+app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts.")
+
+
+@app.callback()
+def bench() -> None:
+    """Measure speed and error of parts."""
+
+
+@app.command("raster", epilog="Example: `simrun bench raster --repeats 20`")
+def raster(
+    repeats: Annotated[int, typer.Option("--repeats", min=3, help="Frames per row; medians are printed.")] = 15,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Time the CPU rasteriser on a random street and compare it with the float64 reference."""
+    del debug
+    rows = [dict(row) for row in bench_raster(repeats=repeats)]
+    if as_json:
+        print(json.dumps(rows))
+        return
+    table = Table(box=None, header_style="bold")
+    for name in rows[0]:
+        table.add_column(name.replace("_", " "), justify="right")
+    for row in rows:
+        table.add_row(*("-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
+    Console().print(table)

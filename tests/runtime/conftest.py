@@ -1,0 +1,76 @@
+"""A scene small enough for tests of the loop: a straight two-lane road, one car ahead, one on the shoulder."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.geometry import quat_from_yaw
+from alpasim_plugin.types import (
+    Actor,
+    Box,
+    CameraSpec,
+    Degradation,
+    Environment,
+    Lane,
+    LaneMap,
+    Latency,
+    Rates,
+    Route,
+    Scenario,
+    Trajectory,
+    Vehicle,
+)
+from alpasim_plugin.world.ground import flat
+
+
+def straight_track(x0_m: float, y_m: float, z_m: float, speed_mps: float, duration_s: float, period_us: int = 10_000) -> Trajectory:
+    """Return a track along x at constant speed."""
+    t_us = np.arange(0, int(duration_s * 1e6) + 1, period_us, dtype=np.int64)
+    x = x0_m + speed_mps * t_us * 1e-6
+    xyz = np.stack([x, np.full_like(x, y_m), np.full_like(x, z_m)], axis=1)
+    return Trajectory(t_us, xyz, quat_from_yaw(np.zeros(len(t_us))))
+
+
+@pytest.fixture
+def straight_road() -> Scenario:
+    """Give 3 s at 10 m/s in the right lane of a straight road; 1 s of it is warm-up."""
+    x = np.linspace(-50.0, 250.0, 151)
+
+    def line(y_m: float) -> np.ndarray:
+        return np.stack([x, np.full_like(x, y_m), np.zeros_like(x)], axis=1)
+
+    lanes = {
+        "right": Lane("right", line(0.0), line(1.75), line(-1.75), left_neighbour="left", left_paint="dashed_white", right_paint="solid_white"),
+        "left": Lane("left", line(3.5), line(5.25), line(1.75), right_neighbour="right", left_paint="solid_white", right_paint="dashed_white"),
+    }
+    camera = CameraSpec(
+        "front",
+        96,
+        64,
+        np.array([[60.0, 0, 48], [0, 60.0, 32], [0, 0, 1]]),
+        np.array([[0.0, 0, 1, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]]),
+    )
+    return Scenario(
+        scene_id="straight-road",
+        source="yaml",
+        seed=0,
+        lane_map=LaneMap(lanes, road_edges=(line(5.25), line(-1.75))),
+        ground=flat(),
+        ego_log=straight_track(0.0, 0.0, 0.0, 10.0, 3.0),
+        vehicle=Vehicle(),
+        route=Route(line(0.0), ("right",)),
+        actors=(
+            Actor("ahead", "car", Box(4.5, 1.8, 1.5), straight_track(30.0, 0.0, 0.75, 10.0, 3.0)),
+            Actor("parked", "car", Box(4.5, 1.8, 1.5), straight_track(20.0, 3.5, 0.75, 0.0, 3.0), is_static=True),
+        ),
+        cameras=(camera,),
+        rates=Rates(),
+        start_us=0,
+        end_us=3_000_000,
+        warmup_us=1_000_000,
+        latency=Latency(),
+        environment=Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0),
+        degradation=Degradation(),
+        content_hash="straight-road-test",
+    )
