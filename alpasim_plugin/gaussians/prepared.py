@@ -33,6 +33,7 @@ class PreparedCloud:
         sh: float32, groups of sh_size x 3 x 16 lanes.
         index: int64, position of each lane's Gaussian in the cloud given.
         spheres: float64, bounding sphere per bundle.
+        sphere: float64 ``(SPHERE_SIZE,)``, bounding sphere of all.
     """
 
     n_input: int
@@ -44,6 +45,7 @@ class PreparedCloud:
     sh: F32
     index: npt.NDArray[np.int64]
     spheres: F64
+    sphere: F64
 
     def __len__(self) -> int:
         """Return the number of Gaussians kept."""
@@ -73,16 +75,18 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     geometry[:, GEO_EXTENT] = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
     geometry[:, GEO_REACH] = kept.scales.max(axis=1, initial=0.0)
     # A mean of NaN in the lanes that fill up the last group fails every comparison, so they are never drawn.
+    means, reach = kept.means.astype(np.float64), geometry[:, GEO_REACH].astype(np.float64)
     return PreparedCloud(
         len(cloud),
         n,
         sh_frame,
         size,
-        _in_lanes(kept.means.astype(np.float64), np.nan),
+        _in_lanes(means, np.nan),
         _in_lanes(geometry, 0.0),
         _in_lanes(kept.sh.reshape(n, size * 3).astype(np.float32), 0.0),
         np.concatenate([index, np.zeros(-n % _LANES, np.int64)]).astype(np.int64),
-        _bounding_spheres(kept.means.astype(np.float64), geometry[:, GEO_REACH].astype(np.float64)),
+        _bounding_spheres(means, reach, BUNDLE),
+        _bounding_spheres(means, reach, max(n, 1)) if n else np.zeros(SPHERE_SIZE),
     )
 
 
@@ -94,16 +98,16 @@ def _in_lanes(columns: npt.NDArray[np.floating], fill: float) -> npt.NDArray[np.
     return np.ascontiguousarray(padded.reshape(-1, _LANES, width).transpose(0, 2, 1)).reshape(-1)
 
 
-def _bounding_spheres(means: F64, reach: F64) -> F64:
-    """Return, per bundle, centre and radius of the means and the largest scale, flat."""
-    spheres = np.zeros((-(-len(means) // BUNDLE), SPHERE_SIZE))
-    for i, sphere in enumerate(spheres):
-        part = means[i * BUNDLE : (i + 1) * BUNDLE]
-        sphere[:3] = (part.min(axis=0) + part.max(axis=0)) / 2
-        # Grown by a hair: the radius must hold after rounding too.
-        sphere[3] = np.linalg.norm(part - sphere[:3], axis=1).max() * (1 + 1e-9) + 1e-9
-        sphere[4] = reach[i * BUNDLE : (i + 1) * BUNDLE].max()
-    return spheres.reshape(-1)
+def _bounding_spheres(means: F64, reach: F64, bundle: int) -> F64:
+    """Return centre and radius of the means and the largest scale of each ``bundle`` Gaussians in a row, flat."""
+    if len(means) == 0:
+        return np.zeros(0)
+    starts = np.arange(0, len(means), bundle)
+    centre = (np.minimum.reduceat(means, starts) + np.maximum.reduceat(means, starts)) / 2
+    distance = np.linalg.norm(means - np.repeat(centre, np.diff([*starts, len(means)]), axis=0), axis=1)
+    # Grown by a hair: the radius must hold after rounding too.
+    radius = np.maximum.reduceat(distance, starts) * (1 + 1e-9) + 1e-9
+    return np.column_stack([centre, radius, np.maximum.reduceat(reach, starts)]).reshape(-1)
 
 
 def _morton_codes(points: npt.NDArray[np.floating]) -> npt.NDArray[np.uint64]:

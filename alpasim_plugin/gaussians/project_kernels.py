@@ -77,6 +77,18 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
 
 
 @njit(cache=True, nogil=True)
+def nodes_in_view(spheres, poses, camera):
+    """Return the positions of the nodes that may touch a pixel."""
+    kept = np.empty(spheres.shape[0], np.int64)
+    count = 0
+    for i in range(spheres.shape[0]):
+        if not bundle_is_out_of_view(spheres[i], 0, poses[i], camera):
+            kept[count] = i
+            count += 1
+    return kept[:count]
+
+
+@njit(cache=True, nogil=True)
 def _write_basis(basis, x, y, z, size):
     """Write ``size`` spherical harmonics of sixteen unit directions."""
     v.store(basis, 0, v.splat(_f(C0)))
@@ -141,8 +153,9 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
     a00, a01, a02 = v.load(geometry, f), v.load(geometry, f + 16), v.load(geometry, f + 32)
     a10, a11, a12 = v.load(geometry, f + 48), v.load(geometry, f + 64), v.load(geometry, f + 80)
     a20, a21, a22 = v.load(geometry, f + 96), v.load(geometry, f + 112), v.load(geometry, f + 128)
-    m0, m1, m2 = v.fma(j0, a00, v.fma(j1, a10, j2 * a20)), v.fma(j0, a01, v.fma(j1, a11, j2 * a21)), v.fma(j0, a02, v.fma(j1, a12, j2 * a22))
-    n0, n1, n2 = v.fma(k0, a00, v.fma(k1, a10, k2 * a20)), v.fma(k0, a01, v.fma(k1, a11, k2 * a21)), v.fma(k0, a02, v.fma(k1, a12, k2 * a22))
+    m0, n0 = v.fma(j0, a00, v.fma(j1, a10, j2 * a20)), v.fma(k0, a00, v.fma(k1, a10, k2 * a20))
+    m1, n1 = v.fma(j0, a01, v.fma(j1, a11, j2 * a21)), v.fma(k0, a01, v.fma(k1, a11, k2 * a21))
+    m2, n2 = v.fma(j0, a02, v.fma(j1, a12, j2 * a22)), v.fma(k0, a02, v.fma(k1, a12, k2 * a22))
     mm = v.fma(m0, m0, v.fma(m1, m1, m2 * m2))
     nn = v.fma(n0, n0, v.fma(n1, n1, n2 * n2))
     mn = v.fma(m0, n0, v.fma(m1, n1, m2 * n2))

@@ -52,9 +52,8 @@ def _start_tile(state, tile_x, tile_y, width, height):
 @njit(cache=True, nogil=True)
 def _composite_tile(lists, start, end, records, x0, y0, state, live):
     """Blend a tile's splats in order; ``x0, y0`` is the centre of its first pixel. Returns how many splats were looked at."""
-    zero, one = v.splat(_f(0.0)), _f(1.0)
-    four = _f(4.0)
-    nil = _f(0.0)
+    zero = v.splat(_f(0.0))
+    nil, four = _f(0.0), _f(4.0)
     block_x = v.lane_pattern(four, nil)
     block_y = v.lane_pattern(nil, four)
     for i in range(start, end):

@@ -13,10 +13,10 @@ from alpasim_plugin.gaussians.binning import CHUNK, depth_order, fill_tiles, gat
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
 from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
-from alpasim_plugin.gaussians.layout import POSE_CENTRE, POSE_COLOUR, POSE_ROTATION, POSE_SIZE, RECORD, TILE
+from alpasim_plugin.gaussians.layout import POSE_CENTRE, POSE_COLOUR, POSE_ROTATION, POSE_SIZE, RECORD, SPHERE_SIZE, TILE
 from alpasim_plugin.gaussians.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.prepared import Node, PreparedCloud, prepare
-from alpasim_plugin.gaussians.project_kernels import project_node
+from alpasim_plugin.gaussians.project_kernels import nodes_in_view, project_node
 from alpasim_plugin.gaussians.raster_kernels import raster_tiles
 from alpasim_plugin.gaussians.workers import run_on_threads, thread_count
 from alpasim_plugin.types import F64
@@ -36,6 +36,8 @@ class _Buffers(threading.local):
         return array
 
 
+_IDENTITY = np.eye(4)
+_WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
 _buffers = _Buffers()
 _prepared: weakref.WeakKeyDictionary[GaussianCloud, PreparedCloud] = weakref.WeakKeyDictionary()
 
@@ -74,20 +76,20 @@ def rasterize_prepared(
         ],
         np.float32,
     )
-    total = sum(len(prepared) for prepared, _ in nodes)
+    poses = _node_poses(nodes, camera)
+    in_view = nodes_in_view(np.array([prepared.sphere for prepared, _ in nodes]).reshape(-1, SPHERE_SIZE), poses, view)
+    total = sum(len(nodes[i][0]) for i in in_view)
     records = _buffers.get("records", total * RECORD, np.float32)
     ids = _buffers.get("ids", total, np.int64)
+    first_ids = np.cumsum([0, *(prepared.n_input for prepared, _ in nodes)])
     cursor = np.zeros(2, np.int64)
-    first_id = 0
-    for prepared, T_world_node in nodes:
-        pose = _node_pose(prepared, T_world_node, camera)
+    for i in in_view:
+        prepared = nodes[i][0]
         cursor[0] = 0
-        workers = threads if len(prepared) > 4096 else 1
         run_on_threads(
-            workers, project_node, cursor, prepared.means, prepared.geometry, prepared.sh, prepared.sh_size, prepared.index,
-            prepared.spheres, first_id, pose, view, records, ids,
+            threads if len(prepared) > _WORTH_THREADS else 1, project_node, cursor, prepared.means, prepared.geometry, prepared.sh,
+            prepared.sh_size, prepared.index, prepared.spheres, first_ids[i], poses[i], view, records, ids,
         )  # fmt: skip
-        first_id += prepared.n_input
     count = int(cursor[1])
 
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
@@ -98,11 +100,11 @@ def rasterize_prepared(
     histogram = _buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
     starts = np.empty(n_tiles + 1, np.int64)
     cursor[:] = 0
-    run_on_threads(threads if count > 4096 else 1, gather_and_count, cursor, count, order, records, tiles_x, tiles_y, ordered, histogram)
+    run_on_threads(threads if count > _WORTH_THREADS else 1, gather_and_count, cursor, count, order, records, tiles_x, tiles_y, ordered, histogram)
     pairs = int(tile_offsets(count, histogram, starts))
     lists = _buffers.get("lists", pairs, np.int32)
     cursor[:] = 0
-    run_on_threads(threads if count > 4096 else 1, fill_tiles, cursor, count, ordered, tiles_x, tiles_y, histogram, lists)
+    run_on_threads(threads if count > _WORTH_THREADS else 1, fill_tiles, cursor, count, ordered, tiles_x, tiles_y, histogram, lists)
 
     shape = (camera.height, camera.width)
     rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -112,23 +114,22 @@ def rasterize_prepared(
     return RasterOutput(rgb, alpha, depth, stats)
 
 
-def _node_pose(prepared: PreparedCloud, T_world_node: npt.NDArray[np.floating] | None, camera: PinholeCamera) -> F64:
-    """Pack a node's pose relative to the camera; all differences of large coordinates happen here, in float64."""
-    pose = np.empty(POSE_SIZE)
-    rotation = camera.T_camera_world[:3, :3]
-    centre = camera.centre_world
-    colour = np.eye(3)
-    if T_world_node is not None:
-        require_rigid(T_world_node, "placing a node")
-        node = np.asarray(T_world_node, dtype=np.float64)
-        centre = node[:3, :3].T @ (centre - node[:3, 3])
-        rotation = rotation @ node[:3, :3]
-        if prepared.sh_frame == "world":
-            colour = node[:3, :3]
-    pose[POSE_ROTATION:POSE_CENTRE] = rotation.reshape(-1)
-    pose[POSE_CENTRE:POSE_COLOUR] = centre
-    pose[POSE_COLOUR:] = colour.reshape(-1)
-    return pose
+def _node_poses(nodes: Sequence[Node], camera: PinholeCamera) -> F64:
+    """Pack the nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64."""
+    poses = np.empty((len(nodes), POSE_SIZE))
+    T_world_node = np.stack([_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for _, T in nodes]) if nodes else np.empty((0, 4, 4))
+    rotation = T_world_node[:, :3, :3]
+    gram = rotation @ rotation.transpose(0, 2, 1)
+    # A cheap test of all nodes at once; the precise message is composed only where it fails.
+    if T_world_node.shape[1:] != (4, 4) or not np.all(np.abs(gram - np.eye(3)) <= 1e-5) or np.any(np.linalg.det(rotation) < 0):
+        for _, T in nodes:
+            if T is not None:
+                require_rigid(T, "placing a node")
+    poses[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
+    poses[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
+    turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
+    poses[:, POSE_COLOUR:] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
+    return poses
 
 
 def rasterize_cpu(
