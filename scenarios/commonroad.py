@@ -1,0 +1,188 @@
+"""CommonRoad scenarios (XML 2018b and 2020a) with recorded traffic.
+
+The format is read directly from its public description (Althoff, Koschi, Manzinger 2017; commonroad.in.tum.de). A file names no recorded
+ego: its planning problem asks for one. Here a recorded vehicle takes that role, so that there is a human drive to compare with.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.geometry import offset_trajectory
+from alpasim_plugin.geometry_lanes import lane_polygon
+from alpasim_plugin.types import F64, Box, HeightField, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.world.ground import flat, from_points
+from scenarios.commonroad_map import read_lanelets
+from scenarios.commonroad_obstacles import Obstacle, read_obstacles
+from scenarios.reading import SourceFiles
+from scenarios.recorded import RecordedLog
+from scenarios.road_edges import merge_areas
+from scenarios.tracks import actors_of_track
+
+VERSIONS = ("2018b", "2020a")
+DEFAULT = Vehicle()
+
+
+def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
+    """Read a scenario file.
+
+    Args:
+        path: The XML file.
+        ego: Id of the recorded vehicle that becomes the ego; None picks the car with the longest drive among those that are present
+            all the time, stay on the lanelets and touch nobody (ties: the smaller id). Lanes and gaps are tested with a footprint at
+            least as large as the default vehicle's, because the evaluators score with that footprint.
+
+    Raises:
+        InputError: The file is missing, malformed or no CommonRoad scenario; no vehicle can be the ego; ``ego`` names none.
+    """
+    file = Path(path)
+    files = SourceFiles("reading a CommonRoad scenario")
+    root = files.read_xml(file)
+    version = root.get("commonRoadVersion")
+    if root.tag != "commonRoad" or version not in VERSIONS:
+        found = f"root element {root.tag!r}, version {version!r}"
+        raise files.fail(file, found, f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}")
+    dt_s = _time_step(files, file, root)
+    obstacles, obstacle_notes = read_obstacles(files, file, root, np.zeros(3))
+    if not obstacles:
+        raise files.fail(file, "no recorded traffic, so no drive to take the ego from", "use a scenario with dynamic obstacles")
+    origin = np.array([*np.round(obstacles[0].centre[0, :2]), 0.0])  # whole metres: the subtraction loses nothing
+    obstacles = tuple(_moved(o, -origin) for o in obstacles)
+    lane_map, map_notes = read_lanelets(files, file, root, origin)
+    chosen, why = _choose_ego(files, file, obstacles, lane_map, ego)
+    vehicle = _vehicle(chosen.box)
+    centre_log = chosen.trajectory(files, file, dt_s)
+    if len(centre_log) < 2:
+        raise files.fail(f"{file}, obstacle {chosen.obstacle_id}", "1 state", "choose an ego with a trajectory")
+    T_centre_rig = np.eye(4)
+    T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
+    first, last = _time_range(obstacles, dt_s)
+    actors = [
+        actor
+        for o in obstacles
+        if o is not chosen
+        for actor in actors_of_track(o.obstacle_id, o.label, o.box, _actor_track(files, file, o, dt_s, first, last), fixed=o.static)
+    ]
+    notes = (
+        why,
+        f"ego box {chosen.box.length_m} x {chosen.box.width_m} m from the file; rear axle assumed {vehicle.rear_axle_to_centre_m:.2f} m "
+        f"behind its centre and wheelbase {vehicle.wheelbase_m:.2f} m, in proportion to its length",
+        "heights of boxes assumed by class: the format has none",
+        "the planning problem is not used: it asks for a drive and records none",
+        *map_notes,
+        *obstacle_notes,
+    )
+    return RecordedLog(
+        scene_id=f"commonroad-{root.get('benchmarkID') or file.stem}",
+        source="commonroad",
+        lane_map=lane_map,
+        ground=_ground(lane_map),
+        ego_log=offset_trajectory(centre_log, T_centre_rig),
+        vehicle=vehicle,
+        actors=tuple(actors),
+        cameras=(),
+        world_origin=(float(origin[0]), float(origin[1]), 0.0),
+        content_hash=files.content_hash,
+        notes=notes,
+    )
+
+
+def _time_step(files: SourceFiles, path: Path, root: Element) -> float:
+    try:
+        dt_s = float(str(root.get("timeStepSize")))
+    except ValueError as error:
+        raise files.fail(path, f"timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds") from error
+    if not 0 < dt_s < 10:
+        raise files.fail(path, f"timeStepSize = {dt_s}", "give a time step between 0 and 10 s")
+    return dt_s
+
+
+def _moved(obstacle: Obstacle, by: F64) -> Obstacle:
+    return Obstacle(**{**vars(obstacle), "centre": obstacle.centre + by})
+
+
+def _vehicle(box: Box) -> Vehicle:
+    """Scale the default chassis to the recorded length: the file has sizes and no axles."""
+    scale = box.length_m / DEFAULT.box.length_m
+    return Vehicle(box=box, rear_axle_to_centre_m=DEFAULT.rear_axle_to_centre_m * scale, wheelbase_m=DEFAULT.wheelbase_m * scale)
+
+
+def _time_range(obstacles: tuple[Obstacle, ...], dt_s: float) -> tuple[int, int]:
+    moving = [o for o in obstacles if not o.static] or list(obstacles)
+    first, last = min(int(o.steps[0]) for o in moving), max(int(o.steps[-1]) for o in moving)
+    return round(first * dt_s * 1e6), round(last * dt_s * 1e6)
+
+
+def _actor_track(files: SourceFiles, path: Path, obstacle: Obstacle, dt_s: float, first_us: int, last_us: int) -> Trajectory:
+    """Return an actor's poses; a static obstacle with one state is there for the whole recording."""
+    track = obstacle.trajectory(files, path, dt_s)
+    if obstacle.static and len(track) == 1 and last_us > first_us:
+        return Trajectory(np.array([first_us, last_us]), np.repeat(track.xyz, 2, axis=0), np.repeat(track.quat, 2, axis=0))
+    return track
+
+
+def _choose_ego(
+    files: SourceFiles, path: Path, obstacles: tuple[Obstacle, ...], lane_map: LaneMap, ego: str | None
+) -> tuple[Obstacle, str]:
+    moving = {o.obstacle_id: o for o in obstacles if not o.static}
+    if ego is not None:
+        if ego not in moving:
+            raise files.fail(path, f"no moving obstacle {ego!r}", f"choose the ego among {', '.join(sorted(moving)) or 'none'}")
+        return moving[ego], f"ego is the recorded vehicle {ego}, as asked"
+    first, last = (f(int(o.steps[i]) for o in moving.values()) for f, i in ((min, 0), (max, -1))) if moving else (0, 0)
+    surface = merge_areas([lane_polygon(lane) for lane in lane_map.lanes.values()])
+    ranked = sorted(
+        (-float(np.linalg.norm(np.diff(o.centre[:, :2], axis=0), axis=1).sum()), len(key), key)
+        for key, o in moving.items()
+        if o.label == "car" and o.steps[0] == first and o.steps[-1] == last and len(o.steps) == last - first + 1
+    )
+    for length, _, key in ranked:
+        footprints = _footprints(moving[key], least=DEFAULT.box)
+        if shapely.covers(surface, footprints).all() and not _touches(moving[key], footprints, obstacles):
+            return moving[key], (
+                f"ego is the recorded car {key}: the longest drive ({-length:.1f} m) among cars present all the time that stay on the "
+                "lanelets and touch nobody; choose another with ego=ID"
+            )
+    found = f"{len(moving)} moving obstacles, none a car that is present all the time, stays on the lanelets and touches nobody"
+    raise files.fail(path, found, "name the recorded vehicle that shall be the ego")
+
+
+def _footprints(obstacle: Obstacle, least: Box) -> Any:
+    """Return the plan-view rectangles ``(T,)`` of an obstacle, at least as large as ``least``."""
+    half_l, half_w = max(obstacle.box.length_m, least.length_m) / 2, max(obstacle.box.width_m, least.width_m) / 2
+    return _rectangles(obstacle, half_l, half_w)
+
+
+def _rectangles(obstacle: Obstacle, half_l: float, half_w: float) -> Any:
+    c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
+    corners = np.array([[half_l, half_w], [half_l, -half_w], [-half_l, -half_w], [-half_l, half_w]])
+    x = obstacle.centre[:, :1] + c[:, None] * corners[:, 0] - s[:, None] * corners[:, 1]
+    y = obstacle.centre[:, 1:2] + s[:, None] * corners[:, 0] + c[:, None] * corners[:, 1]
+    return shapely.polygons(np.stack([x, y], axis=-1))  # (T,) of rings (4, 2)
+
+
+def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) -> bool:
+    at = {int(step): i for i, step in enumerate(ego.steps)}
+    for other in obstacles:
+        if other is ego:
+            continue
+        shapes = _rectangles(other, other.box.length_m / 2, other.box.width_m / 2)
+        if other.static and len(other.steps) == 1:
+            if shapely.intersects(footprints, shapes[0]).any():
+                return True
+            continue
+        common = [(at[int(step)], j) for j, step in enumerate(other.steps) if int(step) in at]
+        if any(shapely.intersects(footprints[i], shapes[j]) for i, j in common):
+            return True
+    return False
+
+
+def _ground(lane_map: LaneMap) -> HeightField:
+    """Return a level ground for planar files, a fitted one where points have heights."""
+    points = np.concatenate([e for lane in lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None])
+    return flat(0.0) if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0 else from_points(points)

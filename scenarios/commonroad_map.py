@@ -1,0 +1,204 @@
+"""Lanelets of a CommonRoad file (versions 2018b and 2020a) as a lane map."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.geometry_lanes import centre_line, lane_polygon
+from alpasim_plugin.types import F64, Lane, LaneMap, Paint
+from scenarios.reading import SourceFiles
+from scenarios.road_edges import border_lines, merge_areas
+
+# Line markings of version 2020a; the format has no colour, so lines are white.
+PAINTS: dict[str, Paint] = {
+    "solid": "solid_white",
+    "broad_solid": "solid_white",
+    "solid_solid": "solid_white",
+    "solid_dashed": "solid_white",
+    "dashed_solid": "solid_white",
+    "dashed": "dashed_white",
+    "broad_dashed": "dashed_white",
+    "dashed_dashed": "dashed_white",
+    "curb": "none",
+    "lowered_curb": "none",
+    "no_marking": "none",
+    "unknown": "unknown",
+}
+KINDS = {"shoulder": "shoulder", "busLane": "bus", "bicycleLane": "bike", "parking": "parking"}
+NOT_FOR_CARS = ("sidewalk", "crosswalk")
+MAX_SPEED_SIGNS = ("274", "R2-1")  # German and US maximum speed; the additional value is in m/s
+CROSSING_SHARE = 0.1  # a lanelet covered to this share by lanelets it is not linked to lies in an intersection
+
+
+def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
+    """Read all lanelets around ``origin (3,)``, with notes.
+
+    Raises:
+        InputError: There is no lanelet, or one lacks a bound.
+    """
+    elements = root.findall("lanelet")
+    if not elements:
+        raise files.fail(path, "a map without lanelets", "use a scenario with at least one lanelet")
+    signs = _speed_signs(root)
+    lanes: dict[str, Lane] = {}
+    crosswalks: list[F64] = []
+    stop_lines: list[F64] = []
+    left_out: Counter[str] = Counter()
+    swapped = 0
+    opposite: set[tuple[str, str]] = set()  # (lanelet, side) whose neighbour drives the other way
+    for element in elements:
+        lane_id = str(element.get("id"))
+        where = f"{path}, lanelet {lane_id}"
+        left, right = (_bound(files, where, element, side, origin) for side in ("leftBound", "rightBound"))
+        types = [str(t.text) for t in element.findall("laneletType")]
+        if any(t in NOT_FOR_CARS for t in types):
+            left_out.update(t for t in types if t in NOT_FOR_CARS)
+            if "crosswalk" in types:
+                crosswalks.append(np.concatenate([left, right[::-1], left[:1]]))
+            continue
+        if _is_left_of(right, left):  # bounds exchanged
+            left, right, swapped = right, left, swapped + 1
+        stop_lines += _stop_line(files, where, element, left, right, origin)
+        beside = {side: n for side in ("left", "right") if (n := element.find(f"adjacent{side.capitalize()}")) is not None}
+        opposite |= {(lane_id, side) for side, n in beside.items() if n.get("drivingDir") != "same"}
+        same = {side: str(n.get("ref")) for side, n in beside.items() if n.get("drivingDir") == "same"}
+        lanes[lane_id] = Lane(
+            lane_id=lane_id,
+            centre=centre_line(left, right),
+            left=left,
+            right=right,
+            kind=next((KINDS[t] for t in types if t in KINDS), "vehicle"),
+            successors=tuple(str(s.get("ref")) for s in element.findall("successor")),
+            left_neighbour=same.get("left"),
+            right_neighbour=same.get("right"),
+            left_paint=_marking(element, "leftBound"),
+            right_paint=_marking(element, "rightBound"),
+            is_intersection="intersection" in types,
+            speed_limit_mps=_speed_limit(files, where, element, signs),
+        )
+    if not lanes:
+        raise files.fail(path, f"{len(elements)} lanelets, none for vehicles", "use a scenario with a road")
+    notes = [f"{n} lanelets of type {t} carry no vehicles and are no lanes" for t, n in sorted(left_out.items())]
+    if swapped:
+        notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
+    lanes = _mark_intersections(lanes)
+    if root.find("lanelet/leftBound/lineMarking") is None and root.find("lanelet/rightBound/lineMarking") is None:
+        lanes = {key: _assume_paint(lane, opposite) for key, lane in lanes.items()}
+        notes.append(
+            "the file has no line markings: paint assumed from adjacency (dashed white between lanes of one direction, double yellow "
+            "between directions, solid yellow at the left and solid white at the right border, none in intersections)"
+        )
+    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
+    edges = border_lines(surface, np.concatenate([e for lane in lanes.values() for e in (lane.left, lane.right) if e is not None]))
+    notes.append(
+        "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
+    )
+    return LaneMap(lanes=lanes, road_edges=edges, crosswalks=tuple(crosswalks), stop_lines=tuple(stop_lines)), tuple(notes)
+
+
+def point(files: SourceFiles, where: str, element: Element) -> tuple[float, float, float]:
+    """Read ``x``, ``y`` and, where given, ``z`` of a point element in metres."""
+    values = []
+    for axis in ("x", "y", "z"):
+        child = element.find(axis)
+        if child is None and axis == "z":
+            values.append(0.0)
+            continue
+        values.append(number(files, where, child, axis))
+    return values[0], values[1], values[2]
+
+
+def number(files: SourceFiles, where: str, element: Element | None, what: str) -> float:
+    """Read a finite number out of an element's text.
+
+    Raises:
+        InputError: The element is missing or holds no finite number.
+    """
+    if element is None:
+        raise files.fail(where, f"no {what}", f"add {what}")
+    try:
+        value = float(str(element.text))
+    except ValueError as error:
+        raise files.fail(where, f"{what} = {element.text!r}", "give a number") from error
+    if not np.isfinite(value):
+        raise files.fail(where, f"{what} = {element.text!r}", "give a finite number")
+    return value
+
+
+def _bound(files: SourceFiles, where: str, element: Element, side: str, origin: F64) -> F64:
+    bound = element.find(side)
+    points = [] if bound is None else [point(files, f"{where}, {side}", p) for p in bound.findall("point")]
+    if len(points) < 2:
+        raise files.fail(where, f"{side} with {len(points)} points", "give each lanelet two bounds of at least 2 points")
+    return np.array(points, dtype=np.float64) - origin
+
+
+def _is_left_of(one: F64, other: F64) -> bool:
+    """Say whether ``one`` runs on the left of ``other``: the ring one + reversed other is clockwise."""
+    x, y = np.concatenate([one[:, :2], other[::-1, :2]]).T
+    return bool(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
+
+
+def _marking(element: Element, side: str) -> Paint:
+    text = element.findtext(f"{side}/lineMarking")
+    return PAINTS.get(str(text), "unknown")
+
+
+def _stop_line(files: SourceFiles, where: str, element: Element, left: F64, right: F64, origin: F64) -> list[F64]:
+    line = element.find("stopLine")
+    if line is None:
+        return []
+    points = [point(files, f"{where}, stopLine", p) for p in line.findall("point")]
+    return [np.array(points) - origin if len(points) == 2 else np.stack([left[-1], right[-1]])]
+
+
+def _speed_signs(root: Element) -> dict[str, float]:
+    """Return the speed of each maximum-speed sign in m/s by sign id (2020a)."""
+    speeds: dict[str, float] = {}
+    for sign in root.findall("trafficSign"):
+        for part in sign.findall("trafficSignElement"):
+            value = part.findtext("additionalValue")
+            if part.findtext("trafficSignID") in MAX_SPEED_SIGNS and value is not None:
+                try:
+                    speeds[str(sign.get("id"))] = float(value)
+                except ValueError:
+                    continue  # a textual value ("30 mph zone") is no number to rely on
+    return speeds
+
+
+def _speed_limit(files: SourceFiles, where: str, element: Element, signs: dict[str, float]) -> float | None:
+    given = element.find("speedLimit")
+    if given is not None and (given.text or "").strip():
+        return number(files, where, given, "speedLimit")
+    limits = [signs[ref] for s in element.findall("trafficSignRef") if (ref := str(s.get("ref"))) in signs]
+    return min(limits) if limits else None
+
+
+def _mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
+    """Mark lanelets that overlap others they are neither linked to nor beside: those cross or fork inside an intersection."""
+    ids = list(lanes)
+    polygons = [lane_polygon(lanes[i]) for i in ids]
+    tree = shapely.STRtree(polygons)
+    marked: dict[str, Lane] = {}
+    for n, key in enumerate(ids):
+        lane = lanes[key]
+        friends = {key, *lane.successors, lane.left_neighbour, lane.right_neighbour}
+        friends |= {other for other in ids if key in lanes[other].successors}
+        covered = [polygons[m] for m in tree.query(polygons[n], predicate="intersects") if ids[m] not in friends]
+        shared = shapely.area(shapely.intersection(polygons[n], shapely.union_all(covered))) if covered else 0.0
+        crossing = lane.is_intersection or shared > CROSSING_SHARE * polygons[n].area
+        marked[key] = lane if crossing == lane.is_intersection else Lane(**{**vars(lane), "is_intersection": True})
+    return marked
+
+
+def _assume_paint(lane: Lane, opposite: set[tuple[str, str]]) -> Lane:
+    if lane.is_intersection:
+        return Lane(**{**vars(lane), "left_paint": "none", "right_paint": "none"})
+    left: Paint = "double_yellow" if (lane.lane_id, "left") in opposite else "dashed_white" if lane.left_neighbour else "solid_yellow"
+    right: Paint = "double_yellow" if (lane.lane_id, "right") in opposite else "dashed_white" if lane.right_neighbour else "solid_white"
+    return Lane(**{**vars(lane), "left_paint": left, "right_paint": right})
