@@ -34,8 +34,8 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     Args:
         path: The XML file.
         ego: Id of the recorded vehicle that becomes the ego; None picks the car with the longest drive among those that are present
-            all the time, stay on the lanelets and touch nobody (ties: the smaller id). Lanes and gaps are tested with a footprint at
-            least as large as the default vehicle's, because the evaluators score with that footprint.
+            all the time, keep inside one lane (if none does: stay on the lanelets) and touch nobody; ties go to the smaller id. Lanes
+            and gaps are tested with a footprint at least as large as the default vehicle's, because the evaluators score with that one.
 
     Raises:
         InputError: The file is missing, malformed or no CommonRoad scenario; no vehicle can be the ego; ``ego`` names none.
@@ -134,22 +134,49 @@ def _choose_ego(
         if ego not in moving:
             raise files.fail(path, f"no moving obstacle {ego!r}", f"choose the ego among {', '.join(sorted(moving)) or 'none'}")
         return moving[ego], f"ego is the recorded vehicle {ego}, as asked"
-    first, last = (f(int(o.steps[i]) for o in moving.values()) for f, i in ((min, 0), (max, -1))) if moving else (0, 0)
+    first = min((int(o.steps[0]) for o in moving.values()), default=0)
+    last = max((int(o.steps[-1]) for o in moving.values()), default=0)
+    always = [o for o in moving.values() if o.label == "car" and (o.steps[0], o.steps[-1], len(o.steps)) == (first, last, last - first + 1)]
+    always.sort(key=lambda o: (-_driven_m(o), len(o.obstacle_id), o.obstacle_id))
     surface = merge_areas([lane_polygon(lane) for lane in lane_map.lanes.values()])
-    ranked = sorted(
-        (-float(np.linalg.norm(np.diff(o.centre[:, :2], axis=0), axis=1).sum()), len(key), key)
-        for key, o in moving.items()
-        if o.label == "car" and o.steps[0] == first and o.steps[-1] == last and len(o.steps) == last - first + 1
-    )
-    for length, _, key in ranked:
-        footprints = _footprints(moving[key], least=DEFAULT.box)
-        if shapely.covers(surface, footprints).all() and not _touches(moving[key], footprints, obstacles):
-            return moving[key], (
-                f"ego is the recorded car {key}: the longest drive ({-length:.1f} m) among cars present all the time that stay on the "
-                "lanelets and touch nobody; choose another with ego=ID"
+    corridors = _corridors(lane_map)
+    on_road: list[Obstacle] = []
+    for candidate in always:
+        footprints = _footprints(candidate, least=DEFAULT.box)
+        if not shapely.covers(surface, footprints).all() or _touches(candidate, footprints, obstacles):
+            continue
+        on_road.append(candidate)
+        if shapely.covers(corridors[:, None], footprints[None, :]).any(axis=0).all():
+            return candidate, (
+                f"ego is the recorded car {candidate.obstacle_id}: the longest drive ({_driven_m(candidate):.1f} m) among cars that are "
+                "present all the time, keep inside one lane and touch nobody; choose another with ego=ID"
             )
+    if on_road:
+        return on_road[0], (
+            f"ego is the recorded car {on_road[0].obstacle_id}: the longest drive ({_driven_m(on_road[0]):.1f} m) among cars that are "
+            "present all the time, stay on the lanelets and touch nobody (none keeps inside one lane); choose another with ego=ID"
+        )
     found = f"{len(moving)} moving obstacles, none a car that is present all the time, stays on the lanelets and touches nobody"
     raise files.fail(path, found, "name the recorded vehicle that shall be the ego")
+
+
+def _driven_m(obstacle: Obstacle) -> float:
+    return float(np.linalg.norm(np.diff(obstacle.centre[:, :2], axis=0), axis=1).sum())
+
+
+def _corridors(lane_map: LaneMap) -> Any:
+    """Return each lane's area joined with its predecessors and successors ``(L,)``: where a car is that keeps its lane."""
+    lanes = lane_map.lanes
+    before: dict[str, list[str]] = {key: [] for key in lanes}
+    for key, lane in lanes.items():
+        for follower in lane.successors:
+            if follower in before:
+                before[follower].append(key)
+    joined = [
+        merge_areas([lane_polygon(lanes[k]) for k in (key, *before[key], *(s for s in lane.successors if s in lanes))])
+        for key, lane in lanes.items()
+    ]
+    return np.array(joined, dtype=object)
 
 
 def _footprints(obstacle: Obstacle, least: Box) -> Any:
