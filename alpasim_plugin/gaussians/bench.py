@@ -32,7 +32,7 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
 
     # Points are denser near the camera, as reconstructions are.
     def ahead(count: int, reach_m: float) -> F64:
-        return -8.0 + (reach_m + 8.0) * rng.uniform(0, 1, count) ** 1.5
+        return np.asarray(-8.0 + (reach_m + 8.0) * rng.uniform(0, 1, count) ** 1.5)
 
     road_means = np.stack([ahead(road, 120), rng.uniform(-9, 9, road), rng.normal(0, 0.01, road)], axis=1)
     side = rng.choice([-1.0, 1.0], facade)

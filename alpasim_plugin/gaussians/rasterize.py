@@ -55,4 +55,12 @@ def rasterize(
         from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
 
         return rasterize_reference(cloud, camera, background, near_m=near_m, lod_px=lod_px)
+    if backend == "torch":
+        from alpasim_plugin.gaussians.rasterize_torch import rasterize_torch
+
+        return rasterize_torch(cloud, camera, background, near_m=near_m, lod_px=lod_px)
+    if backend == "gsplat":
+        from alpasim_plugin.gaussians.rasterize_gsplat import rasterize_gsplat
+
+        return rasterize_gsplat(cloud, camera, background, near_m=near_m, lod_px=lod_px)
     raise InputError("rendering Gaussians", f"backend {backend!r}", "no such backend", f"choose one of {', '.join(get_args(Backend))}")

@@ -100,11 +100,12 @@ def rasterize_prepared(
     histogram = _buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
     starts = np.empty(n_tiles + 1, np.int64)
     cursor[:] = 0
-    run_on_threads(threads if count > _WORTH_THREADS else 1, gather_and_count, cursor, count, order, records, tiles_x, tiles_y, ordered, histogram)
+    workers = threads if count > _WORTH_THREADS else 1
+    run_on_threads(workers, gather_and_count, cursor, count, order, records, tiles_x, tiles_y, ordered, histogram)
     pairs = int(tile_offsets(count, histogram, starts))
     lists = _buffers.get("lists", pairs, np.int32)
     cursor[:] = 0
-    run_on_threads(threads if count > _WORTH_THREADS else 1, fill_tiles, cursor, count, ordered, tiles_x, tiles_y, histogram, lists)
+    run_on_threads(workers, fill_tiles, cursor, count, ordered, tiles_x, tiles_y, histogram, lists)
 
     shape = (camera.height, camera.width)
     rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -117,11 +118,11 @@ def rasterize_prepared(
 def _node_poses(nodes: Sequence[Node], camera: PinholeCamera) -> F64:
     """Pack the nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64."""
     poses = np.empty((len(nodes), POSE_SIZE))
-    T_world_node = np.stack([_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for _, T in nodes]) if nodes else np.empty((0, 4, 4))
+    T_world_node = np.array([_IDENTITY if T is None else T for _, T in nodes], dtype=np.float64).reshape(-1, 4, 4)
     rotation = T_world_node[:, :3, :3]
     gram = rotation @ rotation.transpose(0, 2, 1)
     # A cheap test of all nodes at once; the precise message is composed only where it fails.
-    if T_world_node.shape[1:] != (4, 4) or not np.all(np.abs(gram - np.eye(3)) <= 1e-5) or np.any(np.linalg.det(rotation) < 0):
+    if not np.all(np.abs(gram - np.eye(3)) <= 1e-5) or np.any(np.linalg.det(rotation) < 0):
         for _, T in nodes:
             if T is not None:
                 require_rigid(T, "placing a node")
