@@ -43,13 +43,19 @@ class PurePursuit:
         return Plan(observation.t_us, times, xy, yaw, debug={"cruise_mps": self.cruise_mps})
 
 
+def has_route(route_rig: F64) -> bool:
+    """Tell whether at least half a metre of the route ``(20, 3)`` is left."""
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    return len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5
+
+
 def route_points(route_rig: F64) -> F64:
-    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where fewer than two remain.
+    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where no route is left.
 
     The route begins at the ego's projection, so the first point may lie beside the ego.
     """
     points = np.asarray(route_rig[np.isfinite(route_rig).all(axis=1), :2])
-    if len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5:
+    if has_route(route_rig):
         return points
     start = points[0] if len(points) else np.zeros(2)
     return np.stack([start, start + np.array([1.0, 0.0])])

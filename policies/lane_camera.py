@@ -1,0 +1,226 @@
+"""Drive by looking: lane paint and obstacles from the pixels of one front camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.geometry import interpolate, inverse, yaw_of
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F64, U8, CameraSpec, Frame, Observation, Plan, Route, Scenario, SensorSpec
+from policies.base import POLICIES, plan_times, seconds
+from policies.ground_grid import GroundGrid, make_grid
+from policies.lane_filter import LaneState, predict, search, shift, update
+from policies.lane_plan import Blend, alternatives, blend, guess_from_route, progress_behind
+from policies.lane_vision import RidgeFilter, find_paint
+from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
+from policies.paths import curve_speeds, follow
+from policies.pure_pursuit import has_route, route_points
+
+MIN_CRUISE_MPS = 8.0
+MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
+LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
+OTHER_LANE = 0.55  # the route asks for the next lane when it lies this share of a width off the centre
+OTHER_LANE_FRAMES = 5
+CHOOSE_AT_M = 12.0
+OBSTACLE_RANGE_M = 48.0
+
+
+def front_camera(scenario: Scenario) -> CameraSpec:
+    """Return the camera to look through: the first one with "front" in its name, else the first one that looks ahead.
+
+    Raises:
+        InputError: No camera looks ahead.
+    """
+    ahead = [camera for camera in scenario.cameras if camera.T_rig_camera[0, 2] > 0.7]
+    for camera in sorted(ahead, key=lambda c: "front" not in c.name):
+        return camera
+    raise InputError(
+        "making the policy 'lane-camera'",
+        f"scene {scenario.scene_id!r}",
+        f"no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
+        "add a front camera to the scenario or choose another policy",
+    )
+
+
+@POLICIES.register("lane-camera", "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior")
+class LaneCamera:
+    """Keep the lane that the paint shows and stop for what stands on it.
+
+    It reads the newest frame of one camera, its own motion, and the route. The lateral position comes from the paint: the route's weight
+    is its variance against the paint's, which near the car is below one percent. The route decides which lane, where to turn, and
+    everything when no paint is seen for long. ``Plan.debug["mode"]`` says what the plan stands on: ``lane`` (paint in this
+    frame), ``memory`` (the estimate of earlier frames), ``route`` or ``straight`` (neither).
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.camera = front_camera(scenario)
+        self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
+        self.scene_id = scenario.scene_id
+        self.bumper_m = scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
+        self.grid: GroundGrid = make_grid(self.camera)
+        self.ridges = RidgeFilter(self.grid)
+        self.reset(0, scenario.route)
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Forget everything of the drive before."""
+        self.seed, self.step = seed, 0
+        self.cruise_mps: float | None = None
+        self.lane: LaneState | None = None
+        self.road: RoadColour | None = None
+        self.obstacle: ObstacleTrack | None = None
+        self.seen_us: int | None = None  # time of the frame that the memory belongs to
+        self.seen_pose: F64 = np.eye(4)
+        self.other_lane_frames = 0
+
+    def act(self, observation: Observation) -> Plan:
+        """Return the plan that the newest frame supports.
+
+        Raises:
+            PolicyError: The observation has no frame of the camera, or one of another size.
+        """
+        frame = self._frame(observation)
+        route = route_points(observation.route_rig) if has_route(observation.route_rig) else None
+        speed = observation.ego.speed_mps
+        if self.cruise_mps is None:
+            self.cruise_mps = max(speed, MIN_CRUISE_MPS)
+        pose_now = observation.ego.T_world_rig
+        if self.seen_us is None or frame.t_us > self.seen_us:
+            self._look(frame, _pose_at(observation, frame.t_us), route, pose_now, speed)
+        lane = None if self.lane is None else _moved(self.lane, self.seen_pose, pose_now)
+        blended = blend(lane, route)
+        times = plan_times(observation.t_us)
+        progress = progress_behind(
+            speed,
+            curve_speeds(blended.path, self.cruise_mps),
+            seconds(times),
+            self._obstacle_now(observation),
+            self.bumper_m,
+            self.cruise_mps,
+        )
+        xy, yaw = follow(blended.path, progress, max(speed, 0.0))
+        samples = alternatives(xy, yaw, stream(self.scene_id, self.seed, "policy", self.step))
+        self.step += 1
+        chosen = samples[0]
+        debug = self._debug(lane, route, blended)
+        return Plan(observation.t_us, times, chosen[:, :2].copy(), chosen[:, 2].copy(), tuple(samples[1:]), debug)
+
+    def _frame(self, observation: Observation) -> Frame:
+        frame = observation.frames.get(self.camera.name)
+        expected = (self.camera.height, self.camera.width, 3)
+        if frame is None or frame.rgb.shape != expected:
+            found = f"frames of {sorted(observation.frames)}" if frame is None else f"a frame of shape {frame.rgb.shape}"
+            raise PolicyError(
+                "planning by camera",
+                f"policy 'lane-camera' at {observation.t_us} us",
+                f"{found}; needed is {self.camera.name!r} of shape {expected}",
+                "render the cameras that the policy names in `sensors`, at the scenario's size",
+            )
+        return frame
+
+    def _look(self, frame: Frame, pose: F64, route: F64 | None, pose_now: F64, speed: float) -> None:
+        """Bring lane, road colour and obstacle up to a new frame."""
+        dt_s = 0.0 if self.seen_us is None else (frame.t_us - self.seen_us) * 1e-6
+        if self.lane is not None:
+            self.lane = _moved(self.lane, self.seen_pose, pose)
+        self.seen_us, self.seen_pose = frame.t_us, pose
+        ground = self.grid.warp(frame.rgb)
+        there = None if route is None else _points_in(route, pose_now, pose)
+        self._look_for_lane(ground, there)
+        path = blend(self.lane, there).path
+        centre_y = np.interp(self.grid.x_m, *_increasing(path.xy))
+        lab = cv2.cvtColor(ground, cv2.COLOR_RGB2LAB)
+        free_m = self.obstacle.distance_m if self.obstacle is not None else np.inf
+        self.road = learn_road(self.road, lab, self.grid, centre_y, free_m)
+        foot = None
+        if self.road is not None:
+            reach = min(OBSTACLE_RANGE_M, _range_of(path.xy))
+            foot = find_foot(anomaly(lab, self.road, self.grid), self.grid, centre_y, float(self.grid.x_m[0]), reach)
+        self.obstacle = track_obstacle(self.obstacle, foot, speed, dt_s, float(self.grid.x_m[0]))
+
+    def _look_for_lane(self, ground: U8, route: F64 | None) -> None:
+        points = find_paint(ground, self.grid, self.ridges)
+        row_m = np.interp(points.x_m, self.grid.x_m, self.grid.row_m)
+        if self.lane is not None:
+            self.lane = update(self.lane, points, row_m)
+            if self._is_lost(self.lane):
+                self.lane = None
+        if self.lane is None:
+            guess = guess_from_route(route) if route is not None else guess_from_route(np.array([[0.0, 0.0], [20.0, 0.0]]))
+            self.lane = search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm)
+            if self.lane is not None:
+                self.lane = update(self.lane, points, row_m)
+        if self.lane is not None and route is not None:
+            self.lane = self._choose_lane(self.lane, route)
+
+    def _choose_lane(self, lane: LaneState, route: F64) -> LaneState:
+        """Move to the neighbouring lane once the route has asked for it over several frames."""
+        x, y = _increasing(route)
+        at = np.array([CHOOSE_AT_M])
+        off = float((np.interp(at, x, y) - lane.centre(at))[0]) / float(lane.mean[4])
+        self.other_lane_frames = self.other_lane_frames + 1 if abs(off) > OTHER_LANE and x[-1] > CHOOSE_AT_M else 0
+        if self.other_lane_frames < OTHER_LANE_FRAMES:
+            return lane
+        self.other_lane_frames = 0
+        return shift(lane, 1 if off > 0 else -1)
+
+    def _is_lost(self, lane: LaneState) -> bool:
+        sigma = float(lane.sigma(np.array([5.0]))[0])
+        heading, width = float(lane.mean[1]), float(lane.mean[4])
+        return sigma > LOST_SIGMA_M or lane.blind_m > LOST_BLIND_M or abs(heading) > MAX_HEADING_RAD or not 2.2 < width < 5.5
+
+    def _obstacle_now(self, observation: Observation) -> ObstacleTrack | None:
+        """Return the confirmed thing ahead, moved from the frame's time to now."""
+        if self.obstacle is None or not self.obstacle.confirmed or self.seen_us is None:
+            return None
+        age_s = (observation.t_us - self.seen_us) * 1e-6
+        if age_s <= 0:
+            return self.obstacle
+        return track_obstacle(self.obstacle, None, observation.ego.speed_mps, age_s, np.inf)
+
+    def _debug(self, lane: LaneState | None, route: F64 | None, blended: Blend) -> dict[str, Any]:
+        mode = ("straight" if route is None else "route") if lane is None else ("lane" if lane.blind_m == 0 else "memory")
+        out: dict[str, Any] = {"mode": mode, "route_weight": blended.route_weight, "route_leaves_m": blended.route_leaves_m}
+        if lane is not None:
+            names = ("lane_offset_m", "lane_heading_rad", "lane_curvature_1pm", "lane_bend_1pm2", "lane_width_m")
+            out.update({name: float(value) for name, value in zip(names, lane.mean, strict=True)})
+            out.update(lane_sigma_m=float(np.sqrt(lane.cov[0, 0])), blind_m=lane.blind_m)
+            out.update(paint_left_m=lane.left_m, paint_right_m=lane.right_m)
+        if self.obstacle is not None:
+            o = self.obstacle
+            out.update(obstacle_m=o.distance_m, obstacle_mps=o.speed_mps, obstacle_confirmed=o.confirmed)
+        return out
+
+
+def _pose_at(observation: Observation, t_us: int) -> F64:
+    """Return the rig pose at a frame's time, from the ego's own history."""
+    if t_us >= observation.t_us or len(observation.history) < 2:
+        return observation.ego.T_world_rig
+    return interpolate(observation.history, max(t_us, int(observation.history.t_us[0])))
+
+
+def _moved(lane: LaneState, T_world_old: F64, T_world_new: F64) -> LaneState:
+    step = inverse(T_world_old) @ T_world_new
+    return predict(lane, float(step[0, 3]), float(step[1, 3]), yaw_of(step))
+
+
+def _points_in(points: F64, T_world_a: F64, T_world_b: F64) -> F64:
+    """Return points (M, 2) given in rig pose a as seen from rig pose b, in the plane."""
+    T = inverse(T_world_b) @ T_world_a
+    return np.asarray(points @ T[:2, :2].T + T[:2, 3])
+
+
+def _increasing(points: F64) -> tuple[F64, F64]:
+    """Return x and y of the leading points ``(M, 2)`` whose x increases, for interpolation over x."""
+    x = points[:, 0]
+    stop = int(np.argmax(np.diff(x) <= 0.05)) + 1 if (np.diff(x) <= 0.05).any() else len(x)
+    return x[:stop], points[:stop, 1]
+
+
+def _range_of(path: F64) -> float:
+    """Return how far ahead the path stays within 60 degrees of the view; beyond that a corridor over x has no meaning."""
+    return float(_increasing(path[1:])[0][-1])

@@ -1,0 +1,162 @@
+"""From what was seen to a plan: where to drive, how fast, and the sampled alternatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.geometry import arc_lengths, resample
+from alpasim_plugin.types import F64
+from policies.lane_filter import LaneState
+from policies.obstacle_vision import ObstacleTrack
+from policies.paths import Path, make_path
+
+ROUTE_SIGMA_M = 0.75  # how far a lane's centre may lie from the route, for all the policy knows
+PATH_M = 70.0
+LEAVE_M, LEAVE_RAD = 1.2, 0.2  # the route leaves the lane where it is this far off and points this much elsewhere
+LEAVE_BEFORE_M = 8.0
+
+HEADWAY_S, MIN_GAP_M = 1.3, 3.5
+IDM_ACCEL_MPS2, IDM_BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.5, 2.0, 7.0
+
+N_ALTERNATIVES = 5
+NOISE_LATERAL_M, NOISE_SPEED = 0.08, 0.02
+NOISE_RAMP_M = 12.0
+
+
+@dataclass(frozen=True)
+class RouteGuess:
+    """The route near the ego, as a weak guess for the lane."""
+
+    offset_m: float
+    heading_rad: float
+    curvature_1pm: float
+
+
+def guess_from_route(points: F64) -> RouteGuess:
+    """Fit the next 20 m of route points ``(M, 2)`` by a parabola in the rig frame."""
+    s = arc_lengths(points)
+    near = resample(points, np.arange(0.0, min(20.0, max(float(s[-1]), 2.0)) + 0.5, 1.0))
+    x, y = near[:, 0], near[:, 1]
+    if x[-1] - x[0] < 5.0:
+        return RouteGuess(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
+    half_curvature, heading, offset = np.polyfit(x, y, 2)
+    return RouteGuess(float(offset), float(heading), float(2 * half_curvature))
+
+
+@dataclass(frozen=True)
+class Blend:
+    """The path to drive and how it came about."""
+
+    path: Path
+    route_weight: float  # share of the route in the lateral position 10 m ahead; 0: paint alone
+    route_leaves_m: float  # distance at which the route leaves the lane; inf: it does not
+
+
+def blend(lane: LaneState | None, route: F64 | None) -> Blend:
+    """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
+
+    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route has no say in the
+    lateral position; it takes over beyond the paint that is seen, and where it turns away from the lane (an intersection, an exit).
+    """
+    if lane is None:
+        points = np.array([[0.0, 0.0], [10.0, 0.0]]) if route is None else route
+        return Blend(make_path(points, PATH_M), 0.0 if route is None else 1.0, np.inf)
+    if route is None:
+        x = np.arange(0.0, 40.0)
+        y = _straight_beyond(lane, x, max(lane.seen_to_m, 10.0))
+        return Blend(make_path(np.stack([x, y], axis=1), PATH_M), 0.0, np.inf)
+    points = resample(route, np.arange(0.0, max(float(arc_lengths(route)[-1]), 2.0), 1.0))
+    step = np.gradient(points, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    x, y = points[:, 0], points[:, 1]
+    usable = _prefix((np.abs(heading) < 1.0) & (np.gradient(x) > 0.3) & (x > -5.0))
+    y_lane = _straight_beyond(lane, x, max(lane.seen_to_m + 15.0, 25.0))
+    sigma = lane.sigma(np.maximum(x, 0.0))
+    apart = np.abs((y - y_lane) - (y[0] - y_lane[0])) > LEAVE_M
+    turned = np.abs(heading - np.arctan(lane.slope(np.clip(x, 0.0, 30.0)))) > LEAVE_RAD
+    leaves = np.inf
+    if (apart & turned & usable).any():
+        leaves = float(x[np.argmax(apart & turned & usable)])
+        sigma = np.hypot(sigma, 0.3 * np.maximum(x - (leaves - LEAVE_BEFORE_M), 0.0))
+    lane_share = ROUTE_SIGMA_M**2 / (ROUTE_SIGMA_M**2 + sigma**2)
+    correction = np.where(usable, lane_share * (y_lane - y), 0.0)
+    if not usable.all():
+        last = max(int(np.argmin(usable)) - 1, 0)
+        beyond = np.arange(len(x)) > last
+        correction = np.where(beyond, correction[last] * np.exp(-(np.arange(len(x)) - last) / 8.0), correction)
+    normal = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    # The correction is measured along the rig's y axis; along the path's normal it is shorter by the cosine.
+    fused = points + normal * (correction * np.cos(heading))[:, None]
+    at_10 = int(np.argmin(np.abs(x - 10.0)))
+    return Blend(make_path(fused, PATH_M), float(1.0 - lane_share[at_10]), leaves)
+
+
+def progress_behind(
+    speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float
+) -> F64:
+    """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance to what is ahead.
+
+    Intelligent driver model (Treiber, Hennecke, Helbing 2000), the thing ahead continuing at its speed.
+    """
+    ahead = limits.tolist()
+    progress, s, v = [0.0], 0.0, max(speed_mps, 0.0)
+    for k in range(1, len(t_s)):
+        dt = float(t_s[k] - t_s[k - 1])
+        limit = ahead[min(int(s / Path.SPACING_M), len(ahead) - 1)]
+        accel = IDM_ACCEL_MPS2 * (1 - (v / max(cruise_mps, 0.1)) ** 4) if v < limit else (limit - v) / 0.5
+        accel = max(min(accel, (limit - v) / dt), -4.0)
+        if obstacle is not None:
+            other = max(obstacle.speed_mps, 0.0)
+            gap = obstacle.distance_m + other * float(t_s[k - 1]) - s - bumper_m
+            wish = MIN_GAP_M + max(v * HEADWAY_S + v * (v - other) / (2 * np.sqrt(IDM_ACCEL_MPS2 * IDM_BRAKE_MPS2)), 0.0)
+            follow = IDM_ACCEL_MPS2 * (1 - (v / max(limit, 0.1)) ** 4 - (wish / max(gap, 0.1)) ** 2)
+            accel = max(min(accel, follow), -HARD_BRAKE_MPS2)
+        after = max(v + accel * dt, 0.0)
+        s += 0.5 * (v + after) * dt
+        v = after
+        progress.append(s)
+    return np.array(progress)
+
+
+def alternatives(xy: F64, yaw: F64, random: np.random.Generator) -> list[F64]:
+    """Return `N_ALTERNATIVES` noisy versions ``(T, 3)`` of a plan: shifted to a side over the first metres, and faster or slower.
+
+    Each has one lateral shift and one speed factor, so it is as drivable as the plan itself.
+    """
+    s = arc_lengths(xy)
+    ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
+    ramp_slope = np.where(s < NOISE_RAMP_M, 6 * ramp * (1 - ramp) / NOISE_RAMP_M, 0.0)
+    ramp = ramp * ramp * (3 - 2 * ramp)
+    out = []
+    for shift_m, factor in zip(
+        random.normal(0.0, NOISE_LATERAL_M, N_ALTERNATIVES), random.normal(0.0, NOISE_SPEED, N_ALTERNATIVES), strict=True
+    ):
+        shifted = xy + shift_m * ramp[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+        line = np.column_stack([shifted, yaw + np.arctan(shift_m * ramp_slope)])
+        out.append(_retimed(line, s, s * (1.0 + factor)))
+    return out
+
+
+def _retimed(line: F64, s: F64, at: F64) -> F64:
+    """Return rows of ``line`` (T, 3) at progress ``at``, straight on beyond the end; a standing plan stays as it is."""
+    if s[-1] < 0.1:
+        return line
+    keep = np.concatenate([[True], np.diff(s) > 1e-9])
+    out = np.stack([np.interp(at, s[keep], line[keep, d]) for d in range(3)], axis=1)
+    over = np.maximum(at - s[-1], 0.0)
+    out[:, 0] += over * np.cos(line[-1, 2])
+    out[:, 1] += over * np.sin(line[-1, 2])
+    return out
+
+
+def _straight_beyond(lane: LaneState, x: F64, limit_m: float) -> F64:
+    """Return the lane's centre, carried on along its tangent beyond ``limit_m``, where a cubic would run away."""
+    inside = np.clip(x, 0.0, limit_m)
+    return lane.centre(inside) + (x - inside) * lane.slope(inside)
+
+
+def _prefix(flags: np.ndarray) -> np.ndarray:
+    """Return the flags up to the first false one."""
+    return np.asarray(np.logical_and.accumulate(flags))

@@ -1,0 +1,102 @@
+"""From a frame to points of lane paint on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.types import F32, F64, U8, Bool
+from policies.ground_grid import CELL_M, GroundGrid
+
+PAINT_WIDTH_M = 0.15
+MIN_CONTRAST = 7.0  # grey levels
+NOISE_FACTOR = 4.0
+MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double line)
+
+
+@dataclass(frozen=True)
+class PaintPoints:
+    """Where paint was seen: one entry per line and grid row."""
+
+    x_m: F64  # (N,) rig
+    y_m: F64  # (N,)
+    strength: F64  # (N,) contrast over the row's threshold, >= 1
+    sigma_m: F64  # (N,) lateral standard deviation
+
+
+def brightness(ground: U8) -> F32:
+    """Return the channel ``(R, C)`` in which both white and yellow paint are bright: the mean of red and green."""
+    return np.asarray(cv2.addWeighted(ground[..., 0], 0.5, ground[..., 1], 0.5, 0.0), dtype=np.float32)
+
+
+class RidgeFilter:
+    """Tells how much each cell of the ground outshines the road on *both* sides of it.
+
+    The stroke's width and the distance of the two flanks grow with the pixel's size on the ground, so far paint, blurred over a
+    pixel or two, still stands out. A step (kerb, shadow, the side of a car) outshines one side only and gives nothing.
+    """
+
+    def __init__(self, grid: GroundGrid) -> None:
+        half, gap, flank = _windows(grid)
+        n = len(grid.y_m)
+        column, start = np.arange(n)[None, :], (n + 1) * np.arange(len(grid.x_m))[:, None]
+
+        def window(first: F64, last: F64) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], F32]:
+            a = np.clip(column + first[:, None], 0, n).astype(np.intp)
+            b = np.clip(column + last[:, None] + 1, 0, n).astype(np.intp)
+            return start + a, start + b, (1.0 / np.maximum(b - a, 1)).astype(np.float32)
+
+        self._windows = window(-half, half), window(-gap - flank, -gap), window(gap, gap + flank)
+        self._seen = _erode_rows(grid.inside, gap + flank)
+
+    def response(self, value: F32) -> F32:
+        """Return the response ``(R, C)`` of a brightness ``(R, C)``; 0 where a flank is out of the image."""
+        total = np.zeros((value.shape[0], value.shape[1] + 1), dtype=np.float32)
+        np.cumsum(value, axis=1, out=total[:, 1:])
+        centre, left, right = ((np.take(total, b) - np.take(total, a)) * scale for a, b, scale in self._windows)
+        return np.asarray(np.where(self._seen, np.maximum(centre - np.maximum(left, right), 0.0), 0.0), dtype=np.float32)
+
+
+def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter) -> PaintPoints:
+    """Return the ridge points of a warped frame ``(R, C, 3)``: local maxima of the response above each row's noise."""
+    response = ridges.response(brightness(ground))
+    # Paint is long and noise is not: average over three rows before looking for maxima.
+    smooth = cv2.blur(response, (1, 3))
+    near = round(MERGE_M / CELL_M)
+    peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), np.uint8))
+    spread = np.median(smooth, axis=1)
+    threshold = np.maximum(MIN_CONTRAST, NOISE_FACTOR * spread)
+    is_peak = (smooth >= peak) & (smooth > threshold[:, None])
+    rows, cols = np.nonzero(is_peak)
+    inner = (cols > 0) & (cols < smooth.shape[1] - 1)
+    rows, cols = rows[inner], cols[inner]
+    before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
+    bend = np.maximum(2 * here - before - after, 1e-6)
+    shift = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
+    return PaintPoints(
+        grid.x_m[rows],
+        grid.y_m[cols] - shift * CELL_M,
+        here / threshold[rows],
+        np.hypot(0.05, 0.5 * grid.pixel_m[rows]),
+    )
+
+
+def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:
+    """Return, per row and in cells: half the stroke, the start of the flanks, and their length."""
+    half = np.maximum(PAINT_WIDTH_M / 2, 0.5 * grid.pixel_m)
+    gap = half + np.maximum(0.15, grid.pixel_m)
+    flank = np.maximum(0.3, grid.pixel_m)
+    return np.rint(half / CELL_M), np.rint(gap / CELL_M), np.rint(flank / CELL_M)
+
+
+def _erode_rows(inside: Bool, reach: F64) -> Bool:
+    """Return where the whole window of ``reach`` cells to both sides is inside the image; rows of a pinhole view are intervals."""
+    n = inside.shape[1]
+    any_inside = inside.any(axis=1)
+    first = np.where(any_inside, np.argmax(inside, axis=1), n)
+    last = np.where(any_inside, n - 1 - np.argmax(inside[:, ::-1], axis=1), -1)
+    column = np.arange(n)[None, :]
+    return np.asarray((column >= (first + reach)[:, None]) & (column <= (last - reach)[:, None]))

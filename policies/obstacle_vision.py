@@ -1,0 +1,180 @@
+"""Obstacles from pixels: what rises from the ground in front of the car does not look like the road, from its foot up.
+
+A thing of height ``H`` standing at distance ``d`` from a camera of height ``h`` hides the ground behind it up to ``d h / (h - H)``. On
+the ground grid it is therefore a patch that starts at its foot and goes on far; paint, a shadow or a patch of new asphalt ends
+soon. The foot gives the distance by the ground plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.types import F64, U8
+from policies.ground_grid import CELL_M, GroundGrid
+
+STRIPS = 4
+CORRIDOR_HALF_M = 0.95  # half the ego's width: what stands outside can be passed
+MIN_HEIGHT_M = 0.6
+LEAST_HEIGHT_M = 0.3
+LEAVE_LANE_M = 1.4
+ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
+LEARN = 0.1
+FILLED, CLEAR = 0.7, 0.35
+
+
+@dataclass(frozen=True)
+class RoadColour:
+    """What the road looks like: centre and tolerance per Lab channel."""
+
+    centre: F64  # (3,)
+    tolerance: F64  # (3,)
+
+
+def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F64, free_to_m: float) -> RoadColour | None:
+    """Refine the road's colour from the patch in front of the car, as far as it is known to be free.
+
+    Args:
+        colour: What was learned so far.
+        lab: ``(R, C, 3)`` warped frame in Lab.
+        grid: The grid of the frame.
+        centre_y: ``(R,)`` lateral position of the ego's path.
+        free_to_m: Nothing stands nearer than this.
+    """
+    rows = np.flatnonzero((grid.x_m >= ROAD_NEAR_M) & (grid.x_m <= min(ROAD_FAR_M, free_to_m - 2.0)))
+    if len(rows) < 3:
+        return colour
+    columns = grid.column_of(centre_y[rows])[:, None] + np.arange(-ROAD_HALF_M, ROAD_HALF_M, 2 * CELL_M) / CELL_M
+    index = np.clip(np.rint(columns).astype(np.intp), 0, lab.shape[1] - 1)
+    patch = lab[rows[:, None], index].reshape(-1, 3).astype(np.float64)
+    patch = patch[grid.inside[rows[:, None], index].reshape(-1)]
+    if len(patch) < 50:
+        return colour
+    middle = np.median(patch, axis=0)
+    spread = 1.4826 * np.median(np.abs(patch - middle), axis=0)
+    new = RoadColour(middle, np.maximum(np.array([22.0, 7.0, 7.0]), 4.0 * spread))
+    if colour is None:
+        return new
+    # A sudden change is more likely a thing than a new road: follow it slowly.
+    step = np.clip(new.centre - colour.centre, -20.0, 20.0)
+    return RoadColour(colour.centre + LEARN * step, colour.tolerance + LEARN * (new.tolerance - colour.tolerance))
+
+
+def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
+    """Return 0..255 per cell ``(R, C)``: how little it looks like the road, by its worst channel. Thin things (paint) are removed."""
+    level = np.arange(256, dtype=np.float64)[:, None]
+    away = np.abs(level - colour.centre) / colour.tolerance
+    table = (255 * np.clip((away - 0.7) / 0.6, 0.0, 1.0)).astype(np.uint8)
+    light, a, b = cv2.split(cv2.LUT(lab, table[:, None, :]))
+    value = cv2.max(light, cv2.max(a, b))
+    wide = np.ones((1, round(0.35 / CELL_M) | 1), np.uint8)
+    value = cv2.morphologyEx(value, cv2.MORPH_OPEN, wide)
+    value[~grid.inside] = 0
+    return np.asarray(value)
+
+
+def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_m: float) -> tuple[float, float] | None:
+    """Return (distance, its standard deviation) of the nearest thing in the corridor along ``centre_y`` (R,), or None.
+
+    The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear and what lies behind it on the
+    camera's line of sight is filled, up to where a thing of `MIN_HEIGHT_M` would hide the ground. In a curve the line of sight leaves
+    the lane: what is seen there says nothing, and a row that keeps less than a thing of `LEAST_HEIGHT_M` would hide is no candidate.
+
+    Args:
+        value: `anomaly` of the frame.
+        grid: The grid of the frame.
+        centre_y: Lateral position of the ego's path at each row.
+        min_x_m: Nearest candidate.
+        max_x_m: Furthest candidate.
+    """
+    x_camera, height = grid.camera_xz
+    distance = grid.x_m - x_camera
+    rows = np.arange(len(distance))
+    table = _sums_along_sight(value, grid)
+    last = np.searchsorted(distance, distance * height / max(height - MIN_HEIGHT_M, 0.2 * height))
+    least = np.searchsorted(distance, distance * height / max(height - LEAST_HEIGHT_M, 0.2 * height))
+    # The line of sight through the path at row i, and where it has left the path at a later row k.
+    sight = (centre_y[:, None] - grid.camera_y) * (distance[None, :] / distance[:, None]) + grid.camera_y
+    left_lane = (np.abs(sight - centre_y[None, :]) > LEAVE_LANE_M) & (rows[None, :] > rows[:, None])
+    last = np.minimum(last, np.where(left_lane.any(axis=1), np.argmax(left_lane, axis=1), len(rows)))
+    usable = (grid.x_m >= min_x_m) & (grid.x_m <= max_x_m) & (last >= np.minimum(least, len(rows))) & (last - rows >= 3)
+    front = np.searchsorted(distance, 0.82 * distance)
+    edges = np.linspace(CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1)
+    u = np.rint(grid.sight_column((centre_y[:, None] + edges[None, :]), rows)).astype(np.intp)
+    u = np.clip(u, 0, table.shape[1] - 1)
+    filled = _box_mean(table, rows, last, u)
+    clear = _box_mean(table, front, np.maximum(rows - 1, front), u)
+    hit = (filled > FILLED) & (clear < CLEAR) & usable[:, None]
+    if not hit.any():
+        return None
+    i = int(np.argmax(hit.any(axis=1)))
+    pair = _box_mean(table, np.array([max(i - 1, 0), i]), np.array([max(i, 1), i + 1]), u[[i, i]])[:, hit[i]].mean(axis=1)
+    part = float(np.clip((pair[1] - 0.5) / max(pair[1] - pair[0], 0.1), 0.0, 1.0))
+    return float(grid.x_m[i] - part * grid.row_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
+
+
+def _sums_along_sight(value: U8, grid: GroundGrid) -> F64:
+    """Return the integral image ``(R + 1, U + 1)`` of the anomaly over grid rows and image columns, in 0..1."""
+    seen = np.take_along_axis(value, grid.sight_index, axis=1)
+    return np.asarray(cv2.integral(seen, sdepth=cv2.CV_64F) / 255.0, dtype=np.float64)
+
+
+def _box_mean(table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp], u: npt.NDArray[np.intp]) -> F64:
+    """Return the means ``(N, STRIPS)`` over rows first..last-1 and the columns between neighbouring edges ``u`` (N, STRIPS + 1)."""
+    a, b = first[:, None], last[:, None]
+    left, right = u[:, :-1], np.maximum(u[:, 1:], u[:, :-1] + 1)
+    right = np.minimum(right, table.shape[1] - 1)
+    total = table[b, right] - table[a, right] - table[b, left] + table[a, left]
+    return np.asarray(total / np.maximum((b - a) * (right - left), 1))
+
+
+@dataclass(frozen=True)
+class ObstacleTrack:
+    """The thing ahead over time: distance from the rear axle and its own speed."""
+
+    distance_m: float
+    speed_mps: float  # along the ego's path, over ground
+    cov: F64  # (2, 2)
+    hits: int = 1
+    misses: int = 0
+
+    @property
+    def confirmed(self) -> bool:
+        """Tell whether it was seen often enough to act on."""
+        return self.hits >= 3
+
+
+def track_obstacle(
+    track: ObstacleTrack | None, foot: tuple[float, float] | None, ego_mps: float, dt_s: float, blind_below_m: float
+) -> ObstacleTrack | None:
+    """Carry the track over ``dt_s`` and correct it by a new foot; None when there is nothing (any more).
+
+    A track whose foot has gone out of the image at the bottom is kept for as long as the ego's own motion says it is near.
+    """
+    if track is not None:
+        transition = np.array([[1.0, dt_s], [0.0, 1.0]])
+        q = 3.0**2 * np.array([[dt_s**4 / 4, dt_s**3 / 2], [dt_s**3 / 2, dt_s**2]])
+        track = replace(
+            track,
+            distance_m=track.distance_m + (track.speed_mps - ego_mps) * dt_s,
+            cov=transition @ track.cov @ transition.T + q,
+        )
+    if foot is None:
+        if track is None:
+            return None
+        hidden = track.confirmed and track.distance_m < blind_below_m + 1.0
+        track = replace(track, misses=track.misses + (0 if hidden else 1))
+        return None if track.misses > (8 if track.confirmed else 2) else track
+    measured, sigma = foot
+    if track is None or abs(measured - track.distance_m) > 4.0 * np.sqrt(track.cov[0, 0] + sigma**2) + 2.0:
+        # Nothing is known of its speed: as fast as the ego, give or take 5 m/s, until it is watched.
+        return ObstacleTrack(measured, 0.6 * ego_mps, np.diag([sigma**2, (2.0 + 0.4 * ego_mps) ** 2]))
+    gain = track.cov[:, 0] / (track.cov[0, 0] + sigma**2)
+    surprise = measured - track.distance_m
+    cov = track.cov - np.outer(gain, track.cov[0])
+    return ObstacleTrack(
+        track.distance_m + float(gain[0]) * surprise, max(track.speed_mps + float(gain[1]) * surprise, -2.0), cov, track.hits + 1, 0
+    )
