@@ -209,7 +209,7 @@ def test_unknown_part_lists_the_known_ones(street: Path) -> None:
 def test_colours_over_time_are_refused_not_misread(tmp_path: Path) -> None:
     names = [*NAMES, "f_dc_3", "f_dc_4"]
     path = write_elements(tmp_path / "a.ply", element("vertex", names, np.zeros((1, len(names)))))
-    with pytest.raises(InputError, match="Fourier terms f_dc_3..f_dc_4"):
+    with pytest.raises(InputError, match=r"Fourier terms f_dc_3\.\.f_dc_4"):
         read_ply(path)
 
 

@@ -1,0 +1,178 @@
+"""Framing of rollout logs: any entries survive, a cut tail is told, damage is an error."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.alpasim.asl import AslFile, AslReader
+from alpasim_plugin.alpasim.wire import logging_pb2
+from alpasim_plugin.errors import InfrastructureError, InputError
+
+
+def entry(t_us: int = 7, ids: tuple[str, ...] = ("EGO",)) -> logging_pb2.LogEntry:
+    pose = logging_pb2.ActorPoses.ActorPose
+    return logging_pb2.LogEntry(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=[pose(actor_id=i) for i in ids]))
+
+
+def write(path: Path, entries: list[logging_pb2.LogEntry]) -> Path:
+    with AslFile(path) as file:
+        for e in entries:
+            file.write(e)
+    return path
+
+
+entries_strategy = st.lists(
+    st.builds(entry, st.integers(0, 2**63), st.lists(st.text(max_size=200), max_size=5).map(tuple)), min_size=1, max_size=8
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(entries=entries_strategy)
+def test_any_entries_come_back_in_order(tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry]) -> None:
+    path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
+    reader = AslReader(path)
+    assert list(reader) == entries
+    assert reader.truncated is None
+    assert path.stat().st_size == sum(4 + e.ByteSize() for e in entries)
+
+
+@settings(max_examples=60, deadline=None)
+@given(entries=entries_strategy, data=st.data())
+def test_a_cut_anywhere_loses_only_the_last_entry(
+    tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry], data: st.DataObject
+) -> None:
+    path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
+    whole = path.read_bytes()
+    ends = [0]
+    for e in entries:
+        ends.append(ends[-1] + 4 + e.ByteSize())
+    cut = data.draw(st.integers(1, len(whole) - 1))
+    path.write_bytes(whole[:cut])
+    reader = AslReader(path)
+    kept = [e for e, end in zip(entries, ends[1:], strict=True) if end <= cut]
+    assert list(reader) == kept
+    if cut in ends:
+        assert reader.truncated is None
+    else:
+        assert reader.truncated is not None
+        assert (reader.truncated.entries, reader.truncated.offset) == (len(kept), ends[len(kept)])
+
+
+def test_length_is_big_endian(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.asl", [entry()])
+    assert struct.unpack(">I", path.read_bytes()[:4])[0] == entry().ByteSize() == len(path.read_bytes()) - 4
+
+
+def test_truncated_tail_reads_as_a_sentence(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.asl", [entry(), entry()])
+    size = entry().ByteSize()
+    path.write_bytes(path.read_bytes()[:-3])
+    reader = AslReader(path)
+    list(reader)
+    assert str(reader.truncated) == f"{path}: last entry cut at byte {4 + size} ({size - 3} of {size} bytes); 1 whole entries read"
+
+
+def test_overwritten_length_is_damage_not_a_cut_tail(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.asl", [entry(), entry(), entry()])
+    data = bytearray(path.read_bytes())
+    data[2] = 0x40  # the first length now reaches far past the end of the file
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="does not fit what follows") as caught:
+        list(AslReader(path))
+    assert "entry 0 at byte 0" in caught.value.with_what
+
+
+def test_varint_lengths_are_refused(tmp_path: Path) -> None:
+    body = entry().SerializeToString()
+    (tmp_path / "a.asl").write_bytes(b"".join(bytes([len(body)]) + body for _ in range(3)))
+    with pytest.raises(InputError, match="a length of"):
+        list(AslReader(tmp_path / "a.asl"))
+
+
+def test_garbage_in_the_middle_is_an_error_with_its_place(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.asl", [entry(), entry(), entry()])
+    size = 4 + entry().ByteSize()
+    data = bytearray(path.read_bytes())
+    data[size + 4 : 2 * size] = b"\xff" * (size - 4)
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="no log entry") as caught:
+        list(AslReader(path))
+    assert f"entry 1 at byte {size + 4}" in caught.value.with_what
+
+
+@pytest.mark.parametrize("length", [0, 2**31])
+def test_impossible_length_is_an_error(tmp_path: Path, length: int) -> None:
+    path = write(tmp_path / "a.asl", [entry()])
+    with path.open("ab") as stream:
+        stream.write(struct.pack(">I", length) + bytes(50))
+    with pytest.raises(InputError, match=f"a length of {length} bytes"):
+        list(AslReader(path))
+
+
+def test_empty_and_missing_files_are_errors(tmp_path: Path) -> None:
+    (tmp_path / "a.asl").write_bytes(b"")
+    with pytest.raises(InputError, match="an empty file"):
+        list(AslReader(tmp_path / "a.asl"))
+    with pytest.raises(InputError, match="cannot open"):
+        list(AslReader(tmp_path / "b.asl"))
+
+
+def test_entry_of_a_future_kind_is_passed_on_unnamed(tmp_path: Path) -> None:
+    body = b"\xfa\x01\x02\x08\x01"  # field 31, two bytes
+    (tmp_path / "a.asl").write_bytes(struct.pack(">I", len(body)) + body)
+    assert [e.WhichOneof("log_entry") for e in AslReader(tmp_path / "a.asl")] == [None]
+
+
+def test_name_appears_only_when_finished(tmp_path: Path) -> None:
+    file = AslFile(tmp_path / "a.asl")
+    file.write(entry())
+    assert [p.name for p in tmp_path.iterdir()] == ["a.asl.part"]
+    file.finish()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.asl"]
+    file.finish()
+    with pytest.raises(InfrastructureError, match="already finished"):
+        file.write(entry())
+
+
+def test_failed_writer_leaves_a_readable_part_and_no_log(tmp_path: Path) -> None:
+    def fail() -> None:
+        with AslFile(tmp_path / "a.asl") as file:
+            file.write(entry())
+            raise RuntimeError("the rollout broke")
+
+    with pytest.raises(RuntimeError, match="the rollout broke"):
+        fail()
+    assert not (tmp_path / "a.asl").exists()
+    assert list(AslReader(tmp_path / "a.asl.part")) == [entry()]
+
+
+def test_failed_attempt_does_not_touch_a_finished_log(tmp_path: Path) -> None:
+    write(tmp_path / "a.asl", [entry(1)])
+    second = AslFile(tmp_path / "a.asl")
+    second.write(entry(2))
+    second.abandon()
+    assert list(AslReader(tmp_path / "a.asl")) == [entry(1)]
+
+
+def test_full_disk_is_an_infrastructure_failure() -> None:
+    device = Path("/dev/full")
+    if not device.exists():
+        pytest.skip("this system has no /dev/full")
+    file = AslFile.__new__(AslFile)
+    file.path, file.partial, file.entries = device, device, 0
+    file._stream = device.open("wb")
+    file.write(entry())
+    with pytest.raises(InfrastructureError, match="No space left") as caught:
+        file.finish()
+    assert caught.value.exit_code == 4
+    file._stream = None
+
+
+def test_missing_folder_is_an_infrastructure_failure(tmp_path: Path) -> None:
+    with pytest.raises(InfrastructureError, match="No such file or directory"):
+        AslFile(tmp_path / "absent" / "a.asl")
