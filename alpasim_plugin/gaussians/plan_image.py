@@ -1,0 +1,169 @@
+"""Paint the plan of a scene as an image: the colour of the ground, what is raised by a kerb, and how fine it must be sampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.gaussians.paint import WHITE, YELLOW, Strokes
+from alpasim_plugin.gaussians.site import CELL_M, SHIFT_BITS, Site, to_pixels
+from alpasim_plugin.types import F32, F64, I64
+
+PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
+ASPHALT = (0.335, 0.335, 0.345)
+PAVEMENT = (0.55, 0.53, 0.50)
+GRASS = (0.33, 0.40, 0.22)
+PAVEMENT_M = 2.6  # width of the pavement beside the road
+FORECOURT_M = 6.5  # paved or planted strip up to the facades
+
+
+@dataclass(frozen=True)
+class PlanImage:
+    """The painted plan; cell (i, j) has its centre at ``low + (j + 0.5, i + 0.5) * cell_m`` in plan coordinates.
+
+    Attributes:
+        cell_m: Metres.
+        low: ``(2,)`` plan coordinates of the corner.
+        rgb: ``(H, W, 3)`` 0..1.
+        raised: ``(H, W)`` 1 where the ground stands a kerb's height above the road.
+        level: ``(H, W)`` the largest square that may stand for the cell is ``cell_m * 2**level``.
+    """
+
+    cell_m: float
+    low: F64
+    rgb: F32
+    raised: F32
+    level: I64
+
+
+def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, int, int, int] | None) -> PlanImage:
+    """Paint the plan.
+
+    Args:
+        site: What lies where.
+        strokes: Road paint.
+        cell_m: Cell size of the image.
+        window: (first row, first column, rows, columns) in cells of ``cell_m``; None: the whole site, padded to whole tiles of 32 m.
+    """
+    if window is None:
+        n = round(32.0 / cell_m)
+        rows, columns = (int(np.ceil(s * CELL_M / 32.0)) * n for s in site.road.shape)
+        window = (0, 0, rows, columns)
+    i0, j0, rows, columns = window
+    low = site.low + np.array([j0, i0]) * cell_m
+    off, inside, path = (_sampled(d, site, low, cell_m, (rows, columns)) for d in (site.off_road_m, site.inside_m, site.path_m))
+    road = inside > off
+    edge = np.abs(inside - off)
+    texture = site.scenario.environment.texture
+    tag = f"ground-{cell_m}"
+    grain = _noise(site, tag, (rows, columns), cell_m)
+
+    rgb = np.empty((rows, columns, 3), dtype=np.float32)
+    rgb[:] = _verge(site, off, grain, texture)
+    asphalt = np.array(ASPHALT, dtype=np.float32) * (1 + texture * (0.10 * grain[..., None] - _wear(site, low, cell_m, (rows, columns))[..., None]))
+    rgb[road] = asphalt[road]
+    covers = [_coverage(strokes, colour, low, cell_m, (rows, columns)) for colour in (WHITE, YELLOW)]
+    for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
+        worn = cover * (0.95 - 0.12 * texture * np.clip(grain, 0, 2))
+        rgb += worn[..., None] * (np.array(PAINT_IMAGE_RGB[colour], dtype=np.float32) - rgb)
+
+    painted = (covers[0] + covers[1]) > 0.04
+    near_paint = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * cell_m if painted.any() else np.full_like(off, 1e3)
+    feature = np.minimum(near_paint, edge)
+    cap = np.where(road, np.where(path < 4.0, 0.25, 0.5), 0.5) if cell_m < CELL_M else np.clip(0.05 * path, 0.5, 4.0)
+    wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
+    level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
+    return PlanImage(cell_m, low, np.clip(rgb, 0, 1), (~road).astype(np.float32), level)
+
+
+def _sampled(raster: F32, site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
+    """Resample one of the site's rasters, bilinear, the border continued."""
+    scale = cell_m / CELL_M
+    shift = (low - site.low) / CELL_M + 0.5 * scale - 0.5
+    matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(raster.astype(np.float32), matrix, (shape[1], shape[0]), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
+    """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to patches of ten metres."""
+    total = np.zeros(shape, dtype=np.float32)
+    rng = site.rng(tag)
+    for grid_m, weight in ((0.25, 0.55), (0.8, 0.5), (3.0, 0.45), (12.0, 0.5)):
+        step = max(grid_m, cell_m)
+        small = rng.standard_normal((int(shape[0] * cell_m / step) + 3, int(shape[1] * cell_m / step) + 3)).astype(np.float32)
+        total += weight * cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+    return total
+
+
+def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
+    """Colour the ground beside the road: pavement with slabs, then forecourt or grass."""
+    grass = np.array(GRASS, dtype=np.float32) * (1 + 0.20 * texture * grain[..., None])
+    if site.highway:
+        gravel = np.array([0.46, 0.43, 0.38], dtype=np.float32) * (1 + 0.08 * texture * grain[..., None])
+        return np.where((off < 1.0)[..., None], gravel, grass)
+    pavement = np.array(PAVEMENT, dtype=np.float32) * (1 + 0.06 * texture * grain[..., None])
+    joint = (np.abs(off - 1.3) < 0.07)[..., None]
+    pavement = np.where(joint, 0.85 * pavement, pavement)
+    built = site.scenario.environment.buildings
+    forecourt = np.array([0.47, 0.45, 0.42], dtype=np.float32) * (1 + 0.08 * texture * grain[..., None]) if built > 0.5 else grass
+    return np.where((off < PAVEMENT_M)[..., None], pavement, np.where((off < FORECOURT_M)[..., None], forecourt, grass))
+
+
+def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
+    """Return what darkens asphalt, 0..1: wheel tracks and the oil line of each lane, patches and cracks near the path."""
+    dark = np.zeros(shape, dtype=np.uint8)
+    high = low + np.array(shape[::-1]) * cell_m
+    for lane in site.scenario.lane_map.lanes.values():
+        if lane.kind not in ("vehicle", "bus") or lane.is_intersection or len(lane.centre) < 2:
+            continue
+        line = site.frame.to_plan(lane.centre)
+        if np.any(line.max(axis=0) < low) or np.any(line.min(axis=0) > high):
+            continue
+        d = np.gradient(line, axis=0)
+        left = np.stack([-d[:, 1], d[:, 0]], axis=1) / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
+        for side in (-0.85, 0.85):
+            points = to_pixels(line + side * left, low, cell_m)
+            cv2.polylines(dark, [points], False, 26, max(1, round(0.6 / cell_m)), cv2.LINE_8, SHIFT_BITS)
+        cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, 14, max(1, round(0.4 / cell_m)), cv2.LINE_8, SHIFT_BITS)
+    dark = cv2.GaussianBlur(dark, (0, 0), max(0.2 / cell_m, 0.5))
+    if cell_m < CELL_M:
+        _patches_and_cracks(site, dark, low, cell_m)
+    return dark.astype(np.float32) / 255.0
+
+
+def _patches_and_cracks(site: Site, dark: np.ndarray, low: F64, cell_m: float) -> None:  # type: ignore[type-arg]
+    rng = site.rng("cracks")
+    path = site.path
+    for _ in range(max(2, len(path) // 12)):
+        centre = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
+        half = rng.uniform([0.6, 0.4], [2.2, 1.2])
+        angle = rng.normal(0.0, 0.05)
+        c, s = np.cos(angle), np.sin(angle)
+        ring = centre + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ np.array([[c, s], [-s, c]])
+        cv2.fillPoly(dark, [to_pixels(ring, low, cell_m)], int(rng.integers(28, 55)), cv2.LINE_8, SHIFT_BITS)
+    for _ in range(max(3, len(path) // 6)):
+        start = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
+        heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.35, 14))
+        line = start + np.cumsum(0.35 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+        cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, int(rng.integers(60, 100)), 1, cv2.LINE_AA, SHIFT_BITS)
+
+
+def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
+    """Return the share ``(H, W)`` of each cell under paint of one colour."""
+    mask = np.zeros(shape, dtype=np.uint8)
+    high = low + np.array(shape[::-1]) * cell_m
+    mine = (strokes.colour == colour) & np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
+    start, end, width = strokes.start[mine], strokes.end[mine], strokes.width_m[mine]
+    along = end - start
+    length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1) / length * (width / 2)[:, None]
+    along = along / length * 0.02
+    rings = np.stack([start - left - along, end - left + along, end + left + along, start + left - along], axis=1)
+    # Strokes of coarse images are thinner than a pixel: paint at four times the resolution would be exact, area weighting is enough.
+    gain = np.minimum(1.0, width / cell_m)
+    for ring, share in zip(to_pixels(rings.reshape(-1, 2), low, cell_m).reshape(-1, 4, 2), gain, strict=True):
+        cv2.fillConvexPoly(mask, ring, int(255 * share), cv2.LINE_AA if share == 1.0 else cv2.LINE_8, SHIFT_BITS)
+    return mask.astype(np.float32) / 255.0

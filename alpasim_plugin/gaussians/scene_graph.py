@@ -1,0 +1,175 @@
+"""Draw a scene of many parts: cull each part against the view, choose its level of detail, render what is left once.
+
+Nodes are background parts in world coordinates and rigid actors in the frame of their box. Culling and level of detail are decided per
+node, before any Gaussian is touched: a node's sphere must meet the view, and its level is the coarsest whose cells stay below `CELL_PX`
+pixels at the node's nearest point. Order of drawing at equal depth is background nodes in the order given, then actors by id.
+
+The sky is no Gaussian: its image stands behind everything and is blended with what transparency is left. ``alpha`` is therefore the
+accumulated opacity of the scene *without* the sky (0 in the open sky), which is what the paper's opacity-mixed source needs; with
+``sky_in_alpha`` the sky counts as opaque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from alpasim_plugin.errors import RendererError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.nodes import SceneNode
+from alpasim_plugin.gaussians.output import RasterOutput
+from alpasim_plugin.gaussians.prepared import Node, PreparedCloud, ShFrame, prepare
+from alpasim_plugin.gaussians.rasterize import Backend, rasterize
+from alpasim_plugin.gaussians.rasterize_cpu import rasterize_prepared
+from alpasim_plugin.gaussians.sky import Sky
+from alpasim_plugin.types import F64, Bool
+
+CELL_PX = 2.0
+SOLID_ALPHA = 0.99  # a wall of opaque Gaussians ends at this alpha (one further layer would pass the stop rule)
+
+
+class SceneGraph:
+    """A scene ready to be rendered from anywhere.
+
+    Args:
+        background: Nodes in world coordinates.
+        actors: Nodes in box frames; the name is the actor's id.
+        sky: What stands behind everything.
+        sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor; scenes built here) or ``world`` (as
+            reconstructions of recorded drives are optimised).
+        cell_px: Larger is faster and coarser.
+    """
+
+    def __init__(
+        self,
+        background: Sequence[SceneNode],
+        actors: Sequence[SceneNode],
+        sky: Sky,
+        sh_frame: ShFrame = "object",
+        cell_px: float = CELL_PX,
+    ) -> None:
+        self.background = tuple(background)
+        self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
+        self.sky = sky
+        self.sh_frame: ShFrame = sh_frame
+        self.cell_px = cell_px
+        self._centre, self._radius = _spheres(self.background)
+        self._far = np.array([node.far_m for node in self.background])
+        self._prepared: dict[tuple[str, int], PreparedCloud] = {}
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians at the finest level."""
+        return sum(len(node.levels[0].cloud) for node in (*self.background, *self.actors.values()))
+
+    def render(
+        self,
+        camera: PinholeCamera,
+        actor_poses: Mapping[str, F64],
+        threads: int | None = None,
+        backend: Backend = "cpu",
+        sky_in_alpha: bool = False,
+    ) -> RasterOutput:
+        """Render one view.
+
+        Args:
+            camera: From where.
+            actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
+            threads: Thread count of the CPU backend; None leaves it as it is.
+            backend: ``cpu`` uses nodes prepared once; any other backend gets all chosen Gaussians as one cloud.
+            sky_in_alpha: Count the sky as opaque.
+
+        Returns:
+            Colour with sky, alpha, depth, and ``stats`` with ``visible``, ``nodes`` (drawn) and ``nodes_total``.
+
+        Raises:
+            RendererError: A pose for an actor that the scene does not hold.
+        """
+        chosen = self._choose(camera, actor_poses)
+        behind = self.sky.image(camera)
+        if backend == "cpu":
+            nodes: list[Node] = [(self._prepare(node, level), T) for node, level, T in chosen]
+            out = rasterize_prepared(nodes, camera, behind, threads=threads)
+        else:
+            out = rasterize(self._joined(chosen), camera, behind, backend)
+        stats = {**out.stats, "nodes": len(chosen), "nodes_total": len(self.background) + len(actor_poses)}
+        return replace(out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats)
+
+    def cloud_for(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> GaussianCloud:
+        """Return what `render` draws as one cloud in world coordinates: the slow twin of the prepared path."""
+        return self._joined(self._choose(camera, actor_poses))
+
+    def _joined(self, chosen: list[tuple[SceneNode, int, F64 | None]]) -> GaussianCloud:
+        clouds = [
+            node.levels[level].cloud if T is None else node.levels[level].cloud.transformed(T, self.sh_frame == "object")
+            for node, level, T in chosen
+        ]
+        return GaussianCloud.concatenate(clouds)
+
+    def _choose(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> list[tuple[SceneNode, int, F64 | None]]:
+        unknown = sorted(set(actor_poses) - set(self.actors))
+        if unknown:
+            raise RendererError(
+                "rendering a scene",
+                f"poses of {len(actor_poses)} actors",
+                f"actor {unknown[0]!r} has no model in this scene",
+                "pass poses of the scenario's own actors only",
+            )
+        eye, f = camera.centre_world, max(camera.fx, camera.fy)
+        distance = np.linalg.norm(self._centre - eye, axis=1) - self._radius
+        seen = in_view(camera, self._centre, self._radius) & (distance < self._far)
+        chosen: list[tuple[SceneNode, int, F64 | None]] = []
+        for i in np.flatnonzero(seen):
+            node = self.background[i]
+            chosen.append((node, self._level(node, float(distance[i]), f), None))
+        present = [name for name in self.actors if name in actor_poses]
+        if present:
+            nodes = [self.actors[name] for name in present]
+            poses = [np.asarray(actor_poses[name], dtype=np.float64) for name in present]
+            local, radius = _spheres(nodes)
+            centre = np.stack([T[:3, :3] @ c + T[:3, 3] for T, c in zip(poses, local, strict=True)])
+            distance = np.linalg.norm(centre - eye, axis=1) - radius
+            for i in np.flatnonzero(in_view(camera, centre, radius) & (distance < [node.far_m for node in nodes])):
+                chosen.append((nodes[i], self._level(nodes[i], float(distance[i]), f), poses[i]))
+        return chosen
+
+    def _level(self, node: SceneNode, distance_m: float, focal_px: float) -> int:
+        allowed_m = self.cell_px * max(distance_m, 0.0) / focal_px
+        fit = [i for i, level in enumerate(node.levels) if level.cell_m <= allowed_m]
+        return fit[-1] if fit else 0
+
+    def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
+        key = (node.name, level)
+        if key not in self._prepared:
+            self._prepared[key] = prepare(node.levels[level].cloud, sh_frame=self.sh_frame)
+        return self._prepared[key]
+
+
+def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
+    """Return which spheres ``(N, 3)``, ``(N,)`` in the world meet the camera's view volume (conservative at its corners)."""
+    p = centre @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    x, y, z = p.T
+    seen = z > -radius
+    for slope, coordinate, sign in (
+        (camera.cx / camera.fx, x, 1.0),
+        ((camera.width - camera.cx) / camera.fx, x, -1.0),
+        (camera.cy / camera.fy, y, 1.0),
+        ((camera.height - camera.cy) / camera.fy, y, -1.0),
+    ):
+        seen &= sign * coordinate + slope * z > -radius * np.hypot(1.0, slope)
+    return np.asarray(seen)
+
+
+def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:
+    """Return a sphere (centre ``(N, 3)``, radius ``(N,)``) around the three-sigma extent of each node's levels."""
+    centres, radii = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
+    for i, node in enumerate(nodes):
+        clouds = [level.cloud for level in node.levels if len(level.cloud)]
+        if not clouds:
+            continue
+        low = np.min([(c.means - 3 * c.scales.max(axis=1, keepdims=True)).min(axis=0) for c in clouds], axis=0)
+        high = np.max([(c.means + 3 * c.scales.max(axis=1, keepdims=True)).max(axis=0) for c in clouds], axis=0)
+        centres[i], radii[i] = (low + high) / 2, np.linalg.norm(high - low) / 2
+    return centres, radii

@@ -1,0 +1,235 @@
+"""Rasterise a scenario's plan: where is road, how far is it to the road's edge, where have vehicles been.
+
+Maps come with very different content (lane edges or only centres, drivable areas or none), so everything that is built beside or on the
+road is derived from one raster of the plan, in a frame turned along the logged path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from alpasim_plugin.geometry import arc_lengths, resample
+from alpasim_plugin.geometry_lanes import lane_polygon
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F32, F64, Bool, Lane, Scenario
+
+HeightAt = Callable[[F64], F64]  # (N, 2+) world xy -> (N,) metres
+
+CELL_M = 0.25
+REACH_M = 110.0  # how far from the path the plan is drawn
+CLOSE_GAP_M = 1.5  # gaps between lanes narrower than twice this are road too
+SHIFT_BITS = 4  # sub-pixel bits of the polygon filler
+HIGHWAY_MPS = 22.0
+
+
+@dataclass(frozen=True)
+class PlanFrame:
+    """A plan-view frame: metres along x and y after turning the world by ``-yaw_rad`` about ``origin_xy``."""
+
+    origin_xy: F64  # (2,) metres, world
+    yaw_rad: float
+
+    def to_plan(self, xy: F64) -> F64:
+        """Map world points ``(N, 2+)`` to plan coordinates ``(N, 2)``."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        d = np.asarray(xy, dtype=np.float64)[:, :2] - self.origin_xy
+        return np.stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]], axis=1)
+
+    def to_world(self, plan: F64) -> F64:
+        """Map plan coordinates ``(N, 2)`` to world points ``(N, 2)``."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        x, y = plan[:, 0], plan[:, 1]
+        return np.asarray(np.stack([c * x - s * y, s * x + c * y], axis=1) + self.origin_xy)
+
+    def turned(self, plan: F64) -> F64:
+        """Turn plan directions ``(N, 2)`` to level world directions ``(N, 3)``."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.column_stack([c * plan[:, 0] - s * plan[:, 1], s * plan[:, 0] + c * plan[:, 1], np.zeros(len(plan))])
+
+
+@dataclass(frozen=True)
+class Site:
+    """The plan of a scene.
+
+    Attributes:
+        scenario: What is built.
+        height_at: Ground height under world points.
+        frame: Plan frame; cell (row i, column j) of a raster has its centre at ``low + (j + 0.5, i + 0.5) * CELL_M``.
+        low: ``(2,)`` plan coordinates of the raster's corner, metres.
+        path: ``(N, 2)`` logged path and what the route adds to it, plan coordinates, points 1 m apart.
+        road: ``(H, W)`` bool, paved for vehicles.
+        junction: ``(H, W)`` bool, inside an intersection lane.
+        taken: ``(H, W)`` bool, ground that actors stand on or drive over at any time.
+        highway: Fast road without pavements and houses at its edge.
+    """
+
+    scenario: Scenario
+    height_at: HeightAt
+    frame: PlanFrame
+    low: F64
+    path: F64
+    road: Bool
+    junction: Bool
+    taken: Bool
+    highway: bool
+
+    def rng(self, component: str) -> np.random.Generator:
+        """Return the random stream of one part of the scene."""
+        return stream(self.scenario.scene_id, self.scenario.seed, f"scene/{component}")
+
+    @cached_property
+    def off_road_m(self) -> F32:
+        """Return ``(H, W)`` the distance of each cell to the road; 0 on it."""
+        return distance_m(self.road)
+
+    @cached_property
+    def inside_m(self) -> F32:
+        """Return ``(H, W)`` the distance of each road cell to the road's edge; 0 outside."""
+        return distance_m(~self.road)
+
+    @cached_property
+    def path_m(self) -> F32:
+        """Return ``(H, W)`` the distance of each cell to the path."""
+        mask = np.zeros(self.road.shape, dtype=np.uint8)
+        cv2.polylines(mask, [self.pixels(self.path)], False, 1, 1, cv2.LINE_8, SHIFT_BITS)
+        return distance_m(mask.astype(bool))
+
+    def pixels(self, plan: F64) -> npt.NDArray[np.int32]:
+        """Return plan points ``(N, 2)`` as fixed-point pixels for OpenCV's drawing functions."""
+        return to_pixels(plan, self.low, CELL_M)
+
+    def look_up(self, raster: npt.NDArray[np.generic], plan: F64) -> npt.NDArray[np.generic]:
+        """Return the raster's values ``(N,)`` at plan points ``(N, 2)``; points outside take the border's value."""
+        ij = np.floor((plan - self.low) / CELL_M).astype(np.int64)
+        h, w = raster.shape
+        return raster[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
+
+    def world(self, plan: F64, above_m: npt.ArrayLike = 0.0) -> F64:
+        """Return world points ``(N, 3)`` standing ``above_m`` over the ground at plan points ``(N, 2)``."""
+        xy = self.frame.to_world(plan)
+        return np.column_stack([xy, self.height_at(xy) + above_m])
+
+
+def to_pixels(plan: F64, low: F64, cell_m: float) -> npt.NDArray[np.int32]:
+    """Return plan points as fixed-point pixels with `SHIFT_BITS` fractional bits, pixel centres at integers."""
+    return np.round(((plan - low) / cell_m - 0.5) * (1 << SHIFT_BITS)).astype(np.int32)
+
+
+def distance_m(mask: Bool) -> F32:
+    """Return the distance of each cell to the nearest true cell, metres; far away where there is none."""
+    if not mask.any():
+        return np.full(mask.shape, 1.0e3, dtype=np.float32)
+    return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(CELL_M))
+
+
+def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
+    """Rasterise the plan of a scenario."""
+    path_world = _path(scenario)
+    chord = path_world[-1, :2] - path_world[0, :2]
+    heading = scenario.ego_log.quat[0]
+    yaw = np.arctan2(chord[1], chord[0]) if np.hypot(*chord) > 5.0 else 2 * np.arctan2(heading[3], heading[0])
+    frame = PlanFrame(path_world[0, :2].astype(np.float64), float(yaw))
+    path = frame.to_plan(path_world)
+    low = np.floor(path.min(axis=0) - REACH_M)
+    size = np.ceil((path.max(axis=0) + REACH_M - low) / CELL_M).astype(int)
+    shape = (int(size[1]), int(size[0]))
+
+    lanes = list(scenario.lane_map.lanes.values())
+    high = low + size * CELL_M
+    near = [lane for lane in lanes if _touches(frame.to_plan(lane.centre), low, high)]
+    road = _fill(shape, low, frame, _lane_rings(near))
+    _fill_into(road, low, frame, [ring[:, :2] for ring in scenario.lane_map.drivable_areas])
+    half = scenario.vehicle.box.width_m / 2 + 0.6
+    thickness = max(1, round(2 * half / CELL_M))
+    cv2.polylines(road, [to_pixels(path, low, CELL_M)], False, 1, thickness, cv2.LINE_8, SHIFT_BITS)
+    k = 2 * round(CLOSE_GAP_M / CELL_M) + 1
+    road = cv2.morphologyEx(road, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
+    # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
+    road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
+    junction = _fill(shape, low, frame, _lane_rings([lane for lane in near if lane.is_intersection]))
+    return Site(
+        scenario, height_at, frame, low, path, road.astype(bool), junction.astype(bool), _taken(scenario, frame, low, shape), _is_highway(scenario, near)
+    )
+
+
+def _path(scenario: Scenario) -> F64:
+    """Return the logged path and 40 m of the route behind its end, ``(N, 3)`` world, one point a metre."""
+    log = scenario.ego_log.xyz
+    length = float(arc_lengths(log)[-1])
+    route = scenario.route.xyz
+    line = log
+    if len(route) > 1:
+        s = arc_lengths(route)
+        end = np.argmin(np.sum((route[:, :2] - log[-1, :2]) ** 2, axis=1))
+        line = np.concatenate([log, route[(s > s[end] + 0.5) & (s < s[end] + 40.0)]])
+        length = float(arc_lengths(line)[-1])
+    if length < 1.0:
+        forward = np.array([np.cos(0.0), 0.0, 0.0])
+        q = scenario.ego_log.quat[0]
+        forward = np.array([1 - 2 * (q[2] ** 2 + q[3] ** 2), 2 * (q[1] * q[2] + q[0] * q[3]), 0.0])
+        line, length = np.stack([log[0], log[0] + 2.0 * forward]), 2.0
+    return resample(line, np.linspace(0.0, length, max(2, int(np.ceil(length)) + 1)))
+
+
+def _touches(plan: F64, low: F64, high: F64) -> bool:
+    return bool(np.all(plan.max(axis=0) > low) and np.all(plan.min(axis=0) < high))
+
+
+def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
+    rings: list[F64] = []
+    for lane in lanes:
+        for part in shapely.get_parts(lane_polygon(lane)):
+            if shapely.get_dimensions(part) == 2 and not shapely.is_empty(part):
+                rings.append(shapely.get_coordinates(shapely.get_exterior_ring(part)))
+    return rings
+
+
+def _fill(shape: tuple[int, int], low: F64, frame: PlanFrame, rings: list[F64]) -> npt.NDArray[np.uint8]:
+    mask = np.zeros(shape, dtype=np.uint8)
+    _fill_into(mask, low, frame, rings)
+    return mask
+
+
+def _fill_into(mask: npt.NDArray[np.uint8], low: F64, frame: PlanFrame, rings: list[F64]) -> None:
+    for ring in rings:
+        if len(ring) >= 3:
+            cv2.fillPoly(mask, [to_pixels(frame.to_plan(ring), low, CELL_M)], 1, cv2.LINE_8, SHIFT_BITS)
+
+
+def _taken(scenario: Scenario, frame: PlanFrame, low: F64, shape: tuple[int, int]) -> Bool:
+    """Mark where actors are at any time, with a margin of half a metre."""
+    mask = np.zeros(shape, dtype=np.uint8)
+    for actor in scenario.actors:
+        radius = 0.5 * np.hypot(actor.box.length_m, actor.box.width_m) + 0.5
+        points = to_pixels(frame.to_plan(actor.track.xyz), low, CELL_M)
+        thickness = max(1, min(round(2 * radius / CELL_M), 60))
+        cv2.polylines(mask, [points], False, 1, thickness, cv2.LINE_8, SHIFT_BITS)
+    return mask.astype(bool)
+
+
+def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
+    """Tell a fast road by its limits, or where none are given by four lanes side by side without any crossing."""
+    if scenario.lane_map.crosswalks or any(lane.is_intersection for lane in near) or scenario.lane_map.stop_lines:
+        return False
+    limits = [lane.speed_limit_mps for lane in near if lane.speed_limit_mps is not None]
+    if limits:
+        return float(np.median(limits)) >= HIGHWAY_MPS
+    lanes = scenario.lane_map.lanes
+
+    def abreast(lane: Lane) -> int:
+        count, seen = 1, {lane.lane_id}
+        for side in ("left_neighbour", "right_neighbour"):
+            at: Lane | None = lane
+            while at is not None and (name := getattr(at, side)) in lanes and name not in seen:
+                seen.add(name)
+                at, count = lanes[name], count + 1
+        return count
+
+    return max((abreast(lane) for lane in near), default=1) >= 4

@@ -1,0 +1,98 @@
+"""Paint the sky: a panorama by direction, read through the camera for every frame."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.types import F32
+
+Kind = Literal["clear", "overcast", "dusk"]
+WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
+LOW_RAD, HIGH_RAD = np.radians(-20.0), np.radians(70.0)
+STEP_PX = 8  # directions are computed this often and interpolated in between
+
+# zenith, mid, horizon, haze below the horizon, cloud, share of cloud, hills
+_COLOURS: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "clear": ((0.30, 0.50, 0.80), (0.52, 0.70, 0.90), (0.82, 0.89, 0.94), (0.55, 0.58, 0.50), (0.97, 0.97, 0.97), (0.50, 0.56, 0.56)),
+    "overcast": ((0.62, 0.65, 0.69), (0.70, 0.73, 0.76), (0.80, 0.82, 0.83), (0.52, 0.54, 0.49), (0.86, 0.87, 0.88), (0.52, 0.55, 0.54)),
+    "dusk": ((0.23, 0.28, 0.46), (0.52, 0.46, 0.56), (0.95, 0.70, 0.48), (0.40, 0.36, 0.33), (0.93, 0.62, 0.52), (0.30, 0.29, 0.34)),
+}
+_CLOUD_SHARE = {"clear": 0.34, "overcast": 0.85, "dusk": 0.45}
+
+
+class Sky:
+    """A sky as a panorama of directions.
+
+    Args:
+        panorama: ``(HEIGHT, WIDTH, 3)`` float32, 0..1; row 0 is the highest elevation, column 0 looks along world +x, columns go left
+            (counter-clockwise seen from above).
+    """
+
+    def __init__(self, panorama: F32) -> None:
+        # One column repeated at the seam: interpolation never leaves the image.
+        self._panorama = np.ascontiguousarray(np.concatenate([panorama, panorama[:, :1]], axis=1))
+
+    def image(self, camera: PinholeCamera) -> F32:
+        """Return the sky behind every pixel, ``(H, W, 3)`` float32, 0..1."""
+        h, w = camera.height, camera.width
+        u = np.arange(-(-w // STEP_PX) + 1) * STEP_PX
+        v = np.arange(-(-h // STEP_PX) + 1) * STEP_PX
+        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1) @ camera.T_camera_world[:3, :3]
+        elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
+        # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
+        forward = camera.T_camera_world[2, :3]
+        ahead = np.arctan2(forward[1], forward[0])
+        azimuth = ahead + _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - ahead)
+        columns = _upsample(azimuth * (WIDTH / (2 * np.pi)), h, w) % WIDTH
+        rows = _upsample((HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD)), h, w)
+        return np.asarray(cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR))
+
+
+def _wrap(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _upsample(grid: npt.NDArray[np.floating], height: int, width: int) -> F32:
+    """Interpolate values at every `STEP_PX`-th pixel corner to pixel centres."""
+    g = grid.astype(np.float32)
+    at = [(np.arange(n, dtype=np.float32) + 0.5) / STEP_PX for n in (height, width)]
+    rows, columns = np.broadcast_arrays(at[0][:, None], at[1][None, :])
+    return np.asarray(cv2.remap(g, np.ascontiguousarray(columns), np.ascontiguousarray(rows), cv2.INTER_LINEAR))
+
+
+def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
+    """Paint a sky with drifting clouds, a hazy horizon and a line of hills."""
+    zenith, middle, horizon, ground, cloud, hills = (np.array(c) for c in _COLOURS[kind])
+    elevation = np.linspace(HIGH_RAD, LOW_RAD, HEIGHT)
+    up = np.clip(elevation / HIGH_RAD, 0, 1)
+    t = np.clip(up / 0.35, 0, 1)[:, None]
+    column = np.where(up[:, None] < 0.35, horizon * (1 - t) + middle * t, middle + (zenith - middle) * np.clip((up[:, None] - 0.35) / 0.65, 0, 1))
+    image = np.repeat(column[:, None, :], WIDTH, axis=1)
+    noise = sum(
+        weight * _periodic_noise(rng, rows, columns) for rows, columns, weight in ((4, 12, 0.5), (9, 26, 0.3), (20, 60, 0.15), (44, 130, 0.08))
+    )
+    # Clouds are seen flatter towards the horizon and vanish in its haze.
+    threshold = np.quantile(noise, 1 - _CLOUD_SHARE[kind])
+    cover = np.clip((noise - threshold) / 0.45, 0, 1) * np.clip((up[:, None] - 0.05) / 0.15, 0, 1)
+    image += 0.85 * cover[..., None] * (cloud * (1 - 0.12 * np.clip(noise, 0, 1)[..., None]) - image)
+    ridge = np.radians(1.2) * (1 + 0.8 * _periodic_noise(rng, 1, 24)[:1] + 0.3 * _periodic_noise(rng, 1, 120)[:1])
+    below = np.clip((np.maximum(ridge, np.radians(0.3)) - elevation[:, None]) / np.radians(0.25), 0, 1)
+    image += below[..., None] * (hills - image)
+    field = np.clip((np.radians(0.0) - elevation) / np.radians(1.5), 0, 1)[:, None, None]
+    image += field * (ground - image)
+    return Sky(np.clip(image, 0, 1).astype(np.float32))
+
+
+def _periodic_noise(rng: np.random.Generator, rows: int, columns: int) -> npt.NDArray[np.float64]:
+    """Return smooth noise ``(HEIGHT, WIDTH)`` of about unit spread whose left and right edges meet."""
+    small = rng.standard_normal((rows + 2, columns)).astype(np.float32)
+    wide = np.concatenate([small[:, -2:], small, small[:, :3]], axis=1)
+    at_x = np.broadcast_to((np.arange(WIDTH, dtype=np.float32) * columns / WIDTH + 2)[None, :], (HEIGHT, WIDTH))
+    at_y = np.broadcast_to((np.arange(HEIGHT, dtype=np.float32) * rows / HEIGHT + 0.5)[:, None], (HEIGHT, WIDTH))
+    return np.asarray(cv2.remap(wide, np.ascontiguousarray(at_x), np.ascontiguousarray(at_y), cv2.INTER_CUBIC), dtype=np.float64)

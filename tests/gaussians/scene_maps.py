@@ -1,0 +1,169 @@
+"""Small hand-made scenarios for scene and renderer tests: straight 2 + 2 lanes, a curve, a crossing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from alpasim_plugin.geometry import quat_from_yaw
+from alpasim_plugin.types import (
+    F64,
+    Actor,
+    Box,
+    CameraSpec,
+    Degradation,
+    Environment,
+    HeightField,
+    Lane,
+    LaneMap,
+    Latency,
+    Rates,
+    Route,
+    Scenario,
+    Trajectory,
+    Vehicle,
+)
+from alpasim_plugin.world.ground import flat
+
+LANE_M = 3.6
+
+
+def camera_spec(width: int = 256, height: int = 144, hfov_rad: float = 1.2) -> CameraSpec:
+    """A forward camera 1.5 m above the ground, 1.7 m ahead of the rear axle."""
+    f = width / (2 * np.tan(hfov_rad / 2))
+    K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=np.float64)
+    T[:3, 3] = (1.7, 0.0, 1.5)
+    return CameraSpec("front", width, height, K, T)
+
+
+def offset(line: F64, left_m: float) -> F64:
+    """Shift a polyline sideways."""
+    d = np.gradient(line[:, :2], axis=0)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    out = line.copy()
+    out[:, 0] -= left_m * d[:, 1]
+    out[:, 1] += left_m * d[:, 0]
+    return out
+
+
+def road_lanes(axis: F64, name: str, lanes_each_way: int = 2, is_intersection: bool = False, paint: bool = False) -> dict[str, Lane]:
+    """Lanes on both sides of a road's axis ``(N, 3)``; those on its right run along it."""
+    out: dict[str, Lane] = {}
+    for way, sign in (("a", -1.0), ("b", 1.0)):
+        for i in range(lanes_each_way):
+            inner, outer = offset(axis, sign * i * LANE_M), offset(axis, sign * (i + 1) * LANE_M)
+            if way == "b":
+                inner, outer = inner[::-1].copy(), outer[::-1].copy()
+            lane_id = f"{name}-{way}{i}"
+            known = {"left_paint": "double_yellow" if i == 0 else "dashed_white", "right_paint": "solid_white"} if paint else {}
+            out[lane_id] = Lane(lane_id, (inner + outer) / 2, inner, outer, is_intersection=is_intersection, **known)  # type: ignore[arg-type]
+    return out
+
+
+def make_scenario(
+    lane_map: LaneMap,
+    path: F64,
+    actors: tuple[Actor, ...] = (),
+    environment: Environment | None = None,
+    degradation: Degradation | None = None,
+    ground: HeightField | None = None,
+    scene_id: str = "test",
+    seed: int = 0,
+    speed_mps: float = 10.0,
+) -> Scenario:
+    """A scenario whose ego drives along ``path (N, 3)``."""
+    d = np.gradient(path[:, :2], axis=0)
+    yaw = np.arctan2(d[:, 1], d[:, 0])
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1))])
+    t_us = np.round(s / speed_mps * 1e6).astype(np.int64)
+    log = Trajectory(t_us, path, quat_from_yaw(yaw))
+    return Scenario(
+        scene_id=scene_id,
+        source="yaml",
+        seed=seed,
+        lane_map=lane_map,
+        ground=ground or flat(),
+        ego_log=log,
+        vehicle=Vehicle(),
+        route=Route(path),
+        actors=actors,
+        cameras=(camera_spec(),),
+        rates=Rates(),
+        start_us=int(t_us[0]),
+        end_us=int(t_us[-1]),
+        warmup_us=0,
+        latency=Latency(),
+        environment=environment or Environment(),
+        degradation=degradation or Degradation(),
+        content_hash="",
+    )
+
+
+def line(start: tuple[float, float], end: tuple[float, float], step_m: float = 2.0) -> F64:
+    """A straight polyline on level ground."""
+    a, b = np.array(start), np.array(end)
+    n = max(2, int(np.linalg.norm(b - a) / step_m) + 1)
+    xy = a + np.linspace(0, 1, n)[:, None] * (b - a)
+    return np.column_stack([xy, np.zeros(n)])
+
+
+def parked(actor_id: str, x: float, y: float, yaw: float = 0.0, label: str = "car", box: Box | None = None) -> Actor:
+    """An actor that stands still."""
+    b = box or Box(4.6, 1.9, 1.5)
+    t = np.array([0, 60_000_000])
+    xyz = np.tile([x, y, b.height_m / 2], (2, 1))
+    return Actor(actor_id, label, b, Trajectory(t, xyz, np.tile(quat_from_yaw(yaw), (2, 1))), is_static=True)
+
+
+STREET_ACTORS = (
+    parked("car-1", 42.0, -1.8),
+    parked("car-2", 26.0, -5.9),
+    parked("car-3", 33.0, 5.4, np.pi),
+    parked("truck-1", 60.0, -5.4, 0.0, "truck", Box(8.5, 2.5, 3.4)),
+    parked("bus-1", 55.0, 5.4, np.pi, "bus", Box(11.5, 2.6, 3.2)),
+    parked("ped-1", 24.0, -8.6, 0.5, "pedestrian", Box(0.6, 0.6, 1.75)),
+    parked("ped-2", 20.0, 8.8, 2.5, "pedestrian", Box(0.6, 0.6, 1.65)),
+    parked("bike-1", 22.0, 1.8, np.pi, "cyclist", Box(1.8, 0.6, 1.75)),
+    parked("moto-1", 29.0, 1.8, np.pi, "motorcycle", Box(2.1, 0.8, 1.5)),
+    parked("cone-1", 18.0, -6.6, 0.0, "other", Box(0.4, 0.4, 0.8)),
+)
+
+
+def straight(**kwargs: object) -> Scenario:
+    """A straight street, two lanes each way, the ego in the inner right lane."""
+    lanes = road_lanes(line((-60, 0), (220, 0)), "r")
+    walk = np.array([[78.0, -7.2, 0], [81.0, -7.2, 0], [81.0, 7.2, 0], [78.0, 7.2, 0]])
+    stop = np.array([[76.5, -7.2, 0], [76.5, 0.0, 0]])
+    kwargs.setdefault("actors", STREET_ACTORS)
+    return make_scenario(LaneMap(lanes, crosswalks=(walk,), stop_lines=(stop,)), line((0, -1.8), (100, -1.8)), **kwargs)  # type: ignore[arg-type]
+
+
+def curve(radius_m: float = 60.0, **kwargs: object) -> Scenario:
+    """A left curve on a slope of 3 %."""
+    a = np.linspace(-0.6, 2.2, 90)
+    axis = np.column_stack([radius_m * np.sin(a), radius_m * (1 - np.cos(a)), np.zeros_like(a)])
+    path = offset(axis, -1.8)[(a >= 0.0) & (a < 1.6)]
+    xs = np.arange(-200.0, 201.0, 10.0)
+    field = HeightField(-200.0, -200.0, 10.0, np.broadcast_to(0.03 * xs[None, :], (41, 41)).copy())
+    path[:, 2] = 0.03 * path[:, 0]
+    return make_scenario(LaneMap(road_lanes(axis, "c", 1)), path, ground=field, **kwargs)  # type: ignore[arg-type]
+
+
+def crossing(**kwargs: object) -> Scenario:
+    """Two streets that cross at the origin."""
+    lanes: dict[str, Lane] = {}
+    for name, angle in (("e", 0.0), ("n", np.pi / 2), ("w", np.pi), ("s", -np.pi / 2)):
+        d = np.array([np.cos(angle), np.sin(angle)])
+        lanes |= road_lanes(line(tuple(12 * d), tuple(150 * d)), name, 1)  # type: ignore[arg-type]
+    for name, angle in (("x0", 0.0), ("x1", np.pi / 2)):
+        d = np.array([np.cos(angle), np.sin(angle)])
+        lanes |= road_lanes(line(tuple(-12 * d), tuple(12 * d)), name, 1, is_intersection=True)  # type: ignore[arg-type]
+    return make_scenario(LaneMap(lanes), line((-70, -1.8), (40, -1.8)), **kwargs)  # type: ignore[arg-type]
+
+
+def with_camera(scenario: Scenario, width: int, height: int) -> Scenario:
+    """The same scenario at another image size."""
+    return replace(scenario, cameras=(camera_spec(width, height),))
