@@ -50,7 +50,6 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
     stop_lines: list[F64] = []
     left_out: Counter[str] = Counter()
     swapped = 0
-    opposite: set[tuple[str, str]] = set()  # (lanelet, side) whose neighbour drives the other way
     for element in elements:
         lane_id = str(element.get("id"))
         where = f"{path}, lanelet {lane_id}"
@@ -65,7 +64,6 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
             left, right, swapped = right, left, swapped + 1
         stop_lines += _stop_line(files, where, element, left, right, origin)
         beside = {side: n for side in ("left", "right") if (n := element.find(f"adjacent{side.capitalize()}")) is not None}
-        opposite |= {(lane_id, side) for side, n in beside.items() if n.get("drivingDir") != "same"}
         same = {side: str(n.get("ref")) for side, n in beside.items() if n.get("drivingDir") == "same"}
         lanes[lane_id] = Lane(
             lane_id=lane_id,
@@ -88,11 +86,7 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
         notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
     lanes = _mark_intersections(lanes)
     if root.find("lanelet/leftBound/lineMarking") is None and root.find("lanelet/rightBound/lineMarking") is None:
-        lanes = {key: _assume_paint(lane, opposite) for key, lane in lanes.items()}
-        notes.append(
-            "the file has no line markings: paint assumed from adjacency (dashed white between lanes of one direction, double yellow "
-            "between directions, solid yellow at the left and solid white at the right border, none in intersections)"
-        )
+        notes.append("the file has no line markings: the paint of all lane edges is unknown")
     surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     edges = border_lines(surface, np.concatenate([e for lane in lanes.values() for e in (lane.left, lane.right) if e is not None]))
     notes.append(
@@ -194,11 +188,3 @@ def _mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
         crossing = lane.is_intersection or shared > CROSSING_SHARE * polygons[n].area
         marked[key] = lane if crossing == lane.is_intersection else Lane(**{**vars(lane), "is_intersection": True})
     return marked
-
-
-def _assume_paint(lane: Lane, opposite: set[tuple[str, str]]) -> Lane:
-    if lane.is_intersection:
-        return Lane(**{**vars(lane), "left_paint": "none", "right_paint": "none"})
-    left: Paint = "double_yellow" if (lane.lane_id, "left") in opposite else "dashed_white" if lane.left_neighbour else "solid_yellow"
-    right: Paint = "double_yellow" if (lane.lane_id, "right") in opposite else "dashed_white" if lane.right_neighbour else "solid_white"
-    return Lane(**{**vars(lane), "left_paint": left, "right_paint": right})

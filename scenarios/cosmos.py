@@ -10,22 +10,20 @@ import re
 from pathlib import Path
 
 import numpy as np
-import shapely
 
 from alpasim_plugin.geometry import quat_from_matrix
 from alpasim_plugin.geometry_lanes import densify
-from alpasim_plugin.types import F64, Lane, LaneMap, Marking, Trajectory, Vehicle
+from alpasim_plugin.types import F64, LaneMap, Marking, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.cosmos_camera import FRONT_WIDE, front_camera, read_lenses
 from scenarios.cosmos_lanes import oriented_lanes
-from scenarios.cosmos_layers import Label, paint_of, read_layer, sign_pose
+from scenarios.cosmos_layers import paint_of, read_layer, sign_pose
 from scenarios.reading import SourceFiles
 from scenarios.recorded import RecordedLog
 from scenarios.tracks import checked_trajectory
 
 FRAME_RATE_HZ = 30
 EDGE_STEP_M = 2.0
-PAINTED_REACH_M = 0.15  # a lane line this near to a painted lane edge is that edge's paint
 GROUND_CELL_M = 2.0
 
 
@@ -47,14 +45,15 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     if not layers["road_boundaries"]:
         raise files.fail(folder / "3d_road_boundaries", "a map without road edges", "use a clip with road boundaries")
     lanes, lane_notes = oriented_lanes(files, layers["lanes"], ego_log)
-    markings = tuple(_markings(layers["lanelines"], lanes))
     stops = [label for label in layers["wait_lines"] if label.attributes.get("is_implicit") is not True]
     lane_map = LaneMap(
         lanes=lanes,
         road_edges=tuple(densify(label.lines[0], EDGE_STEP_M) for label in layers["road_boundaries"] if len(label.lines[0]) > 1),
         crosswalks=tuple(np.concatenate([label.lines[0], label.lines[0][:1]]) for label in layers["crosswalks"]),
         stop_lines=tuple(label.lines[0] for label in stops),
-        markings=markings,
+        markings=tuple(
+            Marking(line.lines[0], paint_of(line.attributes.get("styles"), line.attributes.get("colors"))) for line in layers["lanelines"]
+        ),
         poles=tuple(label.lines[0] for label in layers["poles"]),
         signs=tuple(sign_pose(label.lines[0]) for label in layers["traffic_signs"] if len(label.lines[0]) == 8),
     )
@@ -69,7 +68,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
         "rendered through a pinhole of 90 degrees width inside the recorded 120 degree f-theta lens",
         "vehicle size and axles assumed: the clip has none; the rig's origin is taken to be on the ground under the rear axle",
         f"{len(layers['wait_lines']) - len(stops)} implicit wait lines are no painted stop lines and were left out",
-        f"{len(markings)} of {len(layers['lanelines'])} lane lines are markings, the rest are the paint of lane edges",
+        "lane lines run between the edges of neighbouring lanes and are the same paint: draw a line once",
         "road markings (6 classes of words and arrows) and traffic lights are not used",
         *lane_notes,
     )
@@ -116,21 +115,3 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
     t_us = start_us + np.round(np.arange(len(poses)) * (1e6 / FRAME_RATE_HZ)).astype(np.int64)
     quat = quat_from_matrix(poses[:, :3, :3])
     return checked_trajectory(files, path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp["clip"] if stamp else path.stem
-
-
-def _markings(lines: tuple[Label, ...], lanes: dict[str, Lane]) -> list[Marking]:
-    """Return the lane lines that are not already the paint of a lane's edge: painting them twice would fill the gaps of dashes."""
-    sides = [side for lane in lanes.values() for side in ((lane.left, lane.left_paint), (lane.right, lane.right_paint))]
-    edges = [edge for edge, paint in sides if edge is not None and paint != "none"]
-    tree = shapely.STRtree([shapely.linestrings(e[:, :2]) for e in edges])
-    markings: list[Marking] = []
-    for label in lines:
-        xyz = label.lines[0]
-        if len(xyz) < 2:
-            continue
-        line = shapely.linestrings(xyz[:, :2])
-        near = shapely.union_all([tree.geometries[i] for i in tree.query(line, predicate="dwithin", distance=PAINTED_REACH_M)])
-        covered = shapely.length(shapely.intersection(line, shapely.buffer(near, PAINTED_REACH_M)))
-        if covered < 0.5 * shapely.length(line):
-            markings.append(Marking(xyz, paint_of(label.attributes.get("styles"), label.attributes.get("colors"))))
-    return markings
