@@ -18,8 +18,8 @@ from alpasim_plugin.alpasim.wire import common_pb2, logging_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import matrix_from_quat, quat_from_yaw, se2, yaw_from_quat
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
-from alpasim_plugin.log.schema import read_poses, wire_poses
-from alpasim_plugin.types import Actor, Box, RolloutLog
+from alpasim_plugin.log.schema import read_poses, wire_poses, wire_trajectory
+from alpasim_plugin.types import Actor, Box, RolloutLog, Trajectory
 from tests.log.make_rollout import ACTORS, CAMERA, HEADER, STEP_US, T0_US, ego_at, picture, plan_at, present, straight, write_rollout
 
 # --- our own logs -----------------------------------------------------------------------------------------------------
@@ -179,6 +179,21 @@ def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -
     unit = np.array(quat) / np.linalg.norm(quat)
     assert 2 * np.arccos(min(1.0, abs(float(back_quat[0] @ unit)))) < 1e-6
     assert abs(np.linalg.norm(back_quat[0]) - 1) < 1e-12
+
+
+@settings(max_examples=50, deadline=None)
+@given(n=st.integers(0, 6), seed=st.integers(0, 1000), zeros=st.booleans())
+def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(n: int, seed: int, zeros: bool) -> None:
+    rng = np.random.default_rng(seed)
+    xyz = np.zeros((n, 3)) if zeros else rng.normal(size=(n, 3)) * 1000
+    trajectory = Trajectory(T0_US + np.arange(n, dtype=np.int64), xyz, rng.normal(size=(n, 4)))
+    poses = wire_poses(trajectory.xyz, trajectory.quat, "a test")
+    slow = common_pb2.Trajectory(
+        poses=[common_pb2.PoseAtTime(pose=p, timestamp_us=t) for p, t in zip(poses, trajectory.t_us.tolist(), strict=True)]
+    )
+    fast = wire_trajectory(trajectory, "a test")
+    assert fast == slow
+    assert fast.SerializeToString() == slow.SerializeToString()
 
 
 def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path) -> None:
