@@ -1,0 +1,262 @@
+"""Lay out a scene seen from above: lanes, the logged drive, what each rollout drove, and where it went wrong.
+
+Only geometry is made here, as SVG path data in small integers (one unit is about a quarter of a screen pixel); colours, strokes and
+hover texts belong to the template. The map is turned so that the logged drive runs from left to right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from evaluators.report.events import Event, events_of
+from evaluators.report.numbers import fixed
+from evaluators.report.run_folder import Rollout, Series
+
+F64 = npt.NDArray[np.float64]
+UNITS_ACROSS = 4000  # width of the drawing in integer units
+MARGIN_M = 10.0
+STRAY_M = 40.0  # how far from the log's bounds the view follows a rollout
+MIN_ASPECT = 0.12  # height / width
+
+
+@dataclass(frozen=True)
+class Track:
+    """One rollout's path: SVG path data and what to say on hover."""
+
+    arm: int
+    dash: int
+    label: str
+    d: str
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One event on the map, in drawing units."""
+
+    arm: int
+    kind: str
+    text: str
+    x: int | None
+    y: int | None
+    footprint: str = ""
+
+
+@dataclass(frozen=True)
+class OffsetChart:
+    """Signed distance from the logged path over time; width 1000, height 200, zero in the middle."""
+
+    tracks: tuple[Track, ...]
+    reach_m: str
+    end_s: str
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """Everything that the template draws for one scene."""
+
+    scene: str
+    width: int
+    height: int
+    unit_per_m: float
+    lanes: str
+    lines: str
+    edges: str
+    crosswalks: str
+    log: str
+    tracks: tuple[Track, ...]
+    marks: tuple[Mark, ...]
+    bar_units: int
+    bar_label: str
+    north_deg: float
+    offset: OffsetChart | None
+
+    @property
+    def is_wide(self) -> bool:
+        """Tell whether the drawing should take the full width of the page."""
+        return self.height < 0.45 * self.width
+
+
+class _Frame:
+    """The turn, shift and scale from world metres to drawing units."""
+
+    def __init__(self, log: F64, paths: Sequence[F64]) -> None:
+        self.log_at = log[0]
+        chord = log[-1] - log[0]
+        angle = math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
+        c, s = math.cos(angle), math.sin(angle)
+        self.turn = np.array([[c, s], [-s, c]])  # world to drawing, still metres and y up
+        self.north_deg = math.degrees(angle)
+        on_log = self._turned(log)
+        low, high = on_log.min(0) - STRAY_M, on_log.max(0) + STRAY_M
+        all_xy = np.concatenate([on_log, *(np.clip(self._turned(p), low, high) for p in paths)])
+        low, high = all_xy.min(0) - MARGIN_M, all_xy.max(0) + MARGIN_M
+        lacking = MIN_ASPECT * (high[0] - low[0]) - (high[1] - low[1])
+        if lacking > 0:
+            low[1], high[1] = low[1] - lacking / 2, high[1] + lacking / 2
+        self.low, self.high = low, high
+        self.scale = UNITS_ACROSS / float(high[0] - low[0])
+        self.height = math.ceil(float(high[1] - low[1]) * self.scale)
+
+    def _turned(self, xy: F64) -> F64:
+        turned: F64 = (xy - self.log_at) @ self.turn.T
+        return turned
+
+    def units(self, xy: F64) -> F64:
+        """Map ``(N, 2)`` world metres to drawing units, y down."""
+        metres = self._turned(xy)
+        return np.stack([(metres[:, 0] - self.low[0]) * self.scale, (self.high[1] - metres[:, 1]) * self.scale], 1)
+
+    def sees(self, units: F64) -> bool:
+        """Tell whether the bounds of a line touch the drawing."""
+        (x0, y0), (x1, y1) = units.min(0), units.max(0)
+        return bool(x1 >= 0 and y1 >= 0 and x0 <= UNITS_ACROSS and y0 <= self.height)
+
+
+def path_data(units: F64, closed: bool = False, tolerance: float = 1.5) -> str:
+    """Write a polyline as compact relative SVG path data, dropping points nearer than ``tolerance`` units to the line.
+
+    Args:
+        units: ``(N, 2)`` drawing units.
+    """
+    if len(units) < 2:
+        return ""
+    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(units), tolerance, preserve_topology=False))
+    whole = np.rint(kept).astype(int)
+    steps = np.diff(whole, axis=0)
+    steps = steps[np.any(steps != 0, axis=1)]
+    body = "".join(f"{dx}{dy:+d}".replace("+", " ") + " " for dx, dy in steps)
+    return f"M{whole[0, 0]} {whole[0, 1]}l{body}".strip() + ("z" if closed else "") if len(steps) else ""
+
+
+def scene_view(
+    scene: str,
+    content: Mapping[str, Any],
+    rollouts: Sequence[Rollout],
+    series: Series,
+    arm_of: Mapping[tuple[str, str], tuple[int, int]],
+) -> SceneView | None:
+    """Lay out one scene.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+        rollouts: The scene's rollouts.
+        series: Pose and event series, by cell.
+        arm_of: (renderer, policy) -> (colour index, dash index).
+
+    Returns:
+        The drawing; None where the scene has no logged drive of at least two points.
+    """
+    log = np.stack([np.asarray(content["ego_log"][k], float) for k in ("x_m", "y_m")], 1)
+    if len(log) < 2:
+        return None
+    driven = {r.cell: xy for r in rollouts if (xy := _driven(series.get(r.cell, {}))) is not None}
+    frame = _Frame(log, list(driven.values()))
+    names_policy = len({r.policy for r in rollouts}) > 1
+
+    def label(rollout: Rollout) -> str:
+        return " \u00b7 ".join([rollout.renderer, *([rollout.policy] if names_policy else []), f"seed {rollout.seed}"])
+
+    tracks = [
+        Track(*arm_of[r.renderer, r.policy], label(r), path_data(frame.units(driven[r.cell])))
+        for r in rollouts
+        if r.cell in driven and (r.renderer, r.policy) in arm_of
+    ]
+    vehicle = content.get("vehicle") or {}
+    marks = [_mark(e, frame, vehicle, arm_of, label(e.rollout)) for r in rollouts for e in events_of(r, series)]
+    bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
+    lanes = content.get("lanes") or []
+    return SceneView(
+        scene=scene,
+        width=UNITS_ACROSS,
+        height=frame.height,
+        unit_per_m=frame.scale,
+        lanes=_areas([_ring(lane) for lane in lanes], frame),
+        lines=_lines([lane.get(side) for lane in lanes for side in ("left", "right")], frame),
+        edges=_lines(content.get("road_edges") or [], frame),
+        crosswalks=_areas(content.get("crosswalks") or [], frame),
+        log=path_data(frame.units(log)),
+        tracks=tuple(tracks),
+        marks=tuple(marks),
+        bar_units=round(bar_m * frame.scale),
+        bar_label=f"{bar_m:.0f}\u00a0m",
+        north_deg=round(frame.north_deg, 1),
+        offset=_offset_chart(rollouts, series, arm_of, label),
+    )
+
+
+def _driven(own: Mapping[str, tuple[Any, F64]]) -> F64 | None:
+    if "ego_x_m" not in own or "ego_y_m" not in own:
+        return None
+    (tx, x), (ty, y) = own["ego_x_m"], own["ego_y_m"]
+    return np.stack([x, y], 1) if len(x) > 1 and np.array_equal(tx, ty) else None
+
+
+def _ring(lane: Mapping[str, Any]) -> list[list[float]]:
+    left, right = lane.get("left"), lane.get("right")
+    return [*left, *reversed(right)] if left and right else []
+
+
+def _lines(lines: Sequence[Sequence[Sequence[float]] | None], frame: _Frame) -> str:
+    drawn = []
+    for line in lines:
+        if line is not None and len(line) > 1:
+            units = frame.units(np.asarray(line, float)[:, :2])
+            if frame.sees(units):
+                drawn.append(path_data(units))
+    return "".join(dict.fromkeys(drawn))  # a boundary shared by two lanes is drawn once
+
+
+def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
+    """Write rings into one path, all turning the same way, so that overlapping rings add up instead of cutting holes."""
+    drawn = []
+    for ring in rings:
+        if len(ring) < 3:
+            continue
+        units = frame.units(np.asarray(ring, float)[:, :2])
+        if frame.sees(units):
+            x, y = units.T
+            turns_left = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) > 0
+            drawn.append(path_data(units if turns_left else units[::-1], closed=True))
+    return "".join(drawn)
+
+
+def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], arm_of: Mapping[tuple[str, str], tuple[int, int]], label: str) -> Mark:
+    arm = arm_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
+    when = f"at {fixed(event.t_s, 1)}\u00a0s" if event.t_s is not None else "at a time that no step shows"
+    if event.x_m is None or event.y_m is None:
+        return Mark(arm, event.kind, f"{label}: {event.what} {when}", None, None)
+    yaw = event.yaw_rad or 0.0
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    ahead = float(vehicle.get("rear_axle_to_centre_m") or 0.0) if event.yaw_rad is not None else 0.0
+    centre = np.array([[ahead, 0.0]]) @ turn + [event.x_m, event.y_m]
+    at = frame.units(centre)[0]
+    footprint = ""
+    if event.yaw_rad is not None and vehicle.get("length_m"):
+        half, wide = vehicle["length_m"] / 2, vehicle["width_m"] / 2
+        corners = np.array([[-half, -wide], [half, -wide], [half, wide], [-half, wide]])
+        footprint = path_data(frame.units(corners @ turn + centre), closed=True, tolerance=0.0)
+    where = f"x {fixed(centre[0, 0], 1)}, y {fixed(centre[0, 1], 1)}\u00a0m"
+    return Mark(arm, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint)
+
+
+def _offset_chart(rollouts: Sequence[Rollout], series: Series, arm_of: Mapping[tuple[str, str], tuple[int, int]], label: Any) -> OffsetChart | None:
+    own = {r.cell: series[r.cell]["lateral_offset_m"] for r in rollouts if "lateral_offset_m" in series.get(r.cell, {})}
+    if not own:
+        return None
+    reach = max(0.5, *(float(np.abs(v).max()) for _, v in own.values()))
+    reach = next((step for step in (0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0) if reach <= step), reach)
+    end_us = max(1, *(int(t[-1] - t[0]) for t, _ in own.values()))
+    tracks = []
+    for rollout in rollouts:
+        if rollout.cell in own and (rollout.renderer, rollout.policy) in arm_of:
+            t_us, offset = own[rollout.cell]
+            units = np.stack([(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / reach * 100.0], 1)
+            tracks.append(Track(*arm_of[rollout.renderer, rollout.policy], label(rollout), path_data(units, tolerance=0.7)))
+    return OffsetChart(tuple(tracks), f"{reach:g}", f"{end_us * 1e-6:.1f}")

@@ -1,0 +1,181 @@
+"""Say in one sentence what the run found, from the numbers of ``summary.json`` alone.
+
+The verdict words come from the paired comparison; this module never tests anything itself, so that the sentence and the table
+below it cannot disagree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
+from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
+from evaluators.report.run_folder import Run
+
+Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
+
+WORDS = {
+    "collision_at_fault": "at-fault collisions",
+    "collision_any": "collisions",
+    "offroad": "off-road rollouts",
+    "route_distance_m": "distance to the logged path",
+    "progress": "progress",
+}
+FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
+
+
+@dataclass(frozen=True)
+class Point:
+    """What was found for one renderer."""
+
+    name: str
+    tone: Tone
+    text: str
+    worse: tuple[str, ...] = ()
+    better: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The head of a report: a title, one point per renderer, and what a reader must know before using the numbers."""
+
+    title: str
+    tone: Tone
+    points: tuple[Point, ...] = ()
+    cautions: tuple[str, ...] = ()
+
+
+def find(run: Run) -> Finding:
+    """Derive the main finding of a run."""
+    done = sum(r.ok for r in run.rollouts)
+    if not run.rollouts:
+        return Finding("Nothing was run: the run folder holds no rollouts", "broken")
+    if done == 0:
+        return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run))
+    paired = {arm: pairs for arm, pairs in (run.summary.get("paired") or {}).items() if pairs}
+    points = tuple(_paired_point(run, arm, pairs) for arm, pairs in paired.items())
+    if points:
+        title = "; ".join(_clause(point, _baseline(paired[point.name])) for point in points[:3])
+        title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
+        tones = {point.tone for point in points}
+        order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
+        tone = next(t for t in order if t in tones)
+        return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, _cautions(run))
+    alone = tuple(Point(arm, "neutral", _alone(run, arm)) for arm in run.arms)
+    title = f"{alone[0].name} \u2013 {alone[0].text}" if len(alone) == 1 else f"{plural(len(alone), 'renderer')} driven, none compared with another"
+    return Finding(title, "neutral", alone if len(alone) > 1 else (), _cautions(run))
+
+
+def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
+    """Give the tone of one paired difference: its stated verdict, or where there is none whether its interval excludes zero.
+
+    Args:
+        entry: One metric of ``summary.json``'s ``paired``.
+        direction: "lower", "higher" or "none": which way is better.
+    """
+    stated = str(entry.get("verdict") or "").lower().replace("_", "-")
+    if stated:
+        known: dict[str, Tone] = {"worse": "worse", "better": "better", "superior": "better", "undecided": "unclear"}
+        return known.get(stated, "neutral")
+    difference = finite(entry.get("diff"))
+    bounds = interval(entry.get("ci95"), difference)
+    if difference is None or bounds is None or bounds[0] <= 0.0 <= bounds[1]:
+        return "unclear"
+    if direction not in ("lower", "higher"):
+        return "neutral"
+    return "worse" if (difference > 0) == (direction == "lower") else "better"
+
+
+def _clause(point: Point, baseline: str) -> str:
+    if point.tone == "worse":
+        return f"{point.name} drives worse than {baseline} in {_listing(point.worse)}"
+    if point.tone == "better":
+        return f"{point.name} drives better than {baseline} in {_listing(point.better)}"
+    if point.tone == "mixed":
+        return f"{point.name} is worse than {baseline} in {_listing(point.worse)} and better in {_listing(point.better)}"
+    if point.tone == "neutral":
+        return f"{point.name} drives no worse than {baseline}"
+    return f"no difference shown between {point.name} and {baseline}"
+
+
+def _listing(metrics: Sequence[str]) -> str:
+    words = [WORDS.get(m, m) for m in metrics]
+    return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
+
+
+def _baseline(pairs: Mapping[str, Any]) -> str:
+    return str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
+
+
+def _paired_point(run: Run, arm: str, pairs: Mapping[str, Any]) -> Point:
+    stats = run.summary.get("metrics", {}).get(arm, {})
+    lead = [m for m in HEADLINE if m in pairs and finite(pairs[m].get("diff")) is not None]
+    if "collision_at_fault" in lead and "collision_any" in lead:
+        lead.remove("collision_any")
+    lead = lead or [m for m in ordered(pairs) if finite(pairs[m].get("diff")) is not None]
+    tones = {m: tone_of(pairs[m], str(stats.get(m, {}).get("direction", "none"))) for m in lead}
+    said = [m for m in lead if tones[m] in ("worse", "better")]
+    kinds = {tones[m] for m in said}
+    tone: Tone = "mixed" if len(kinds) == 2 else next(iter(kinds)) if kinds else "unclear"
+    if not said and lead and all(t == "neutral" for t in tones.values()):
+        tone = "neutral"
+    shown = said[:3] or [m for m in lead if m != "progress"][:3]
+    text = "; ".join(_difference(run, arm, m, pairs[m]) for m in shown)
+    worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
+    return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better)
+
+
+def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any]) -> str:
+    here, there = (_level(run, name, metric) for name in (arm, str(entry.get("baseline"))))
+    stats = run.summary.get("metrics", {}).get(arm, {}).get(metric, {})
+    unit = str(stats.get("unit", ""))
+    scale, unit = (100.0, "points") if in_percent(metric, unit) else (1.0, unit)
+    difference = float(entry["diff"]) * scale
+    bounds = interval(entry.get("ci95"), float(entry["diff"]))
+    ends = (bounds[0] * scale, bounds[1] * scale) if bounds else ()
+    places = 1 if scale == 100.0 else decimals(difference, *ends, digits=2)
+    text = f"{WORDS.get(metric, metric)}: {here} against {there} ({fixed(difference, places, sign=True)}"
+    if ends:
+        text += f", 95\u00a0% interval {fixed(ends[0], places, sign=True)} to {fixed(ends[1], places, sign=True)}"
+    return f"{text}\u00a0{unit})" if unit else f"{text})"
+
+
+def _level(run: Run, arm: str, metric: str) -> str:
+    stats = run.summary.get("metrics", {}).get(arm, {}).get(metric, {})
+    mean, unit = finite(stats.get("mean")), str(stats.get("unit", ""))
+    if mean is None:
+        return "no valid value"
+    if is_rate(metric, unit):
+        counted = count_of(mean, int(stats.get("n_rollouts") or 0))
+        return counted if counted else f"{short(100 * mean)}\u00a0%"
+    return f"{short(100 * mean)}\u00a0%" if in_percent(metric, unit) else short(mean, unit)
+
+
+def _alone(run: Run, arm: str) -> str:
+    stats = run.summary.get("metrics", {}).get(arm, {})
+    names = [m for m in HEADLINE if m in stats and m != "progress"]
+    if "collision_at_fault" in names and "collision_any" in names:
+        names.remove("collision_at_fault")
+    return "; ".join(f"{WORDS.get(m, m)}: {_level(run, arm, m)}" for m in names) or "no metric"
+
+
+def _cautions(run: Run) -> tuple[str, ...]:
+    said = []
+    failed = [r for r in run.rollouts if not r.ok]
+    if failed:
+        classes: dict[str, int] = {}
+        for rollout in failed:
+            name = rollout.failure_class or "unknown cause"
+            classes[name] = classes.get(name, 0) + 1
+        causes = ", ".join(f"{name} {n}" for name, n in sorted(classes.items(), key=lambda item: -item[1]))
+        said.append(
+            f"{len(failed)} of {plural(len(run.rollouts), 'rollout')} could not be run ({causes}); they are in no average. See Failures."
+        )
+    scenes = {r.scene for r in run.rollouts if r.ok}
+    if len(scenes) == 1:
+        said.append("One scene only: the result says nothing about other scenes, and no interval over scenes exists.")
+    elif 1 < len(scenes) < FEW_SCENES:
+        said.append(f"Only {len(scenes)} scenes: intervals over scenes are wide and lean on few values.")
+    return tuple(said)

@@ -1,0 +1,166 @@
+"""Write ``report.html``: one file that opens from disk without a network."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from evaluators.report import sections, tables
+from evaluators.report.birdseye import SceneView, scene_view
+from evaluators.report.charts import drift_charts
+from evaluators.report.events import events_of, read_series
+from evaluators.report.files import write_whole
+from evaluators.report.frames import comparisons
+from evaluators.report.headline import find
+from evaluators.report.numbers import DASH, duration, plural
+from evaluators.report.run_folder import Run, Series, read_run
+
+MAX_SCENE_PLOTS = 24
+MAX_STRIP_SCENES = 8
+PLOT_BUDGET_BYTES = 1_500_000
+STRIP_BUDGET_BYTES = 1_500_000
+
+
+def write_report(run_dir: Path | str) -> Path:
+    """Write ``report.html`` into a run folder.
+
+    Args:
+        run_dir: A run folder (DESIGN section 5). Nothing else is read.
+
+    Returns:
+        Path of the report.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(run_dir)
+    path = run.folder / "report.html"
+    write_whole(path, render_report(run))
+    return path
+
+
+def render_report(run: Run) -> str:
+    """Render the report as a string."""
+    environment = Environment(
+        loader=PackageLoader("evaluators.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return environment.get_template("report.html.j2").render(
+        style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, **context(run)
+    )
+
+
+def context(run: Run) -> dict[str, Any]:
+    """Collect everything that the template prints."""
+    series = read_series(run)
+    interesting = by_interest(run, series)
+    arm_of = {(r, p): (i, j) for i, r in enumerate(run.renderers) for j, p in enumerate(run.policies)}
+    views, no_view = scene_views(run, series, interesting, arm_of)
+    strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
+    rows = tables.metric_rows(run.summary, run.invalid_reasons)
+    pairs = tables.pair_rows(run.summary)
+    scene_rows, more_scene_rows = sections.scene_rows(run)
+    failures, more_failures = sections.failure_rows(run)
+    headline = [row for row in rows if row.is_headline] or rows
+    return {
+        "run": run,
+        "title": ", ".join(run.renderers) or "empty run",
+        "when": _when(run.info.get("started_at")),
+        "finding": find(run),
+        "facts": _facts(run),
+        "columns": tables.columns(run),
+        "arm_colour": _arm_colours(run),
+        "headline_rows": headline,
+        "other_rows": [row for row in rows if row not in headline],
+        "headline_pairs": [p for p in pairs if p.metric in {row.name for row in headline}] or pairs,
+        "other_pairs": [p for p in pairs if headline and p.metric not in {row.name for row in headline}],
+        "renderers": run.renderers,
+        "policies": run.policies,
+        "charts": drift_charts(run.rollouts, series, arm_of),
+        "views": views,
+        "views_left_out": no_view,
+        "strips": strips,
+        "strips_left_out": no_strip,
+        "speed": sections.speed(run),
+        "scene_rows": scene_rows,
+        "more_scene_rows": more_scene_rows,
+        "scene_metrics": sections.SCENE_METRICS,
+        "failures": failures,
+        "more_failures": more_failures,
+        "provenance": sections.provenance(run),
+    }
+
+
+def by_interest(run: Run, series: Series) -> list[str]:
+    """Sort scenes by how much there is to see: events and failures first, then the largest distance from the logged path."""
+
+    def interest(scene: str) -> tuple[int, float]:
+        rollouts = [r for r in run.rollouts if r.scene == scene]
+        events = sum(len(events_of(r, series)) for r in rollouts if r.ok) + sum(not r.ok for r in rollouts)
+        far = [v for r in rollouts if (v := r.metrics.get("route_distance_m")) is not None]
+        return events, max(far, default=0.0)
+
+    return sorted(run.scenes, key=interest, reverse=True)
+
+
+def scene_views(
+    run: Run, series: Series, interesting: list[str], arm_of: Mapping[tuple[str, str], tuple[int, int]]
+) -> tuple[list[SceneView], list[str]]:
+    """Lay out the most telling scenes within the limits of count and size.
+
+    Returns:
+        The drawings in the order of the run, and the scenes that are not drawn.
+    """
+    drawn: dict[str, SceneView] = {}
+    spent = 0
+    for scene in interesting:
+        content = run.scene_data(scene)
+        rollouts = [r for r in run.rollouts if r.scene == scene]
+        if content is None or not rollouts or len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
+            continue
+        view = scene_view(scene, content, rollouts, series, arm_of)
+        if view is not None:
+            drawn[scene] = view
+            spent += len(view.lanes) + len(view.lines) + len(view.edges) + sum(len(t.d) for t in view.tracks)
+    return [drawn[s] for s in run.scenes if s in drawn], [s for s in run.scenes if s not in drawn]
+
+
+def _asset(environment: Environment, name: str) -> str:
+    if environment.loader is None:
+        raise RuntimeError("the template environment has no loader")
+    return environment.loader.get_source(environment, name)[0]
+
+
+def _when(text: Any) -> str:
+    try:
+        return datetime.fromisoformat(str(text)).strftime("%Y-%m-%d %H:%M %Z").strip()
+    except ValueError:
+        return str(text or "")
+
+
+def _arm_colours(run: Run) -> dict[str, int]:
+    """Give every column its renderer's colour."""
+    index = {name: i for i, name in enumerate(run.renderers)}
+    return {arm: index.get(next((r.renderer for r in run.rollouts_of(arm)), arm), i) for i, arm in enumerate(run.arms)}
+
+
+def _facts(run: Run) -> list[tuple[str, str]]:
+    done = sum(r.ok for r in run.rollouts)
+    wall = (run.summary.get("pool") or {}).get("wall_s")
+    facts = [
+        ("rollouts", f"{done} of {len(run.rollouts)} completed"),
+        ("scenes", str(len(run.scenes))),
+        ("seeds", str(len({r.seed for r in run.rollouts}))),
+        ("renderers", ", ".join(run.renderers) or DASH),
+        ("policy" if len(run.policies) == 1 else "policies", ", ".join(run.policies) or DASH),
+        ("preset", str(run.summary.get("preset") or run.info.get("preset") or DASH)),
+    ]
+    return [*facts, ("wall time", duration(float(wall)))] if isinstance(wall, int | float) else facts

@@ -1,0 +1,104 @@
+"""Write numbers for people: percent with counts, matching decimals, a true minus sign, and a dash with a reason for what is missing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+DASH = "\u2014"
+ARROWS = {"lower": "\u2193", "higher": "\u2191"}
+ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One printed number.
+
+    Attributes:
+        text: What is printed; an em dash where the number is missing.
+        note: Shown on hover: the reason of a missing number, or counts behind a present one.
+        detail: Second, smaller line (intervals); may be empty.
+        count: "7 of 300" for rates, else empty.
+        sort: Key for sorting; None sorts last.
+        tone: "worse", "better" or "" (nothing to say).
+    """
+
+    text: str
+    note: str = ""
+    detail: str = ""
+    count: str = ""
+    sort: float | None = None
+    tone: str = ""
+
+    @property
+    def missing(self) -> bool:
+        """Tell whether there is no number."""
+        return self.text == DASH
+
+
+def missing(reason: str) -> Cell:
+    """Make the cell of a number that does not exist."""
+    return Cell(DASH, note=reason or "not given in summary.json")
+
+
+def finite(value: Any) -> float | None:
+    """Return a finite float, or None for None, NaN, infinities and anything that is not a number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) else None
+
+
+def interval(value: Any, centre: float | None = None) -> tuple[float, float] | None:
+    """Read ``[low, high]``, or a half-width around ``centre``; None where either end is missing."""
+    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2:
+        low, high = finite(value[0]), finite(value[1])
+        return None if low is None or high is None else (low, high)
+    half = finite(value)
+    return None if half is None or centre is None else (centre - half, centre + half)
+
+
+def decimals(*values: float | None, digits: int = 3, most: int = 4) -> int:
+    """Choose how many decimals show ``digits`` significant digits of the largest of the values (at most ``most``)."""
+    largest = max((abs(v) for v in values if v is not None), default=0.0)
+    if largest == 0.0:
+        return 1
+    return min(most, max(0, digits - 1 - math.floor(math.log10(largest))))
+
+
+def fixed(value: float, places: int, sign: bool = False) -> str:
+    """Print with a fixed number of decimals, U+2212 as minus, and no negative zero."""
+    text = f"{abs(value):,.{places}f}".replace(",", "\u202f")
+    is_zero = not any(c in "123456789" for c in text)
+    if value < 0 and not is_zero:
+        return "\u2212" + text
+    return ("+" if sign and not is_zero else "") + text
+
+
+def short(value: float | None, unit: str = "", digits: int = 3) -> str:
+    """Print a lone number with a unit; a dash where missing."""
+    if value is None:
+        return DASH
+    return fixed(value, decimals(value, digits=digits)) + (f"\u00a0{unit}" if unit else "")
+
+
+def count_of(mean: float, n: int) -> str:
+    """Print "7 of 300" for a rate whose mean is a whole count; empty where it is not (a mean of scene means, say)."""
+    k = mean * n
+    return f"{round(k)} of {n}" if n > 0 and abs(k - round(k)) < 1e-6 * max(1.0, k) else ""
+
+
+def duration(seconds: float | None) -> str:
+    """Print a time span as s, min or h."""
+    if seconds is None:
+        return DASH
+    if seconds < 120:
+        return f"{short(seconds)}\u00a0s"
+    minutes = seconds / 60
+    return f"{fixed(minutes, 0)}\u00a0min" if minutes < 120 else f"{fixed(minutes / 60, 1)}\u00a0h"
+
+
+def plural(n: int, noun: str) -> str:
+    """Print a count with its noun."""
+    return f"{n}\u00a0{noun}" if n == 1 else f"{n}\u00a0{noun}s"

@@ -1,0 +1,282 @@
+"""Read a run folder into plain records; nothing here renders, scores or writes.
+
+The report is a pure reader: it works on a folder that was copied from another machine, without scenario files or weights.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as pads
+import pyarrow.parquet as pq
+
+from alpasim_plugin.errors import InputError
+
+KEY_COLUMNS = ("renderer", "policy", "scene", "seed")
+ROW_COLUMNS = (*KEY_COLUMNS, "status", "failure_class", "failure", "path", "wall_s", "frames", "steps")
+SEPARATORS = ("/", "|", " ", ":", "+")  # how a summary may join renderer and policy into one key
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One row of ``rollouts.parquet``.
+
+    Attributes:
+        metrics: Rollout values; None where the metric is invalid or was not computed.
+        path: Folder of the rollout relative to the run folder, POSIX separators.
+    """
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+    status: str
+    failure_class: str = ""
+    failure: str = ""
+    path: str = ""
+    wall_s: float | None = None
+    frames: int | None = None
+    steps: int | None = None
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Tell whether the rollout ran to its end."""
+        return self.status == "ok"
+
+    @property
+    def cell(self) -> tuple[str, str, str, int]:
+        """Give the key renderer, policy, scene, seed."""
+        return (self.renderer, self.policy, self.scene, self.seed)
+
+    def flag(self, *names: str) -> bool:
+        """Tell whether any of the named 0/1 metrics is 1."""
+        return any((self.metrics.get(name) or 0.0) >= 0.5 for name in names)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder in memory, except steps and scenes, which are read when asked for.
+
+    Attributes:
+        info: ``run.json``.
+        summary: ``summary.json``.
+        metric_names: Rollout metrics in the column order of ``rollouts.parquet``.
+    """
+
+    folder: Path
+    info: Mapping[str, Any]
+    summary: Mapping[str, Any]
+    rollouts: tuple[Rollout, ...]
+    metric_names: tuple[str, ...]
+
+    @property
+    def renderers(self) -> list[str]:
+        """List renderers in the order of the command."""
+        return _ordered(self.info.get("renderers"), (r.renderer for r in self.rollouts))
+
+    @property
+    def policies(self) -> list[str]:
+        """List policies in the order of the command."""
+        return _ordered(self.info.get("policies"), (r.policy for r in self.rollouts))
+
+    @property
+    def scenes(self) -> list[str]:
+        """List scene ids in the order of ``run.json``."""
+        return _ordered(self.info.get("scenes"), (r.scene for r in self.rollouts))
+
+    @property
+    def arms(self) -> list[str]:
+        """List the columns of the result tables: the keys under which ``summary.json`` holds metrics."""
+        return list(self.summary.get("metrics") or {}) or self.renderers
+
+    def rollouts_of(self, arm: str) -> list[Rollout]:
+        """List the rollouts that a summary key stands for.
+
+        Args:
+            arm: A renderer's name, or renderer and policy joined by one of `SEPARATORS`.
+        """
+        exact = [r for r in self.rollouts if any(arm == f"{r.renderer}{s}{r.policy}" for s in SEPARATORS)]
+        return exact or [r for r in self.rollouts if r.renderer == arm]
+
+    @cached_property
+    def _scene_files(self) -> dict[str, Path]:
+        found: dict[str, Path] = {}
+        for path in sorted((self.folder / "scenes").rglob("*.json")):
+            scene_id = read_json(path).get("scene_id")
+            if isinstance(scene_id, str):
+                found[scene_id] = path
+        return found
+
+    def scene_path(self, scene: str) -> Path | None:
+        """Find the file of a scene's map, whatever the writer did to slashes in its name; None where there is none."""
+        return self._scene_files.get(scene)
+
+    def scene_data(self, scene: str) -> Mapping[str, Any] | None:
+        """Read a scene's map and logged drive; None where the run has no such file."""
+        path = self.scene_path(scene)
+        return None if path is None else read_json(path)
+
+    def manifest(self, rollout: Rollout) -> Mapping[str, Any]:
+        """Read a rollout's manifest; empty where the rollout did not get so far."""
+        path = self.file_of(rollout, "manifest.json")
+        return {} if path is None else read_json(path)
+
+    def file_of(self, rollout: Rollout, name: str) -> Path | None:
+        """Find a file in a rollout's folder; None where absent or where the path leaves the run folder."""
+        if not rollout.path:
+            return None
+        path = self.folder / rollout.path / name
+        return path if path.is_file() and path.resolve().is_relative_to(self.folder.resolve()) else None
+
+    def href(self, rollout: Rollout, name: str = "") -> str | None:
+        """Give a relative link to a rollout's folder or to a file in it; None where it does not exist."""
+        if not rollout.path:
+            return None
+        target = self.folder / rollout.path / name
+        if not target.exists() or not target.resolve().is_relative_to(self.folder.resolve()):
+            return None
+        return quote(target.relative_to(self.folder).as_posix()) + ("" if name else "/")
+
+    def steps(self, metrics: Sequence[str], scenes: Sequence[str] | None = None, columns: Sequence[str] = ()) -> pa.Table:
+        """Read the named series from ``steps.parquet``.
+
+        Returns:
+            A table with renderer, policy, scene, seed, t_us, metric, value, valid and ``columns``; empty without the file.
+        """
+        wanted = [*KEY_COLUMNS, "t_us", "metric", "value", "valid", *columns]
+        path = self.folder / "steps.parquet"
+        if not path.is_file():
+            return pa.table({name: pa.array([], pa.string()) for name in wanted})
+        keep = pc.field("metric").isin(list(metrics))
+        if scenes is not None:
+            keep = keep & pc.field("scene").isin(list(scenes))
+        return pads.dataset(path).to_table(columns=wanted, filter=keep)
+
+    @cached_property
+    def invalid_reasons(self) -> dict[tuple[str, str], str]:
+        """Give the most frequent stated reason per (renderer, metric) for which steps are invalid."""
+        path = self.folder / "steps.parquet"
+        if not path.is_file():
+            return {}
+        table = pads.dataset(path).to_table(columns=["renderer", "metric", "reason"], filter=~pc.field("valid"))
+        if not table.num_rows:
+            return {}
+        counts = table.group_by(["renderer", "metric", "reason"]).aggregate([([], "count_all")]).sort_by("count_all")
+        rows = counts.to_pylist()  # ascending: the most frequent reason is written last
+        return {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
+
+
+Series = dict[tuple[str, str, str, int], dict[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]]
+
+
+def series_by_cell(table: pa.Table) -> Series:
+    """Split a step table into valid, time-sorted series.
+
+    Returns:
+        cell -> metric -> (``t_us (T,)``, ``value (T,)``).
+    """
+    table = table.filter(table["valid"]) if table.num_rows else table
+    if not table.num_rows:
+        return {}
+    keys = [*KEY_COLUMNS, "metric"]
+    table = table.sort_by([(name, "ascending") for name in (*keys, "t_us")])
+    columns = [table[name].to_pylist() for name in keys]
+    t_us = table["t_us"].to_numpy().astype(np.int64)
+    value = table["value"].to_numpy().astype(np.float64)
+    found: Series = {}
+    start = 0
+    rows = list(zip(*columns, strict=True))
+    for stop in range(1, len(rows) + 1):
+        if stop == len(rows) or rows[stop] != rows[start]:
+            renderer, policy, scene, seed, metric = rows[start]
+            found.setdefault((renderer, policy, scene, seed), {})[metric] = (t_us[start:stop], value[start:stop])
+            start = stop
+    return found
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: Absent, not JSON, or not an object.
+    """
+    doing = "reading a run folder"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(doing, str(path), "no such file", "give a folder written by simrun run or simrun score") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(doing, str(path), f"not JSON: {error}", "write the run again with the same command and --resume") from error
+    if not isinstance(content, dict):
+        raise InputError(doing, str(path), f"a {type(content).__name__}, not an object", "write the run again")
+    return content
+
+
+def read_run(run_dir: Path | str) -> Run:
+    """Read a run folder.
+
+    Args:
+        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json`` (DESIGN section 5).
+
+    Raises:
+        InputError: A file is absent or unreadable, or ``rollouts.parquet`` lacks a key column.
+    """
+    folder = Path(run_dir)
+    info = read_json(folder / "run.json")
+    summary = read_json(folder / "summary.json")
+    rollouts, names = _read_rollouts(folder / "rollouts.parquet")
+    return Run(folder, info, summary, rollouts, names)
+
+
+def _read_rollouts(path: Path) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
+    doing = "reading a run folder"
+    try:
+        table = pq.read_table(path)
+    except FileNotFoundError as error:
+        raise InputError(doing, str(path), "no such file", "finish the run: the same command with --resume writes it") from error
+    except pa.ArrowInvalid as error:
+        raise InputError(doing, str(path), f"not a parquet file: {error}", "finish the run: the same command with --resume") from error
+    lacking = [name for name in (*KEY_COLUMNS, "status") if name not in table.column_names]
+    if lacking:
+        raise InputError(doing, str(path), f"no column {', '.join(lacking)}", "write the run again with this version")
+    names = tuple(name.removesuffix("_valid") for name in table.column_names if name.endswith("_valid"))
+    rows = []
+    for row in table.to_pylist():
+        metrics = {m: _number(row.get(m)) if row[f"{m}_valid"] else None for m in names}
+        rows.append(
+            Rollout(
+                renderer=str(row["renderer"]),
+                policy=str(row["policy"]),
+                scene=str(row["scene"]),
+                seed=int(row["seed"]),
+                status=str(row["status"]),
+                failure_class=row.get("failure_class") or "",
+                failure=row.get("failure") or "",
+                path=(row.get("path") or "").strip("/"),
+                wall_s=_number(row.get("wall_s")),
+                frames=row.get("frames"),
+                steps=row.get("steps"),
+                metrics=metrics,
+            )
+        )
+    return tuple(rows), names
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and np.isfinite(value) else None
+
+
+def _ordered(stated: Any, seen: Any) -> list[str]:
+    names = [str(name) for name in stated] if stated else []
+    return list(dict.fromkeys([*names, *seen]))

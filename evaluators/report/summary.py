@@ -1,0 +1,94 @@
+"""Write ``summary.md``: the finding and the tables, for a CI job's page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from evaluators.report import sections, tables
+from evaluators.report.files import write_whole
+from evaluators.report.headline import find
+from evaluators.report.numbers import Cell
+from evaluators.report.run_folder import Run, read_run
+
+MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
+CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
+INTERVAL_NOTE = "\u00b1 is 1.96 \u03c3/\u221aN over rollouts; a to b is the 95 % interval with scenes as clusters."
+
+
+def write_summary_md(run_dir: Path | str) -> Path:
+    """Write ``summary.md`` into a run folder and return its path.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(run_dir)
+    path = run.folder / "summary.md"
+    write_whole(path, cut(summary_md(run)))
+    return path
+
+
+def summary_md(run: Run) -> str:
+    """Render the summary as Markdown, of any length."""
+    finding = find(run)
+    parts = [f"## {escape(finding.title)}\n"]
+    parts += [f"- **{escape(p.name)}**: {escape(p.text)}\n" for p in finding.points]
+    parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
+    rows = tables.metric_rows(run.summary, run.invalid_reasons)
+    if rows:
+        head = ["metric", *(f"{c.arm} ({c.n_rollouts} rollouts, {c.n_scenes} scenes)" for c in tables.columns(run))]
+        body = [[_label(r.name, r.unit, r.arrow), *(_cell(c) for c in r.cells)] for r in rows]
+        parts.append(f"\n### Results, preset {escape(str(run.summary.get('preset')))}\n\n{table(head, body)}\n{INTERVAL_NOTE}\n")
+    pairs = tables.pair_rows(run.summary)
+    if pairs:
+        head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
+        body = [[p.arm, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs]
+        parts.append(f"\n### Paired differences from {escape(pairs[0].baseline)}\n\n{table(head, body)}")
+    speed = sections.speed(run)
+    if speed.rows:
+        head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *speed.stages]
+        body = [[r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)] for r in speed.rows]
+        parts.append(f"\n### Speed\n\n{table(head, body)}" + (f"{escape(speed.pool)}\n" if speed.pool else ""))
+    failures, more = sections.failure_rows(run)
+    if failures:
+        head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
+        body = [
+            [f.rollout.failure_class, f.rollout.renderer, f.rollout.policy, f.rollout.scene, str(f.rollout.seed), "; ".join(f"{k}: {v}" for k, v in f.parts)]
+            for f in failures
+        ]
+        parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
+    command = sections.provenance(run).command
+    parts.append(f"\n### Made with\n\n```\n{command.replace('```', '')}\n```\n")
+    return "".join(parts)
+
+
+def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """Render a Markdown table."""
+    lines = [head, ["---"] * len(head), *body]
+    return "".join("| " + " | ".join(cell if i == 1 else escape(cell) for cell in line) + " |\n" for i, line in enumerate(lines))
+
+
+def escape(text: str) -> str:
+    """Make text safe in a Markdown table cell or line: no markup, no new line, no column."""
+    for char in "\\`*_[]<>|#~":
+        text = text.replace(char, "&lt;" if char == "<" else "&gt;" if char == ">" else f"\\{char}")
+    return " ".join(text.split())
+
+
+def cut(text: str, limit: int = MAX_BYTES) -> str:
+    """Cut at the end of a line so that the text with its note stays within ``limit`` bytes of UTF-8."""
+    data = text.encode()
+    if len(data) <= limit:
+        return text
+    kept = data[: limit - len(CUT_NOTE.encode())]
+    return kept[: kept.rfind(b"\n") + 1].decode() + CUT_NOTE
+
+
+def _label(name: str, unit: str, arrow: str) -> str:
+    return " ".join(part for part in (name, f"({unit})" if unit else "", arrow) if part)
+
+
+def _cell(cell: Cell) -> str:
+    if cell.missing:
+        return f"{cell.text} ({cell.note})" if cell.note else cell.text
+    return f"{cell.text}{f' ({cell.count})' if cell.count else ''}, {cell.detail}" if cell.detail else cell.text

@@ -1,0 +1,232 @@
+"""Turn a run into table rows: what is printed, in which order, with which hover text. No markup is made here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from evaluators.report.headline import tone_of
+from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, meaning, ordered
+from evaluators.report.numbers import (
+    ARROW_WORDS,
+    ARROWS,
+    Cell,
+    count_of,
+    decimals,
+    finite,
+    fixed,
+    interval,
+    missing,
+    plural,
+)
+from evaluators.report.run_folder import Run
+
+
+@dataclass(frozen=True)
+class Span:
+    """An interval on an axis that the rows of one table share, in percent of the axis width."""
+
+    centre: float
+    low: float | None = None
+    high: float | None = None
+    inner_low: float | None = None
+    inner_high: float | None = None
+    zero: float | None = None
+
+
+@dataclass(frozen=True)
+class MetricRow:
+    """One metric, one cell per arm."""
+
+    name: str
+    meaning: str
+    unit: str
+    arrow: str
+    arrow_word: str
+    cells: tuple[Cell, ...]
+    spans: tuple[Span | None, ...]
+    is_headline: bool
+    scale_text: str = ""
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """One paired difference."""
+
+    arm: str
+    baseline: str
+    metric: str
+    meaning: str
+    diff: Cell
+    interval: Cell
+    p_value: Cell
+    verdict: str
+    tone: str
+    span: Span | None
+
+
+def metric_rows(summary: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None) -> list[MetricRow]:
+    """Lay out metrics x arms from ``summary.json``.
+
+    Args:
+        summary: Content of ``summary.json``.
+        reasons: (renderer, metric) -> why it is invalid, for cells without a number.
+    """
+    arms = summary.get("metrics") or {}
+    rows = []
+    for name in ordered(m for metrics in arms.values() for m in metrics):
+        entries = [metrics.get(name) or {} for metrics in arms.values()]
+        unit = next((str(e["unit"]) for e in entries if e.get("unit")), "")
+        direction = next((str(e["direction"]) for e in entries if e.get("direction")), "none")
+        percent = in_percent(name, unit)
+        reason_of = [(reasons or {}).get((arm, name), "") for arm in arms]
+        places = 1 if percent else _places(entries)
+        cells = tuple(metric_cell(name, e, unit, places, why) for e, why in zip(entries, reason_of, strict=True))
+        spans, scale_text = _spans(entries, 100.0 if percent else 1.0, is_rate(name, unit), "%" if percent else unit)
+        rows.append(
+            MetricRow(
+                name=name,
+                meaning=meaning(name),
+                unit="%" if percent else unit,
+                arrow=ARROWS.get(direction, ""),
+                arrow_word=ARROW_WORDS.get(direction, "neither direction is better"),
+                cells=cells,
+                spans=spans,
+                is_headline=name in HEADLINE,
+                scale_text=scale_text,
+            )
+        )
+    return rows
+
+
+def metric_cell(name: str, entry: Mapping[str, Any], unit: str, places: int, reason: str = "") -> Cell:
+    """Print a mean with both intervals and, for rates, its count."""
+    mean = finite(entry.get("mean"))
+    n_rollouts, n_scenes = int(entry.get("n_rollouts") or 0), int(entry.get("n_scenes") or 0)
+    if mean is None:
+        stated = reason or str(entry.get("reason") or "")
+        return missing(stated or ("valid in no rollout" if entry else "not computed for this renderer"))
+    scale = 100.0 if in_percent(name, unit) else 1.0
+    half = finite(entry.get("ci95"))
+    clustered = interval(entry.get("ci95_clustered"))
+    detail = "\u00b1\u00a0" + (fixed(half * scale, places) if half is not None else "\u2014")
+    if clustered is None:
+        detail += " \u00b7 \u2014"
+    else:
+        low, high = (fixed(v * scale, places) for v in clustered)
+        detail += f" \u00b7 {low} to {high}"
+    notes = [f"{plural(n_rollouts, 'rollout')}, {plural(n_scenes, 'scene')}"]
+    if half is None:
+        notes.append("no \u00b1: it needs at least two rollouts")
+    if clustered is None:
+        notes.append("no interval over scenes: it needs at least two scenes")
+    count = count_of(mean, n_rollouts) if is_rate(name, unit) else ""
+    return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
+
+
+def _places(entries: list[Mapping[str, Any]]) -> int:
+    halves = [h for e in entries if (h := finite(e.get("ci95")))]
+    means = [m for e in entries if (m := finite(e.get("mean")))]
+    return max(decimals(*means, digits=3), decimals(*halves, digits=2)) if halves else decimals(*means, digits=3)
+
+
+def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str) -> tuple[tuple[Span | None, ...], str]:
+    """Place means and both intervals of one metric on one axis that includes zero."""
+    values: list[float] = [0.0]
+    for e in entries:
+        mean = finite(e.get("mean"))
+        if mean is not None:
+            values.append(mean)
+            for bounds in (interval(e.get("ci95"), mean), interval(e.get("ci95_clustered"))):
+                values += bounds or ()
+    low, high = min(values), max(values)
+    if rate:
+        low, high = max(low, 0.0), min(max(high, 0.02), 1.0)
+    if high <= low:
+        return tuple(None for _ in entries), ""
+
+    def place(value: float) -> float:
+        return round(100.0 * (min(max(value, low), high) - low) / (high - low), 2)
+
+    spans: list[Span | None] = []
+    for e in entries:
+        mean = finite(e.get("mean"))
+        if mean is None:
+            spans.append(None)
+            continue
+        outer, inner = interval(e.get("ci95_clustered")), interval(e.get("ci95"), mean)
+        spans.append(
+            Span(
+                place(mean),
+                place(outer[0]) if outer else None,
+                place(outer[1]) if outer else None,
+                place(inner[0]) if inner else None,
+                place(inner[1]) if inner else None,
+                place(0.0) if low < 0.0 else None,
+            )
+        )
+    places = 0 if scale == 100.0 and high >= 0.1 else decimals(low * scale, high * scale, digits=2)
+    tail = f"\u00a0{unit}" if unit else ""
+    return tuple(spans), f"{fixed(low * scale, places)} to {fixed(high * scale, places)}{tail}"
+
+
+def pair_rows(summary: Mapping[str, Any]) -> list[PairRow]:
+    """Lay out the paired differences, headline metrics first within each arm."""
+    rows = []
+    for arm, pairs in (summary.get("paired") or {}).items():
+        for name in ordered(pairs):
+            entry = pairs[name] or {}
+            stats = (summary.get("metrics") or {}).get(arm, {}).get(name, {})
+            rows.append(_pair_row(arm, name, entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
+    return rows
+
+
+def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, direction: str) -> PairRow:
+    diff = finite(entry.get("diff"))
+    bounds = interval(entry.get("ci95"), diff)
+    scale, unit = (100.0, "points") if in_percent(name, unit) else (1.0, unit)
+    tail = f"\u00a0{unit}" if unit else ""
+    n_pairs = entry.get("n_pairs")
+    note = plural(int(n_pairs), "pair") if n_pairs is not None else ""
+    diff_cell, bounds_cell, span = missing(str(entry.get("reason") or "no pair has this metric valid on both sides")), missing(
+        "it needs at least two scenes"
+    ), None
+    if diff is not None:
+        ends = bounds or ()
+        places = 1 if scale == 100.0 else decimals(*(v * scale for v in (diff, *ends)), digits=3)
+        diff_cell = Cell(fixed(diff * scale, places, sign=True) + tail, note, sort=diff * scale)
+        if bounds is not None:
+            low, high = (fixed(v * scale, places, sign=True) for v in bounds)
+            bounds_cell = Cell(f"{low} to {high}", note, sort=bounds[1] - bounds[0])
+            reach = max(abs(bounds[0]), abs(bounds[1]), abs(diff)) or 1.0
+            span = Span(*(round(50 + 46 * v / reach, 2) for v in (diff, *bounds)), zero=50.0)
+    p = finite(entry.get("p_value"))
+    p_cell = missing("no test: it needs at least two scenes with a difference") if p is None else Cell(_p_text(p), sort=p)
+    tone = tone_of(entry, direction)
+    verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
+    return PairRow(arm, str(entry.get("baseline") or "\u2014"), name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span)
+
+
+def _p_text(p: float) -> str:
+    return "< 0.001" if p < 0.001 else fixed(p, 3)
+
+
+@dataclass(frozen=True)
+class Column:
+    """Head of a result column."""
+
+    arm: str
+    n_rollouts: int
+    n_failed: int
+    n_scenes: int
+
+
+def columns(run: Run) -> list[Column]:
+    """Describe each arm: how many rollouts and scenes stand behind its column."""
+    heads = []
+    for arm in run.arms:
+        rollouts = run.rollouts_of(arm)
+        done = [r for r in rollouts if r.ok]
+        heads.append(Column(arm, len(done), len(rollouts) - len(done), len({r.scene for r in done})))
+    return heads

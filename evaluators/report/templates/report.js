@@ -1,0 +1,73 @@
+"use strict";
+(() => {
+  const root = document.documentElement;
+  const all = (selector, from = document) => [...from.querySelectorAll(selector)];
+
+  // Theme: automatic, dark, light. Storage may be refused for files; the choice then lasts as long as the page.
+  const themes = ["auto", "dark", "light"];
+  const button = document.getElementById("theme");
+  const store = (act) => { try { return act(window.localStorage); } catch { return null; } };
+  const setTheme = (name) => {
+    if (name === "auto") delete root.dataset.theme; else root.dataset.theme = name;
+    button.textContent = "Theme: " + name;
+    button.dataset.name = name;
+    store((s) => s.setItem("simrun-theme", name));
+  };
+  const saved = store((s) => s.getItem("simrun-theme"));
+  setTheme(themes.includes(saved) ? saved : "auto");
+  button.addEventListener("click", () => setTheme(themes[(themes.indexOf(button.dataset.name) + 1) % 3]));
+
+  // Sorting: numbers by data-v, text by the alphabet with numbers in it; cells without a value stay last.
+  const compare = new Intl.Collator("en", { numeric: true }).compare;
+  const key = (row, column) => {
+    const cell = row.children[column];
+    const text = cell.dataset.v ?? cell.textContent.trim();
+    if (text === "" || text === "\u2014") return null;
+    return cell.dataset.v !== undefined && !Number.isNaN(Number(text)) ? Number(text) : text;
+  };
+  for (const sorter of all("th .sort")) {
+    sorter.addEventListener("click", () => {
+      const head = sorter.closest("th");
+      const column = [...head.parentNode.children].indexOf(head);
+      const up = head.getAttribute("aria-sort") !== "ascending";
+      all("th", head.parentNode).forEach((other) => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", up ? "ascending" : "descending");
+      const body = head.closest("table").tBodies[0];
+      const rows = [...body.rows].map((row) => [key(row, column), row]);
+      rows.sort(([a], [b]) => {
+        if (a === null || b === null) return (a === null) - (b === null);
+        const order = typeof a === "number" && typeof b === "number" ? a - b : compare(String(a), String(b));
+        return up ? order : -order;
+      });
+      body.append(...rows.map(([, row]) => row));
+    });
+  }
+
+  // Filter: every word must occur in the row.
+  for (const input of all("input[data-filter]")) {
+    input.addEventListener("input", () => {
+      const words = input.value.toLowerCase().split(/\s+/).filter(Boolean);
+      for (const row of document.getElementById(input.dataset.filter).tBodies[0].rows) {
+        const text = row.textContent.toLowerCase();
+        row.hidden = !words.every((word) => text.includes(word));
+      }
+    });
+  }
+
+  // Legend: show or hide one renderer's drives in every map.
+  for (const toggle of all("button[data-arm]")) {
+    toggle.addEventListener("click", () => {
+      const shown = toggle.getAttribute("aria-pressed") !== "true";
+      toggle.setAttribute("aria-pressed", String(shown));
+      document.getElementById("views").classList.toggle("no-arm-" + toggle.dataset.arm, !shown);
+    });
+  }
+
+  // Copy: the clipboard may be refused for files; the command is then selected instead.
+  const copy = document.getElementById("copy");
+  copy?.addEventListener("click", async () => {
+    const command = document.getElementById("command");
+    try { await navigator.clipboard.writeText(command.textContent); copy.textContent = "Copied"; }
+    catch { window.getSelection().selectAllChildren(command); copy.textContent = "Selected"; }
+  });
+})();

@@ -1,0 +1,51 @@
+"""The result table for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from evaluators.report.numbers import Cell, plural
+from evaluators.report.tables import metric_rows
+
+MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts \u00b7 a to b: 95 % with scenes as clusters"
+
+
+def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Table:
+    """Lay out metrics x renderers with mean and both 95 % intervals.
+
+    Args:
+        summary: Content of ``summary.json``.
+        headline_only: Leave out all but the headline metrics, where any of them is there.
+
+    Returns:
+        A rich table; print it with ``rich.print`` or a Console (80 columns fit two renderers).
+    """
+    rows = metric_rows(summary)
+    if headline_only and any(row.is_headline for row in rows):
+        rows = [row for row in rows if row.is_headline]
+    table = Table(box=box.SIMPLE_HEAD, caption=MARGIN_NOTE, caption_justify="left", pad_edge=False)
+    table.add_column(Text(f"preset {summary.get('preset', '?')}", style="dim"), overflow="fold")
+    for arm, entries in (summary.get("metrics") or {}).items():
+        counts = [(int(e.get("n_rollouts") or 0), int(e.get("n_scenes") or 0)) for e in entries.values()]
+        n_rollouts, n_scenes = max(counts, default=(0, 0))
+        head = Text(arm, style="bold") + Text(f"\n{plural(n_rollouts, 'rollout')}\n{plural(n_scenes, 'scene')}", style="dim")
+        table.add_column(head, justify="right", overflow="fold")
+    for row in rows:
+        label = Text(row.name, style="bold" if row.is_headline else "")
+        label.append(f" {row.unit}" if row.unit else "", style="dim").append(f" {row.arrow}" if row.arrow else "", style="dim")
+        table.add_row(label, *(_cell(cell) for cell in row.cells))
+    return table
+
+
+def _cell(cell: Cell) -> Text:
+    if cell.missing:
+        return Text(cell.text, style="dim")
+    text = Text(cell.text)
+    if cell.count:
+        text.append(f" ({cell.count})")
+    return text.append(f"\n{cell.detail}".replace(" to ", "\u00a0to\u00a0").replace("\u00b1\u00a0", "\u00b1"), style="dim")

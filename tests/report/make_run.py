@@ -1,0 +1,355 @@
+"""Make run folders as the runtime writes them, with drives and pictures made up from a seed, so that the report can be tested alone."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy import stats
+
+METRICS = {  # name -> unit, direction
+    "collision_any": ("", "lower"),
+    "collision_at_fault": ("", "lower"),
+    "collision_front": ("", "lower"),
+    "collision_lateral": ("", "lower"),
+    "collision_rear": ("", "lower"),
+    "offroad": ("", "lower"),
+    "route_distance_m": ("m", "lower"),
+    "progress": ("", "higher"),
+    "dist_to_gt_location": ("m", "lower"),
+    "min_distance_to_obstacle_m": ("m", "higher"),
+    "plan_deviation": ("m", "lower"),
+    "offroad_margin_m": ("m", "higher"),
+    "contact_time_s": ("s", "none"),
+}
+PAIRED = ("collision_any", "collision_at_fault", "offroad", "route_distance_m", "progress", "plan_deviation")
+STAGES = {"render": 0.62, "policy": 0.2, "fixer": 0.0, "log": 0.1, "control": 0.01, "actors": 0.03}
+DT_US = 100_000
+
+
+@dataclass
+class Plan:
+    """What to make."""
+
+    renderers: Sequence[str] = ("clean", "3dgs", "onefixer")
+    policies: Sequence[str] = ("lane-camera",)
+    scenes: Sequence[str] = ("smoke/straight", "urban/left-turn", "hard/narrow-gap-with-parked-cars", "USA_US101-3_3_T-1")
+    seeds: Sequence[int] = (0, 1, 2)
+    steps: int = 120
+    fail: Sequence[tuple[str, str, int]] = ()  # (renderer, scene, seed)
+    failure: str = (
+        "error: rendering a frame\n   with: camera front, t = 3.400000 s\n  found: 1204 NaN pixels <b>&\n     do: run with --set guard=off"
+    )
+    invalid: Sequence[str] = ("min_distance_to_obstacle_m",)  # metrics that are invalid in the first scene
+    pictures: bool = True
+    clips: bool = True
+    picture_px: tuple[int, int] = (256, 144)
+    harm: dict[str, float] = field(default_factory=lambda: {"clean": 0.15, "3dgs": 2.6, "onefixer": 0.45})
+    rng_seed: int = 7
+
+
+def make_run(folder: Path, plan: Plan | None = None) -> Path:
+    """Write a run folder and return it."""
+    plan = plan or Plan()
+    rng = np.random.default_rng(plan.rng_seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    maps = {scene: _scene(scene, index, plan) for index, scene in enumerate(plan.scenes)}
+    for scene, content in maps.items():
+        _json(folder / "scenes" / f"{_slug(scene)}.json", content)
+    rows, steps = [], []
+    for scene, content in maps.items():
+        for seed in plan.seeds:
+            wander = np.cumsum(rng.normal(0, 1, plan.steps)) * 0.02  # shared by the renderers: pairs are sharp
+            for renderer in plan.renderers:
+                for policy in plan.policies:
+                    row, series = _rollout(renderer, policy, scene, seed, content, wander, plan, rng)
+                    rows.append(row)
+                    steps += series
+                    _files(folder, row, content, plan)
+    _write_rows(folder, rows)
+    _write_steps(folder, steps)
+    _json(folder / "run.json", _run_json(plan, maps))
+    _json(folder / "summary.json", summary_of(rows, plan))
+    return folder
+
+
+def _slug(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "._@+-" else "-" for c in name).strip("-.") or "unnamed"
+
+
+def _json(path: Path, value: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value, indent=1, allow_nan=False))
+
+
+def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
+    length_m = 8.0 * plan.steps * 0.1
+    s = np.linspace(-15, length_m + 30, 160)
+    bend = (0.0, 0.014, -0.006, 0.003)[index % 4]
+    yaw = bend * np.clip(s - 30, 0, 90)
+    ds = np.diff(s, prepend=s[0])
+    centre = np.stack([np.cumsum(np.cos(yaw) * ds), np.cumsum(np.sin(yaw) * ds)], 1) + [1000.0 * index, -400.0]
+    normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
+    lanes = []
+    for lane in range(3):
+        mid = centre + normal * 3.6 * (lane - 0.5 if index % 2 else lane)
+        lanes.append(
+            {
+                "id": f"lane-{lane}",
+                "kind": "vehicle",
+                "centre": np.round(mid, 2).tolist(),
+                "left": np.round(mid + normal * 1.8, 2).tolist(),
+                "right": np.round(mid - normal * 1.8, 2).tolist() if lane or index != 2 else None,
+                "paint": ["dashed_white", "solid_white"],
+            }
+        )
+    mid = np.array(lanes[0]["centre"])
+    edges = [np.round(mid - normal * 2.1, 2).tolist(), np.round(mid + normal * 9.4, 2).tolist()]
+    at = mid[60]
+    ring = [(at + normal[60] * a + np.array([math.cos(yaw[60]), math.sin(yaw[60])]) * b).tolist() for a, b in ((-2, 0), (9, 0), (9, 3), (-2, 3))]
+    drive = np.stack([np.interp(np.linspace(0, length_m, plan.steps), s, mid[:, k]) for k in (0, 1)], 1)
+    return {
+        "scene_id": scene,
+        "source": "commonroad" if scene.startswith("USA") else "yaml",
+        "content_hash": f"{index:02d}" * 32,
+        "notes": ["2 signs without a shape left out"],
+        "start_us": 0,
+        "end_us": plan.steps * DT_US,
+        "warmup_us": 500_000,
+        "lanes": lanes,
+        "road_edges": edges,
+        "crosswalks": [ring] if index == 1 else [],
+        "ego_log": {
+            "t_us": [k * DT_US for k in range(plan.steps)],
+            "x_m": np.round(drive[:, 0], 3).tolist(),
+            "y_m": np.round(drive[:, 1], 3).tolist(),
+        },
+        "vehicle": {"length_m": 4.855, "width_m": 1.88, "rear_axle_to_centre_m": 1.4},
+    }
+
+
+def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type: ignore[no-untyped-def]
+    key = {"renderer": renderer, "policy": policy, "scene": scene, "seed": seed}
+    row: dict[str, Any] = key | {
+        "path": f"rollouts/{_slug(renderer)}/{_slug(policy)}/{_slug(scene)}/{seed}",
+        "wall_s": round(float(rng.uniform(2.0, 6.0)), 3),
+        "frames": plan.steps,
+        "steps": plan.steps,
+        "status": "ok",
+        "failure_class": None,
+        "failure": None,
+    }
+    if (renderer, scene, seed) in plan.fail:
+        row |= {"status": "failed", "failure_class": "renderer", "failure": plan.failure, "frames": 34, "steps": 34}
+        row |= {m: None for m in METRICS} | {f"{m}_valid": False for m in METRICS}
+        return row, []
+    harm = plan.harm.get(renderer, 0.8) * (1.6 if "hard" in scene else 1.0)
+    t = np.arange(plan.steps)
+    offset = (wander * (0.6 + harm) + rng.normal(0, 0.015 * harm, plan.steps).cumsum()) * np.clip((t - 5) / 25, 0, 1)
+    xy = np.stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]], 1)
+    tangent = np.gradient(xy, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    ego = xy + offset[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], 1)
+    off = offset < -1.1
+    hit = offset > 1.6
+    end = min([plan.steps, *(int(np.argmax(flag)) + 1 for flag in (off, hit) if flag.any())])
+    series = {
+        "ego_x_m": ego[:, 0],
+        "ego_y_m": ego[:, 1],
+        "ego_yaw_rad": np.arctan2(tangent[:, 1], tangent[:, 0]),
+        "ego_speed_mps": np.full(plan.steps, 8.0),
+        "lateral_offset_m": offset,
+        "opacity_mean": np.clip(0.995 - 0.04 * harm * np.abs(offset), 0, 1),
+        "collision_any": hit.astype(float),
+        "collision_at_fault": hit.astype(float),
+        "offroad": off.astype(float),
+    }
+    steps = [
+        key | {"t_us": k * DT_US, "metric": m, "value": float(v[k]), "valid": True, "reason": ""}
+        for m, v in series.items()
+        for k in range(plan.steps)
+    ]
+    collided = bool(hit[:end].any())
+    values: dict[str, float | None] = {
+        "collision_any": float(collided),
+        "collision_at_fault": float(collided),
+        "collision_front": 0.0,
+        "collision_lateral": float(collided),
+        "collision_rear": 0.0,
+        "offroad": float(off[:end].any()),
+        "route_distance_m": float(np.abs(offset[:end]).mean()),
+        "progress": end / plan.steps,
+        "dist_to_gt_location": float(np.abs(offset[:end]).mean() + 0.4),
+        "min_distance_to_obstacle_m": float(max(0.0, 1.6 - np.abs(offset[:end]).max())),
+        "plan_deviation": float(0.05 + 0.04 * harm + rng.uniform(0, 0.02)),
+        "offroad_margin_m": float(1.1 + offset[:end].min()),
+        "contact_time_s": float(np.argmax(hit) * 0.1) if collided else None,
+    }
+    if scene == plan.scenes[0]:
+        values |= dict.fromkeys(plan.invalid)
+        steps += [
+            key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "no other road user within 50 m"} for m in plan.invalid
+        ]
+    steps += [
+        key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "no contact in this rollout"}
+        for m in ("contact_time_s",)
+        if values[m] is None
+    ]
+    row |= values | {f"{m}_valid": v is not None for m, v in values.items()}
+    return row, steps
+
+
+def _files(folder: Path, row: dict[str, Any], content: dict[str, Any], plan: Plan) -> None:
+    place = folder / row["path"]
+    place.mkdir(parents=True, exist_ok=True)
+    times = [int(k * plan.steps * DT_US / 4) for k in range(4)]
+    _json(place / "manifest.json", {"status": row["status"], "path": row["path"], "strip_t_us": times, "events": []})
+    if plan.pictures and row["status"] == "ok":
+        width, height = plan.picture_px
+        frames = [_picture(row["renderer"], k, width, height) for k in range(4)]
+        cv2.imwrite(str(place / "strip.jpg"), np.concatenate(frames, 1), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    if plan.clips and row["status"] == "ok" and row["seed"] == plan.seeds[0]:
+        (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
+
+
+def _picture(renderer: str, k: int, width: int, height: int) -> np.ndarray:
+    image = np.zeros((height, width, 3), np.uint8)
+    horizon = int(height * 0.45)
+    image[:horizon] = np.linspace((225, 190, 150), (240, 225, 205), horizon)[:, None]
+    image[horizon:] = (98, 96, 94)
+    vanish = np.array([width * (0.5 + 0.01 * k), horizon])
+    for x, colour in ((-0.1, (235, 235, 235)), (0.62, (235, 235, 235)), (1.3, (120, 150, 120))):
+        cv2.line(image, vanish.astype(int).tolist(), (int(x * width), height), colour, max(1, width // 120), cv2.LINE_AA)
+    for side, tone in ((-1, (120, 140, 165)), (1, (140, 130, 120))):
+        x = int(width * (0.5 + side * 0.36))
+        cv2.rectangle(image, (x - width // 9, horizon - height // 3), (x + width // 9, horizon + height // 12), tone, -1)
+    car = width // 14 + k * width // 60
+    cv2.rectangle(image, (int(vanish[0]) - car, horizon), (int(vanish[0]) + car, horizon + car), (60, 40, 130), -1)
+    if renderer == "3dgs":
+        image = cv2.GaussianBlur(image, (0, 0), 1.5 + 1.2 * k)
+    elif renderer == "onefixer":
+        image = cv2.GaussianBlur(image, (0, 0), 0.7)
+    return image
+
+
+def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
+    fields = [("renderer", pa.string()), ("policy", pa.string()), ("scene", pa.string()), ("seed", pa.int64()), ("status", pa.string())]
+    fields += [("failure_class", pa.string()), ("failure", pa.string()), ("path", pa.string()), ("wall_s", pa.float64())]
+    fields += [("frames", pa.int64()), ("steps", pa.int64())]
+    for name in METRICS:
+        fields += [(name, pa.float64()), (f"{name}_valid", pa.bool_())]
+    schema = pa.schema(fields)
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), folder / "rollouts.parquet")
+
+
+def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
+    schema = pa.schema(
+        [("renderer", pa.string()), ("policy", pa.string()), ("scene", pa.string()), ("seed", pa.int64()), ("t_us", pa.int64())]
+        + [("metric", pa.string()), ("value", pa.float64()), ("valid", pa.bool_()), ("reason", pa.string())]
+    )
+    pq.write_table(pa.Table.from_pylist(steps, schema=schema), folder / "steps.parquet", compression="zstd")
+
+
+def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
+    """Aggregate with plain formulas; the real aggregation has its own tests."""
+    metrics: dict[str, Any] = {}
+    paired: dict[str, Any] = {}
+    baseline = plan.renderers[0] if plan.renderers else ""
+    for renderer in plan.renderers:
+        of = [r for r in rows if r["renderer"] == renderer]
+        metrics[renderer] = {m: _mean(of, m) for m in METRICS}
+        if renderer != baseline:
+            against = [r for r in rows if r["renderer"] == baseline]
+            paired[renderer] = {m: _pair(of, against, m, baseline) for m in PAIRED}
+    failed = [r for r in rows if r["status"] != "ok"]
+    speed = {
+        renderer: {
+            "ms_per_frame_p50": 14.0 + 9.0 * k,
+            "ms_per_frame_p95": 19.0 + 13.5 * k,
+            "frames_per_s": 1000 / (15.0 + 9.5 * k),
+            "first_frame_ms": 310.0 + 80 * k,
+            "stages": {
+                s: {"p50_ms": round(share * (14.0 + 9 * k), 3), "p95_ms": round(share * (19.0 + 13 * k), 3), "share": share}
+                for s, share in STAGES.items()
+                if share
+            },
+        }
+        for k, renderer in enumerate(plan.renderers)
+        if rows
+    }
+    return {
+        "preset": "paper",
+        "metrics": metrics,
+        "paired": paired,
+        "censoring": {},
+        "failures": {"n": len(failed)},
+        "speed": speed,
+        "pool": {"workers": 2, "threads_per_worker": 1, "frames_per_s_total": 41.2, "wall_s": sum(r["wall_s"] for r in rows) / 2},
+    }
+
+
+def _mean(rows: list[dict[str, Any]], metric: str) -> dict[str, Any]:
+    unit, direction = METRICS[metric]
+    good = [r for r in rows if r[f"{metric}_valid"]]
+    values = np.array([r[metric] for r in good], float)
+    scenes = sorted({r["scene"] for r in good})
+    facts = {"n_rollouts": len(good), "n_scenes": len(scenes), "unit": unit, "direction": direction}
+    if not good:
+        return {"mean": None, "ci95": None, "ci95_clustered": None, "reason": "valid in no rollout", **facts}
+    means = np.array([np.mean([r[metric] for r in good if r["scene"] == s]) for s in scenes])
+    return {
+        "mean": float(values.mean()),
+        "ci95": float(1.96 * values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else None,
+        "ci95_clustered": _t_interval(means),
+        **facts,
+    }
+
+
+def _t_interval(means: np.ndarray) -> list[float] | None:
+    if len(means) < 2:
+        return None
+    half = float(stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means)))
+    return [float(means.mean() - half), float(means.mean() + half)]
+
+
+def _pair(of: list[dict[str, Any]], against: list[dict[str, Any]], metric: str, baseline: str) -> dict[str, Any]:
+    other = {(r["policy"], r["scene"], r["seed"]): r for r in against if r[f"{metric}_valid"]}
+    cells = [(r, other[(r["policy"], r["scene"], r["seed"])]) for r in of if r[f"{metric}_valid"] and (r["policy"], r["scene"], r["seed"]) in other]
+    if not cells:
+        return {"baseline": baseline, "diff": None, "ci95": None, "p_value": None, "verdict": "undecided"}
+    scenes = sorted({r["scene"] for r, _ in cells})
+    means = np.array([np.mean([a[metric] - b[metric] for a, b in cells if a["scene"] == s]) for s in scenes])
+    ci = _t_interval(means)
+    diff = float(np.mean([a[metric] - b[metric] for a, b in cells]))
+    sign = -1 if METRICS[metric][1] == "higher" else 1
+    verdict = "undecided"
+    if ci is not None and (ci[0] > 0 or ci[1] < 0):
+        verdict = "worse" if sign * diff > 0 else "better"
+    p = float(stats.ttest_1samp(means, 0).pvalue) if len(means) > 1 and means.std() > 0 else None
+    return {"baseline": baseline, "diff": diff, "ci95": ci, "p_value": p, "verdict": verdict, "n_pairs": len(cells)}
+
+
+def _run_json(plan: Plan, maps: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "schema_version": 1,
+        "command": ["simrun", "run", "--renderer", ",".join(plan.renderers), "--policy", ",".join(plan.policies), "--seeds", "3", "smoke.yaml"],
+        "version": "0.1.0",
+        "started_at": "2025-03-04T09:12:44+00:00",
+        "preset": "paper",
+        "config": {"preset": "paper", "images": "jpeg", "video": "none", "workers": 2},
+        "scenes": {s: {"source": m["source"], "content_hash": m["content_hash"], "notes": m["notes"]} for s, m in maps.items()},
+        "renderers": list(plan.renderers),
+        "policies": list(plan.policies),
+        "seeds": list(plan.seeds),
+        "hardware": {"cpu": "Example CPU @ 2.6 GHz", "cores": 2, "memory_gib": 16.0, "gpu": None},
+        "versions": {"python": "3.11.9", "numpy": "2.1.0", "torch": "2.11.0"},
+        "left_out": ["cameras: side-left, side-right (no policy takes them)", "actors: 14 never seen by a camera"],
+    }
