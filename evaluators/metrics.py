@@ -39,7 +39,7 @@ METRICS: dict[str, MetricInfo] = {
     "collision_rear": _flag("an actor touches the rear bumper and not the front one"),
     "min_distance_to_obstacle_m": MetricInfo("m", "higher", "min", "least plan-view gap between the ego and any actor"),
     "offroad": _flag("outside all nearby lanes and their union while touching a road edge"),
-    "wrong_lane": _flag("ego centre in a nearby lane whose direction differs by more than 120 degrees"),
+    "wrong_lane": _flag("the lanes under the ego centre run against it (by more than 120 degrees)"),
     "min_distance_to_lane_boundary_m": MetricInfo("m", "higher", "min", "gap to the border of the joined nearby lanes; 0 when not inside"),
     "dist_to_gt_trajectory": MetricInfo("m", "lower", "max", "distance of the ego centre from the recorded path"),
     "route_distance_m": MetricInfo("m", "lower", "mean", "mean over the rollout of the distance from the recorded path"),

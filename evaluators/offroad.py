@@ -59,15 +59,22 @@ def containment(road: Road, footprints: Geometries, xyz: F64) -> Containment:
     return Containment(near, in_one, in_union, gap_m)
 
 
-def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, wrap: bool) -> Bool:
-    """Return whether any nearby lane that contains the centre ``(T, 2)`` points more than 120 degrees away from the heading ``(T,)``."""
+def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Bool:
+    """Return whether the ego is in a lane of the opposite direction.
+
+    Looked at are the nearby lanes that contain its centre ``(T, 2)``; one opposes where its direction differs from the ego's heading
+    ``(T,)`` by more than 120 degrees. In a junction lanes of many directions overlap, so by default a step is wrong only if all of the
+    lanes under the ego oppose; AlpaSim calls it wrong if any does.
+    """
     step, lane = np.nonzero(near)
     inside = shapely.contains(road.areas[lane], shapely.points(xy[step]))
     step, lane = step[inside], lane[inside]
     delta = road.heading_at(lane, xy[step]) - yaw[step]
-    out = np.zeros(len(xy), dtype=np.bool_)
-    out[step[np.abs(wrap_angle(delta) if wrap else delta) > WRONG_HEADING_RAD]] = True
-    return out
+    opposes = np.abs(wrap_angle(delta) if preset.wrap_heading else delta) > WRONG_HEADING_RAD
+    out, agreed = np.zeros(len(xy), dtype=np.bool_), np.zeros(len(xy), dtype=np.bool_)
+    out[step[opposes]] = True
+    agreed[step[~opposes]] = True
+    return out if preset.wrong_lane_rule == "any_opposes" else out & ~agreed
 
 
 @register("offroad", "off the road, wrong lane, gap to the lanes' border")
@@ -89,7 +96,7 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     if len(road.edges) and len(undecided):
         off[undecided] = road.touches_edge(shapes[undecided], xyz[undecided])
         known[undecided] = True
-    against = wrong_lane(road, held.near, ego.xy, yaw_from_quat(rollout.ego.quat), preset.wrap_heading)
+    against = wrong_lane(road, held.near, ego.xy, yaw_from_quat(rollout.ego.quat), preset)
     return [
         series("offroad", t_us, off, known, NO_EDGES),
         series("wrong_lane", t_us, against),

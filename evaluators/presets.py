@@ -30,6 +30,8 @@ class Preset:
     edge_touch_m: float = 0.001  # off-road below this distance from a road edge, if no lane contains the footprint
     edge_query: Literal["any", "nearest_vertex"] = "any"
     edge_height_m: float = 3.0  # edge_query "any": edges farther above or below the box centre belong to another road
+    # Wrong lane. "none_agrees": no lane under the ego runs its way. "any_opposes": at least one runs against it.
+    wrong_lane_rule: Literal["none_agrees", "any_opposes"] = "none_agrees"
     wrap_heading: bool = True  # compare headings modulo a full turn
     # Recorded path.
     invented_starts: bool = False  # the first two rows of the recording-based metrics are constants
