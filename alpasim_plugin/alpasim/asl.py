@@ -6,6 +6,7 @@ and a `TruncatedTail`. Damage anywhere else is an error.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from collections.abc import Iterator
@@ -165,7 +166,9 @@ class AslFile:
     def abandon(self) -> None:
         """Close without renaming."""
         if self._stream is not None:
-            self._stream.close()
+            # The caller is already dealing with a failure; that the last buffer of a full disk is lost too adds nothing to it.
+            with contextlib.suppress(OSError):
+                self._stream.close()
             self._stream = None
 
     def __enter__(self) -> AslFile:

@@ -2,6 +2,7 @@
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud
+from alpasim_plugin.gaussians.formats import read_gaussians
 from alpasim_plugin.gaussians.output import RasterOutput
 from alpasim_plugin.gaussians.ply import read_ply, write_ply
 from alpasim_plugin.gaussians.prepared import PreparedCloud, prepare
@@ -17,6 +18,7 @@ __all__ = [
     "prepare",
     "rasterize",
     "rasterize_prepared",
+    "read_gaussians",
     "read_ply",
     "write_ply",
 ]

@@ -170,7 +170,7 @@ def test_full_disk_is_an_infrastructure_failure() -> None:
     with pytest.raises(InfrastructureError, match="No space left") as caught:
         file.finish()
     assert caught.value.exit_code == 4
-    file._stream = None
+    file.abandon()
 
 
 def test_missing_folder_is_an_infrastructure_failure(tmp_path: Path) -> None:
