@@ -11,7 +11,7 @@ accumulated opacity of the scene *without* the sky (0 in the open sky), which is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from alpasim_plugin.gaussians.sky import Sky
 from alpasim_plugin.types import F64, Bool
 
 CELL_PX = 2.0
-SOLID_ALPHA = 0.99  # a wall of opaque Gaussians ends at this alpha (one further layer would pass the stop rule)
+Change = Callable[[SceneNode, int], GaussianCloud]  # (node, level index) -> the cloud to draw in its place
 
 
 class SceneGraph:
@@ -41,6 +41,7 @@ class SceneGraph:
         sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor; scenes built here) or ``world`` (as
             reconstructions of recorded drives are optimised).
         cell_px: Larger is faster and coarser.
+        change: Replaces a node's cloud at its first use; None draws the nodes as they are.
     """
 
     def __init__(
@@ -50,12 +51,14 @@ class SceneGraph:
         sky: Sky,
         sh_frame: ShFrame = "object",
         cell_px: float = CELL_PX,
+        change: Change | None = None,
     ) -> None:
         self.background = tuple(background)
         self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
         self.sky = sky
         self.sh_frame: ShFrame = sh_frame
         self.cell_px = cell_px
+        self._change = change
         self._centre, self._radius = _spheres(self.background)
         self._far = np.array([node.far_m for node in self.background])
         self._prepared: dict[tuple[str, int], PreparedCloud] = {}
@@ -101,11 +104,18 @@ class SceneGraph:
         """Return what `render` draws as one cloud in world coordinates: the slow twin of the prepared path."""
         return self._joined(self._choose(camera, actor_poses))
 
+    def changed(self, change: Change, more_actors: Sequence[SceneNode], cell_px: float) -> SceneGraph:
+        """Return a variant of the scene with other clouds in the same nodes, and further actors.
+
+        Culling uses the unchanged nodes' spheres, so a change should move Gaussians little compared with their node.
+        """
+        return SceneGraph(self.background, [*self.actors.values(), *more_actors], self.sky, self.sh_frame, cell_px, change)
+
     def _joined(self, chosen: list[tuple[SceneNode, int, F64 | None]]) -> GaussianCloud:
-        clouds = [
-            node.levels[level].cloud if T is None else node.levels[level].cloud.transformed(T, self.sh_frame == "object")
-            for node, level, T in chosen
-        ]
+        clouds = []
+        for node, level, T in chosen:
+            cloud = self._cloud(node, level)
+            clouds.append(cloud if T is None else cloud.transformed(T, self.sh_frame == "object"))
         return GaussianCloud.concatenate(clouds)
 
     def _choose(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> list[tuple[SceneNode, int, F64 | None]]:
@@ -143,8 +153,11 @@ class SceneGraph:
     def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
         key = (node.name, level)
         if key not in self._prepared:
-            self._prepared[key] = prepare(node.levels[level].cloud, sh_frame=self.sh_frame)
+            self._prepared[key] = prepare(self._cloud(node, level), sh_frame=self.sh_frame)
         return self._prepared[key]
+
+    def _cloud(self, node: SceneNode, level: int) -> GaussianCloud:
+        return node.levels[level].cloud if self._change is None else self._change(node, level)
 
 
 def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:

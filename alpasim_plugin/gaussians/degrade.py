@@ -1,0 +1,215 @@
+"""Stand in for a bad reconstruction: a seeded surrogate whose error grows with the distance from the logged path.
+
+Nothing is trained here. A reconstruction from one drive is right where its cameras were and wrong elsewhere, and this module models the
+causes one by one (fact sheet on splatting, section 9): surfaces that no log camera saw are missing; depth along the log cameras' rays is
+uncertain, so Gaussians slide along those rays, with their size, and look right from the log only; some slide far and hang in the air as
+floaters; Gaussians are too large, lose view dependence and change colour; moving actors are blurred, incomplete and doubled; exposure and
+white balance wander from frame to frame.
+
+Every amount is ``severity * (on + off * w)``: a small part that is there on the path (mild softness) and a part that grows with
+``w``, 0 within ``onset_m`` of the path and 1 beyond ``full_m``. ``w`` is quantised to `STEPS` so that clouds are prepared once per step.
+Random numbers belong to (scene, seed, part of the scene), never to ``w``: moving away makes the same faults larger, not others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.nodes import SceneNode
+from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.geometry import arc_lengths, interpolate, project, resample, se3
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F32, F64, Bool, Degradation, Scenario
+
+STEPS = 8
+BEHIND_M = 6.0  # a Gaussian's log camera is the one this far before it
+KNOT_US = 400_000  # spacing of the wandering of exposure and poses
+SEEN_TOLERANCE = 0.06  # share of depth by which a Gaussian may lie behind the surface a log camera saw
+GHOST = "~ghost"
+
+
+class LogView:
+    """Depth as one log camera saw it."""
+
+    def __init__(self, camera: PinholeCamera, depth: F32, alpha: F32) -> None:
+        self.camera, self.depth, self.solid = camera, depth, alpha > 0.5
+
+    def sees(self, points: F64, size_m: F64) -> Bool:
+        """Return which points ``(N, 3)`` of radius ``size_m (N,)`` lie in view and not behind what was seen."""
+        camera = self.camera
+        x, y, z = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).T
+        ahead = z > 0.2
+        safe = np.where(ahead, z, 1.0)
+        u = np.floor(camera.fx * x / safe + camera.cx)
+        v = np.floor(camera.fy * y / safe + camera.cy)
+        inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        row, column = np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
+        limit = self.depth[row, column] * (1 + SEEN_TOLERANCE) + 0.3 + size_m
+        return np.asarray(inside & (~self.solid[row, column] | (z < limit)))
+
+
+class Surrogate:
+    """Degrade the parts of one scene.
+
+    Args:
+        scenario: Gives the logged path, the amounts and the seed of the reconstruction (the scene's own: a reconstruction does not change
+            from rollout to rollout).
+        views: What the log cameras saw; Gaussians that none of them saw are missing.
+    """
+
+    def __init__(self, scenario: Scenario, views: Sequence[LogView]) -> None:
+        self.scenario, self.views = scenario, tuple(views)
+        self.amount: Degradation = scenario.degradation
+        path = scenario.ego_log.xyz
+        length = float(arc_lengths(path)[-1])
+        camera = scenario.cameras[0].T_rig_camera[:3, 3] if scenario.cameras else np.array([1.5, 0.0, 1.5])
+        self._line = resample(path, np.linspace(0.0, length, max(2, int(length) + 1))) if length > 0 else np.repeat(path[:1], 2, axis=0)
+        self._eyes = self._line + [0.0, 0.0, camera[2]]
+        self._tree = KDTree(self._line[:, :2])
+        self._reach = extended(path, scenario.ego_log.quat[0])
+        self._seen: dict[tuple[str, int], Bool] = {}
+
+    def weight(self, T_world_rig: F64) -> float:
+        """Return ``w`` of a rig pose, 0..1, in steps of ``1 / STEPS``."""
+        lateral = abs(project(self._reach, T_world_rig[:2, 3])[1])
+        span = max(self.amount.full_m - self.amount.onset_m, 1e-9)
+        return float(np.round(np.clip((lateral - self.amount.onset_m) / span, 0.0, 1.0) * STEPS) / STEPS)
+
+    def background(self, node: SceneNode, level: int, cloud: GaussianCloud, w: float) -> GaussianCloud:
+        """Degrade one level of a background node."""
+        n, s = len(cloud), self.amount.severity
+        rng = stream(self.scenario.scene_id, self.scenario.seed, f"degrade/{node.name}/{level}")
+        draw = rng.random((n, 4))
+        normal = rng.standard_normal((n, 3))
+        ray, cell = self._rays(cloud.means)
+        # Depth errors: an own part per Gaussian, a part shared by a neighbourhood, and a few that slide far and become floaters.
+        smooth = _wave(cell, self.scenario, "degrade/depth-field")
+        own = 0.35 * normal[:, 0] + np.where(draw[:, 0] < 0.12, normal[:, 1], 0.0)
+        shift = s * ((0.012 + 0.085 * w) * own + (0.004 + 0.10 * w) * smooth)
+        floater = draw[:, 1] < 0.012 * min(s, 2.0)
+        shift = np.where(floater, shift - s * w * (0.25 + 0.4 * draw[:, 2]), shift)
+        shift = np.clip(shift, -0.75, 1.5)
+        grow = (1 + shift) * np.exp(s * ((0.14 + 0.10 * draw[:, 3]) + w * (0.25 * draw[:, 3] + 0.12)))
+        blotch = _wave(cell * 1.7 + 31.0, self.scenario, "degrade/colour-field")[:, None]
+        rgb = cloud.sh[:, 0] * C0 + 0.5
+        rgb = rgb * (1 + s * (0.03 + 0.05 * w) * normal[:, 2:3]) + s * (0.008 + 0.04 * w) * blotch * [1.0, 0.6, -0.8]
+        patchy = _wave(cell * 0.6 + 77.0, self.scenario, "degrade/missing-field")
+        missing = draw[:, 0] < s * w * np.clip(0.10 + 0.30 * patchy, 0.02, 0.7)
+        unseen = ~self._seen_by_log(node, level, cloud) & (draw[:, 2] < 0.95 * min(s, 1.0))
+        keep = ~(missing | unseen)
+        out = GaussianCloud(
+            cloud.means + ray * shift[:, None],
+            cloud.quats,
+            (cloud.scales * grow[:, None]).astype(np.float32),
+            (cloud.opacities * (1 - np.clip(s * w, 0, 1.5) * 0.25 * draw[:, 2])).astype(np.float32),
+            ((np.clip(rgb, 0, 1) - 0.5) / C0)[:, None, :].astype(np.float32),
+        )
+        return out.take(np.flatnonzero(keep))
+
+    def actor(self, node: SceneNode, level: int, cloud: GaussianCloud, w: float) -> GaussianCloud:
+        """Degrade one level of an actor: soft, incomplete, without sheen; ghosts are fainter."""
+        n, s = len(cloud), self.amount.severity
+        rng = stream(self.scenario.scene_id, self.scenario.seed, f"degrade/{node.name}/{level}")
+        draw, normal = rng.random((n, 2)), rng.standard_normal((n, 3))
+        ghost = node.name.endswith(GHOST)
+        size = cloud.scales.max(axis=1, keepdims=True)
+        opacity = cloud.opacities * (min(0.55, s * (0.10 + 0.40 * w)) if ghost else 1 - min(0.6, s * (0.02 + 0.30 * w)) * draw[:, 1])
+        out = GaussianCloud(
+            cloud.means + s * (0.15 + 0.9 * w) * size * normal,
+            cloud.quats,
+            (cloud.scales * np.exp(s * (0.12 + 0.45 * w) * (0.5 + draw[:, 1:]))).astype(np.float32),
+            opacity.astype(np.float32),
+            cloud.sh[:, :1],
+        )
+        return out.take(np.flatnonzero(draw[:, 0] >= s * (0.03 + 0.30 * w)))
+
+    def pose(self, actor_id: str, T_world_box: F64, t_us: int, seed: int, w: float) -> F64:
+        """Return the pose at which the reconstruction puts an actor: tracks are a little off, and more so seen from aside."""
+        s = self.amount.severity
+        off = wander(self.scenario.scene_id, seed, f"degrade/pose/{actor_id}", t_us, 3)
+        x, y = s * (0.03 + 0.22 * w) * off[0], s * (0.02 + 0.16 * w) * off[1]
+        yaw = s * (0.008 + 0.05 * w) * off[2]
+        move = se3([x, y, 0.0], [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+        return np.asarray(T_world_box @ move)
+
+    def ghost_pose(self, actor_id: str, T_world_box: F64, t_us: int, seed: int, w: float) -> F64:
+        """Return the pose of an actor's ghost: it trails behind along the actor's axis."""
+        late = 0.35 + 0.9 * w + 0.25 * float(wander(self.scenario.scene_id, seed, f"degrade/ghost/{actor_id}", t_us, 1)[0])
+        move = np.eye(4)
+        move[0, 3] = -self.amount.severity * late
+        return np.asarray(self.pose(actor_id, T_world_box, t_us, seed, w) @ move)
+
+    def gain(self, t_us: int, seed: int, w: float) -> F32:
+        """Return the factors ``(3,)`` of this frame's exposure and white balance."""
+        s = self.amount.severity
+        off = wander(self.scenario.scene_id, seed, "degrade/exposure", t_us, 4)
+        return np.exp(s * ((0.02 + 0.07 * w) * off[0] + (0.006 + 0.022 * w) * off[1:])).astype(np.float32)
+
+    def _rays(self, means: F64) -> tuple[F64, F64]:
+        """Return, per Gaussian, the vector from its log camera ``(N, 3)`` and its plan position in metres ``(N, 2)``."""
+        distance, i = self._tree.query(means[:, :2])
+        back = np.round(np.maximum(BEHIND_M, 0.8 * distance)).astype(np.int64)
+        eye = self._eyes[np.clip(i - back, 0, len(self._eyes) - 1)]
+        return means - eye, means[:, :2] - self._line[0, :2]
+
+    def _seen_by_log(self, node: SceneNode, level: int, cloud: GaussianCloud) -> Bool:
+        key = (node.name, level)
+        if key not in self._seen:
+            seen = np.zeros(len(cloud), dtype=bool)
+            size = cloud.scales.max(axis=1).astype(np.float64)
+            for view in self.views:
+                rest = np.flatnonzero(~seen)
+                if len(rest) == 0:
+                    break
+                seen[rest] = view.sees(cloud.means[rest], size[rest])
+            self._seen[key] = seen if self.views else np.ones(len(cloud), dtype=bool)
+        return self._seen[key]
+
+
+def extended(path: F64, quat: F64, by_m: float = 200.0) -> F64:
+    """Return the path ``(N, 3)`` with straight ends, so that a pose beyond an end is judged by its lateral distance only."""
+    first = np.array([1 - 2 * (quat[2] ** 2 + quat[3] ** 2), 2 * (quat[1] * quat[2] + quat[0] * quat[3]), 0.0])
+    s = arc_lengths(path)
+    if s[-1] < 1.0:
+        return np.stack([path[0] - by_m * first, path[0] + by_m * first])
+    ends = resample(path, [0.0, min(1.0, s[-1]), max(0.0, s[-1] - 1.0), s[-1]])
+    start, stop = ends[0] - ends[1], ends[3] - ends[2]
+    keep = np.concatenate([[True], np.diff(s) > 0])
+    return np.concatenate([[path[0] + by_m * start / np.linalg.norm(start)], path[keep], [path[-1] + by_m * stop / np.linalg.norm(stop)]])
+
+
+def wander(scene_id: str, seed: int, component: str, t_us: int, n: int) -> F64:
+    """Return ``(n,)`` numbers of about unit spread that wander with time and depend on nothing but the key and ``t_us``."""
+    knot, part = divmod(int(t_us), KNOT_US)
+    a = stream(scene_id, seed, component, knot).standard_normal(n)
+    b = stream(scene_id, seed, component, knot + 1).standard_normal(n)
+    f = part / KNOT_US
+    return np.asarray(a * (1 - f) + b * f)
+
+
+def _wave(at: F64, scenario: Scenario, component: str) -> F64:
+    """Return a smooth random field of about unit spread at plan points ``(N, 2)``: waves of 3 to 12 m in random directions."""
+    rng = stream(scenario.scene_id, scenario.seed, component)
+    total = np.zeros(len(at))
+    for _ in range(8):
+        angle, length, phase = rng.uniform(0, 2 * np.pi), rng.uniform(3.0, 12.0), rng.uniform(0, 2 * np.pi)
+        total += np.sin(2 * np.pi * (at[:, 0] * np.cos(angle) + at[:, 1] * np.sin(angle)) / length + phase)
+    return total / 2.0
+
+
+def log_times(scenario: Scenario, spacing_m: float, most: int) -> list[int]:
+    """Return times of the log at which the ego has moved ``spacing_m`` since the last one, at most ``most`` of them."""
+    s = arc_lengths(scenario.ego_log.xyz)
+    n = int(np.clip(s[-1] / spacing_m + 1, 1, most))
+    index = np.searchsorted(s, np.linspace(0.0, s[-1], n)).clip(0, len(s) - 1)
+    return [int(t) for t in np.unique(scenario.ego_log.t_us[index])]
+
+
+def log_actors(scenario: Scenario, t_us: int) -> dict[str, F64]:
+    """Return the recorded poses of the actors present at a time."""
+    return {a.actor_id: interpolate(a.track, t_us) for a in scenario.actors if a.track.t_us[0] <= t_us <= a.track.t_us[-1]}
