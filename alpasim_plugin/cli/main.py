@@ -17,7 +17,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
     "Without a verb `run` is meant: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
-    "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, 5 evaluator failure, 130 interrupted.",
+    "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, "
+    "5 evaluator failure, 130 interrupted.",
 )
 app.command("run", epilog=run.EPILOG)(run.run)
 app.command("report", epilog=report.EPILOG)(report.report)

@@ -79,7 +79,8 @@ def make_progress(quiet: bool) -> Silent | Lines | Bar:
 
 def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
     """Say in one line what runs where."""
-    shape = f"{len(plan.renderers)} renderer(s) x {len(plan.policies)} policy(ies) x {len(plan.scenarios)} scene(s) x {len(plan.seeds)} seed(s)"
+    counts = (len(plan.renderers), len(plan.policies), len(plan.scenarios), len(plan.seeds))
+    shape = "{} renderers x {} policies x {} scenes x {} seeds".format(*counts)
     return f"{len(plan.cells)} rollouts ({shape}), {threads.workers} worker(s) x {threads.per_worker} thread(s) -> {root}"
 
 

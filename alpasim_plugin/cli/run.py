@@ -36,7 +36,7 @@ Examples:
 
 def run(
     scenarios: Annotated[
-        list[str], typer.Argument(help="Scenario or suite YAML, shipped name, folder of them, Argoverse 2 log, CommonRoad XML, Cosmos clip.")
+        list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")
     ],
     renderer: Annotated[str, typer.Option("--renderer", help="Renderers, comma-separated.")] = "3dgs",
     policy: Annotated[str, typer.Option("--policy", help="Policies, comma-separated; `package.module:Class` works too.")] = "lane-camera",

@@ -108,7 +108,8 @@ class Recorder:
         """Log what the policy was told."""
         with self.stage("log"):
             log, history = self._scenario.ego_log, observation.history.t_us
-            context = [ego_state_from_log(log, int(t), self._scenario.vehicle) for t in history[(history > self._told_us) & (history < clock.start_us)]]
+            untold = history[(history > self._told_us) & (history < clock.start_us)]
+            context = [ego_state_from_log(log, int(t), self._scenario.vehicle) for t in untold]
             self._log.ego_trajectory([*context, observation.ego])
             self._told_us = observation.t_us
             self._log.route(observation.t_us, observation.route_rig)

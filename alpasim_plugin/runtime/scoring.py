@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,7 @@ import numpy as np
 from alpasim_plugin.geometry import inverse, offset_trajectory, project, yaw_from_quat
 from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.types import MetricSeries, RolloutLog, Scenario
-from evaluators import rollout_values, score
-
-EVENTS = ("collision_front", "collision_lateral", "collision_rear", "offroad")
+from evaluators import Reduction, reduce_rollout, score
 
 
 @dataclass(frozen=True)
@@ -22,8 +20,9 @@ class Scored:
     """What a log came to."""
 
     steps: list[dict[str, Any]]  # rows of steps.parquet less the rollout's key
-    values: dict[str, dict[str, Any]]  # metric -> value, valid, reason
-    events: list[dict[str, Any]]  # first relevant collision and off-road: metric, t_us, x_m, y_m
+    metrics: dict[str, dict[str, Any]]  # metric -> value, valid, reason, unit, direction
+    events: list[dict[str, Any]]  # first scored collision and off-road: metric, t_us, x_m, y_m
+    censored: dict[str, Any]  # how many steps which rule removed
 
 
 def score_log(log: Path, frames: Path, scenario: Scenario, preset: str) -> Scored:
@@ -34,17 +33,14 @@ def score_log(log: Path, frames: Path, scenario: Scenario, preset: str) -> Score
     """
     rollout = read_asl(log)
     series = score(rollout, scenario.scene, preset)
-    values = {
-        name: {"value": _number(entry.value), "valid": entry.valid, "reason": entry.reason}
-        for name, entry in rollout_values(series, preset).items()
-    }
+    reduction = reduce_rollout(series, preset)
     rows = [row for one in series for row in _rows(one)]
     rows += _state_rows(rollout)
     rows += [
         _row(int(fact["t_us"] or 0), "opacity_mean", fact["opacity_mean"], "the renderer gives no opacity")
         for fact in read_facts(frames)
     ]
-    return Scored(rows, values, _first_events(rollout, series))
+    return Scored(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict())
 
 
 def _rows(series: MetricSeries) -> list[dict[str, Any]]:
@@ -84,20 +80,13 @@ def _speeds(t_us: np.ndarray[Any, Any], xyz: np.ndarray[Any, Any]) -> np.ndarray
     return np.asarray(np.linalg.norm(np.gradient(xyz[:, :2], seconds, axis=0), axis=1))
 
 
-def _first_events(rollout: RolloutLog, series: Sequence[MetricSeries]) -> list[dict[str, Any]]:
-    by_name = {one.name: one for one in series}
-    relevant = by_name["eval_relevant"]
-    events = []
-    for name in EVENTS:
-        one = by_name.get(name)
-        if one is None:
-            continue
-        hit = np.flatnonzero(one.valid & (one.value > 0) & (relevant.value > 0))
-        if hit.size:
-            t = int(one.t_us[hit[0]])
-            at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, t))]
-            events.append({"metric": name, "t_us": t, "x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)})
-    return sorted(events, key=lambda event: (event["t_us"], event["metric"]))
+def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
+    """Return the events with the place of the ego's box centre when they happened."""
+    placed = []
+    for event in reduction.events:
+        at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
+        placed.append(dict(event) | {"x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)})
+    return sorted(placed, key=lambda event: (event["t_us"], event["metric"]))
 
 
 def _number(value: float | None) -> float | None:
