@@ -15,6 +15,7 @@ EXTENSION_M = 120.0  # enough for the 80 m that a policy sees, beyond the end of
 BLEND_M = 20.0  # the lateral offset at the end of the log fades out over this length
 MATCH_RADIUS_M = 4.0  # a point outside every lane is matched to lanes with a centre vertex this near
 MAX_HEADING_ERROR_RAD = np.pi / 3
+HEADING_WEIGHT_M = 3.0
 
 
 def route_from_log(lane_map: LaneMap, ego_log: Trajectory, extension_m: float = EXTENSION_M) -> Route:
@@ -115,7 +116,7 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
     """Return the route ahead ``(n, 3)`` in the rig frame, z = 0, with NaN rows after the route's end.
 
     The first point is the ego's projection on the route. Where the route passes the same place twice, the pass that runs in the
-    ego's direction counts.
+    ego's direction counts: one radian of heading error weighs as much as `HEADING_WEIGHT_M` of distance.
     """
     out = np.full((n, 3), np.nan)
     line = route.xyz
@@ -130,15 +131,13 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
 
 
 def _project_ahead(line: F64, xy: F64, yaw: float) -> float:
-    """Return the arc length of the nearest point, among segments within 90 degrees of the heading if there are any."""
+    """Return the arc length of the point of the route that is nearest in place and direction."""
     a, d = line[:-1, :2], np.diff(line[:, :2], axis=0)
     length2 = np.maximum(np.sum(d * d, axis=1), 1e-300)
     f = np.clip(np.sum((xy - a) * d, axis=1) / length2, 0.0, 1.0)
     distance = np.linalg.norm(xy - (a + f[:, None] * d), axis=1)
-    agrees = d @ np.array([np.cos(yaw), np.sin(yaw)]) > 0
-    if agrees.any():
-        distance = np.where(agrees, distance, np.inf)
-    i = int(np.argmin(distance))
+    error = np.abs(wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - yaw))
+    i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
     return float(arc_lengths(line)[i] + f[i] * np.sqrt(length2[i]))
 
 

@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry import arc_lengths, project, quat_from_yaw, se2, se3
+from alpasim_plugin.types import LaneMap, Route, Trajectory
+from alpasim_plugin.world.lane_map import LaneIndex
+from alpasim_plugin.world.route import _change_cost, _local_costs, match_lanes, route_from_log, route_in_rig
+from tests.world.small_maps import FAR, arc, make, straight
+
+
+def drive(x, y=None, z=0.0):
+    """A log through points, 0.1 s apart, heading along them."""
+    xyz = np.column_stack([x, np.zeros_like(x) if y is None else y, np.full_like(x, z)])
+    d = np.gradient(xyz[:, :2], axis=0) if len(x) > 1 else np.array([[1.0, 0.0]])
+    return Trajectory(np.arange(len(x)) * 100_000, xyz, quat_from_yaw(np.arctan2(d[:, 1], d[:, 0])))
+
+
+ROAD = make(
+    straight("a", 0, 40, successors=("b",), left_neighbour="a2"),
+    straight("b", 40, 80, successors=("turn", "c", "off the map")),
+    straight("c", 80, 300),
+    arc("turn", 12.0, 90.0, start=(80, 0)),
+    straight("a2", 0, 80, y=3.5, right_neighbour="a"),
+)
+
+
+def test_route_is_the_recorded_path_and_goes_on_straight_behind_it():
+    x = np.arange(5.0, 60.0, 0.5)
+    log = drive(x, 0.3 * np.sin(x / 10))
+    route = route_from_log(ROAD, log)
+    assert route.lane_ids == ("a", "b", "c")
+    for point in log.xyz:
+        assert abs(project(route.xyz, point)[1]) < 1e-9
+    assert arc_lengths(route.xyz)[-1] == pytest.approx(arc_lengths(log.xyz)[-1] + 120.0, abs=0.1)
+    np.testing.assert_allclose(route.xyz[-5:, 1], 0.0, atol=1e-9)  # back on the centre
+
+
+def test_extension_leaves_the_log_without_a_kink():
+    x = np.arange(5.0, 60.0, 0.5)
+    route = route_from_log(ROAD, drive(x, np.full_like(x, 0.9)))
+    heading = np.arctan2(*np.diff(route.xyz[:, :2], axis=0).T[::-1])
+    assert np.abs(np.diff(heading)).max() < 0.03
+    assert np.abs(heading).max() < 0.08
+
+
+def test_lateral_lane_change_is_named_in_order():
+    x = np.arange(2.0, 70.0, 0.5)
+    y = 3.5 / (1 + np.exp((x - 25) / 3))
+    assert route_from_log(ROAD, drive(x, y), extension_m=0).lane_ids == ("a2", "a", "b")
+
+
+def test_overlapping_lanes_of_an_intersection_are_told_apart_by_the_whole_drive():
+    turn = ROAD.lanes["turn"].centre
+    log = drive(np.concatenate([np.arange(45.0, 80), turn[:, 0]]), np.concatenate([np.zeros(35), turn[:, 1]]))
+    assert route_from_log(ROAD, log).lane_ids == ("b", "turn")
+    straight_on = drive(np.arange(45.0, 100.0))
+    assert route_from_log(ROAD, straight_on).lane_ids == ("b", "c")
+
+
+def test_matching_agrees_with_trying_every_assignment():
+    """The shortest path over samples is the best of all assignments of lanes to samples, here tried one by one."""
+    index = LaneIndex(ROAD)
+    path = np.column_stack([np.linspace(77, 84, 8), np.linspace(0, 0.4, 8), np.zeros(8)])
+    heading = np.arctan2(0.4, 7)
+    costs = [_local_costs(index, p, heading, index.containing(p)) for p in path]
+    best = min(
+        product(*costs),
+        key=lambda names: sum(c[n] for c, n in zip(costs, names, strict=True))
+        + sum(_change_cost(index, a, b) for a, b in pairwise(names)),
+    )
+    assert match_lanes(index, path, heading) == tuple(dict.fromkeys(best))
+
+
+def test_oncoming_lanes_are_never_the_route():
+    assert route_from_log(ROAD, drive(np.arange(60.0, 5.0, -0.5))).lane_ids == ()
+
+
+def test_drive_outside_every_lane_is_its_own_route():
+    log = drive(np.arange(0.0, 30.0), np.full(30, 60.0))
+    route = route_from_log(ROAD, log)
+    assert route.lane_ids == ()
+    np.testing.assert_array_equal(route.xyz, log.xyz)
+
+
+def test_map_without_lanes_still_gives_the_recorded_path():
+    log = drive(np.arange(0.0, 30.0))
+    np.testing.assert_array_equal(route_from_log(LaneMap({}), log).xyz, log.xyz)
+
+
+def test_car_at_rest_gets_the_lane_ahead():
+    jitter = np.column_stack([5.0 + 0.01 * np.random.default_rng(1).normal(size=50), np.zeros((50, 2))])
+    route = route_from_log(ROAD, Trajectory(np.arange(50) * 100_000, jitter, quat_from_yaw(np.zeros(50))))
+    assert route.lane_ids == ("a", "b", "c")
+    assert arc_lengths(route.xyz)[-1] == pytest.approx(120.0, abs=0.2)
+    assert (np.diff(route.xyz[:, 0]) > 0).all()
+
+
+def test_log_of_one_pose_gets_the_lane_ahead():
+    assert route_from_log(ROAD, drive(np.array([5.0]))).xyz[-1, 0] == pytest.approx(125.0)
+
+
+NO_POSES = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+
+
+@pytest.mark.parametrize("log", [drive(np.array([np.nan, 1.0])), NO_POSES])
+def test_unusable_log_is_refused(log):
+    with pytest.raises(InputError) as caught:
+        route_from_log(ROAD, log)
+    assert "with: the recorded drive" in str(caught.value)
+
+
+def test_route_ends_where_the_map_ends():
+    route = route_from_log(make(straight("a", 0, 40)), drive(np.arange(5.0, 30.0)))
+    assert route.xyz[-1, 0] == pytest.approx(40.0)
+
+
+def test_far_maps_give_the_same_route():
+    x = np.arange(5.0, 60.0, 0.5)
+    log = drive(x, 0.3 * np.sin(x / 10))
+    moved = Trajectory(log.t_us, log.xyz + FAR, log.quat)
+    near, far = route_from_log(ROAD, log), route_from_log(make(*ROAD.lanes.values(), shift=FAR), moved)
+    assert near.lane_ids == far.lane_ids
+    np.testing.assert_allclose(far.xyz - FAR, near.xyz, atol=1e-6)
+
+
+def test_way_points_start_at_the_projection_and_are_evenly_spaced():
+    route = Route(np.array([[0.0, 0, 0], [200.0, 0, 0]]))
+    seen = route_in_rig(route, se2(10.0, 2.0, 0.0))
+    assert seen.shape == (20, 3)
+    np.testing.assert_allclose(seen[:, 0], np.arange(20) * 80 / 19, atol=1e-9)
+    np.testing.assert_allclose(seen[:, 1], -2.0, atol=1e-12)
+
+
+def test_rows_behind_the_end_are_nan_and_only_those():
+    seen = route_in_rig(Route(np.array([[0.0, 0, 0], [30.0, 0, 0]])), se2(10.0, 0.0, 0.0), n=10, spacing_m=4.0)
+    assert np.isfinite(seen[:6]).all()
+    assert np.isnan(seen[6:]).all()
+
+
+def test_way_points_lie_level_in_a_pitched_rig():
+    pitch = np.array([np.cos(0.05), 0.0, -np.sin(0.05), 0.0])
+    seen = route_in_rig(Route(np.array([[0.0, 0, 0], [200.0, 0, 20.0]])), se3([10.0, 0.0, 1.0], pitch))
+    assert (seen[:, 2] == 0).all()
+
+
+def test_route_over_itself_is_followed_in_the_ego_s_direction():
+    eight = np.array([[-50.0, 0, 0], [50.0, 0, 0], [50.0, 50, 0], [0.0, 50, 0], [0.0, -50, 0]])
+    ahead = route_in_rig(Route(eight), se2(0.0, 0.2, 0.0))
+    down = route_in_rig(Route(eight), se2(0.2, 0.0, -np.pi / 2))
+    assert ahead[5, 0] == pytest.approx(5 * 80 / 19)
+    assert down[5, 0] == pytest.approx(5 * 80 / 19)
+
+
+def test_skidding_ego_is_not_sent_to_a_far_stretch_that_runs_its_way():
+    corner = np.array([[0.0, 0, 0], [500.0, 0, 0], [500.0, 500, 0]])
+    seen = route_in_rig(Route(corner), se2(100.0, 1.0, np.pi / 2))
+    np.testing.assert_allclose(seen[0], [-1.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_ego_against_the_route_sees_the_route_run_backwards():
+    seen = route_in_rig(Route(np.array([[0.0, 0, 0], [200.0, 0, 0]])), se2(100.0, 0.0, np.pi))
+    assert seen[3, 0] == pytest.approx(-3 * 80 / 19)
+
+
+def test_route_of_one_point_shows_nothing():
+    assert np.isnan(route_in_rig(Route(np.zeros((1, 3))), np.eye(4))).all()
