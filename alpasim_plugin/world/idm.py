@@ -1,0 +1,132 @@
+"""The Intelligent Driver Model and the choice of the leader it follows.
+
+Source: M. Treiber, A. Hennecke, D. Helbing, "Congested traffic states in empirical observations and microscopic simulations",
+Physical Review E 62 (2000), equations 2 and 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.types import F64, I64
+from alpasim_plugin.world.path import Path
+
+
+@dataclass(frozen=True)
+class IdmParams:
+    """Parameters of one driver."""
+
+    desired_speed_mps: float = 13.9
+    headway_s: float = 1.5
+    min_gap_m: float = 2.0
+    accel_mps2: float = 1.5
+    brake_mps2: float = 2.0  # comfortable
+    hard_brake_mps2: float = 7.0  # what the vehicle can do; the model's own demand is cut off here
+
+    @staticmethod
+    def from_mapping(params: Mapping[str, float]) -> IdmParams:
+        """Read the parameters of a `Behaviour`; absent ones take their defaults."""
+        return IdmParams(**{k: float(v) for k, v in params.items()})
+
+
+def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmParams) -> float:
+    """Return the acceleration behind a leader (``gap_m`` infinite: free road), within ``[-hard_brake, accel]``.
+
+    Args:
+        speed_mps: Own speed, >= 0.
+        gap_m: Bumper-to-bumper distance.
+        closing_mps: Own speed minus the leader's.
+        p: Driver.
+
+    Example:
+        >>> round(idm_acceleration(13.9, float("inf"), 0.0, IdmParams()), 6)
+        0.0
+    """
+    v0 = max(p.desired_speed_mps, 0.1)
+    free = 1.0 - (speed_mps / v0) ** 4
+    if np.isinf(gap_m):
+        interaction = 0.0
+    else:
+        dynamic = speed_mps * p.headway_s + speed_mps * closing_mps / (2.0 * np.sqrt(p.accel_mps2 * p.brake_mps2))
+        wanted_gap = p.min_gap_m + max(0.0, dynamic)
+        interaction = (wanted_gap / max(gap_m, 0.01)) ** 2
+    return float(np.clip(p.accel_mps2 * (free - interaction), -p.hard_brake_mps2, p.accel_mps2))
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Road users at one instant, as rectangles."""
+
+    xy: F64  # (M, 2) centre, metres, world
+    yaw: F64  # (M,) radians
+    half_length_m: F64  # (M,)
+    half_width_m: F64  # (M,)
+    velocity: F64  # (M, 2) metres per second, world
+
+
+@dataclass(frozen=True)
+class Leader:
+    """The road user ahead that limits the speed."""
+
+    gap_m: float  # from the own front bumper; may be negative in contact
+    speed_mps: float  # along the own path
+    index: int  # row in `Bodies`, -1: none
+
+
+NO_LEADER = Leader(float("inf"), 0.0, -1)
+
+_OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Extent of bodies along and across a path; rows are those near enough to matter."""
+
+    index: I64  # (m,) row in `Bodies`
+    rear: F64  # (m,) smallest arc length of the outline
+    front: F64  # (m,) largest
+    low: F64  # (m,) rightmost distance from the path
+    high: F64  # (m,) leftmost
+    speed: F64  # (m,) along the path, >= 0
+
+
+def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0) -> Spans | None:
+    """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None where there is none."""
+    if len(bodies.xy) == 0:
+        return None
+    start, _ = path.at(from_s_m)
+    near = np.flatnonzero(np.hypot(*(bodies.xy - start[:2]).T) < horizon_m + bodies.half_length_m + 5.0)
+    if len(near) == 0:
+        return None
+    c, s = np.cos(bodies.yaw[near])[:, None], np.sin(bodies.yaw[near])[:, None]
+    ax = _OUTLINE[:, 0] * bodies.half_length_m[near, None]  # (m, 6)
+    ay = _OUTLINE[:, 1] * bodies.half_width_m[near, None]
+    outline = np.stack([bodies.xy[near, 0:1] + c * ax - s * ay, bodies.xy[near, 1:2] + s * ax + c * ay], axis=-1)
+    along, across = path.project(outline.reshape(-1, 2), (from_s_m - 15.0, from_s_m + horizon_m))
+    along, across = along.reshape(-1, 6), across.reshape(-1, 6)
+    rear = along.min(axis=1)
+    _, yaw = path.at(rear)
+    speed = bodies.velocity[near, 0] * np.cos(yaw) + bodies.velocity[near, 1] * np.sin(yaw)
+    return Spans(near, rear, along.max(axis=1), across.min(axis=1), across.max(axis=1), np.maximum(speed, 0.0))
+
+
+def find_leader(
+    path: Path, front_s_m: float, half_width_m: float, bodies: Bodies, horizon_m: float = 120.0, margin_m: float = 0.2
+) -> Leader:
+    """Return the nearest body that reaches into the corridor of a path ahead of the own front bumper.
+
+    A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the path and its rear end is not more than 2 m
+    behind the own front bumper, so that touching bodies still count.
+    """
+    span = spans(path, front_s_m, bodies, horizon_m)
+    if span is None:
+        return NO_LEADER
+    reach = half_width_m + margin_m
+    ahead = (span.low < reach) & (span.high > -reach) & (span.rear > front_s_m - 2.0) & (span.rear < front_s_m + horizon_m)
+    if not ahead.any():
+        return NO_LEADER
+    k = int(np.argmin(np.where(ahead, span.rear, np.inf)))
+    return Leader(float(span.rear[k] - front_s_m), float(span.speed[k]), int(span.index[k]))

@@ -1,0 +1,170 @@
+"""YAML text to plain data in which every key remembers its file, line and column.
+
+Scalars follow the YAML 1.2 core schema (``no`` is a word, ``1e-3`` a number, ``12:30`` a string), with ``_`` allowed inside integers.
+Duplicate keys, merge keys and recursive aliases are refused; depth and the number of nodes after alias expansion are bounded, so
+that a small hostile file cannot fill the memory.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from alpasim_plugin.errors import InputError
+
+MAX_NODES = 500_000
+MAX_DEPTH = 40
+
+Key = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Where a key was written. Line and column count from 1; line 0 stands for a command-line override."""
+
+    file: str
+    line: int
+    column: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data (dict, list, str, int, float, bool, None) with the position of every key path."""
+
+    data: Any
+    marks: Mapping[Key, Mark]
+    path: str
+    sources: tuple[tuple[str, str], ...] = ()  # (path, sha256) of every file that was merged, in order
+    overrides: tuple[str, ...] = ()
+
+    def mark(self, loc: Sequence[str | int]) -> Mark:
+        """Return the position of the deepest existing key on the way to ``loc``."""
+        for n in range(len(loc), -1, -1):
+            found = self.marks.get(tuple(loc[:n]))
+            if found is not None:
+                return found
+        return Mark(self.path, 1, 1)
+
+    def error(self, doing: str, loc: Sequence[str | int], found: str, do_this: str) -> InputError:
+        """Build a four-part error at a key path."""
+        return InputError(doing, str(self.mark(loc)), found, do_this)
+
+    def folder_of(self, loc: Sequence[str | int]) -> Path:
+        """Return the folder against which a relative path written at ``loc`` is resolved."""
+        mark = self.mark(loc)
+        return Path(mark.file).resolve().parent if mark.line else Path.cwd()
+
+
+class _CoreLoader(yaml.SafeLoader):
+    """SafeLoader with YAML 1.2 core scalars."""
+
+
+_CoreLoader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("int", r"^(?:[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+)$", "-+0123456789"),
+    (
+        "float",
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9][0-9_]*(?:\.[0-9_]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$",
+        "-+0123456789.",
+    ),
+):
+    _CoreLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
+
+
+def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[Any, dict[Key, Mark]]:
+    loader = _CoreLoader(text)
+    try:
+        node = loader.get_single_node()
+        builder = _Builder(loader, file, doing)
+        data = builder.build(node, (), 0) if node is not None else None
+    except yaml.MarkedYAMLError as e:
+        mark = e.problem_mark or e.context_mark
+        at = file if mark is None or override else f"{file}:{mark.line + 1}:{mark.column + 1}"
+        found = " ".join(str(part) for part in (e.context, e.problem) if part)
+        raise InputError(doing, at, f"not valid YAML: {found}", "correct the syntax (indentation, colon, quote or bracket)") from e
+    except yaml.YAMLError as e:
+        raise InputError(doing, file, f"not valid YAML: {e}", "save the file as plain UTF-8 text") from e
+    except RecursionError as e:
+        raise InputError(doing, file, f"nested deeper than {MAX_DEPTH} levels", "flatten the file") from e
+    finally:
+        loader.dispose()
+    return data, builder.marks
+
+
+class _Builder:
+    """Turns a node tree into plain data and positions, within bounds."""
+
+    def __init__(self, loader: _CoreLoader, file: str, doing: str) -> None:
+        self.loader, self.file, self.doing = loader, file, doing
+        self.marks: dict[Key, Mark] = {}
+        self.n_nodes = 0
+        self.open: set[int] = set()
+
+    def fail(self, node: yaml.Node, found: str, do_this: str) -> InputError:
+        return InputError(self.doing, str(self.position(node)), found, do_this)
+
+    def position(self, node: yaml.Node) -> Mark:
+        return Mark(self.file, node.start_mark.line + 1, node.start_mark.column + 1)
+
+    def build(self, node: yaml.Node, loc: Key, depth: int) -> Any:
+        self.n_nodes += 1
+        if self.n_nodes > MAX_NODES:
+            raise self.fail(node, f"more than {MAX_NODES} values once aliases are expanded", "remove nested aliases")
+        if depth > MAX_DEPTH:
+            raise self.fail(node, f"nested deeper than {MAX_DEPTH} levels", "flatten the file")
+        if id(node) in self.open:
+            raise self.fail(node, "an alias that contains itself", "remove the recursive alias")
+        self.marks.setdefault(loc, self.position(node))
+        if isinstance(node, yaml.ScalarNode):
+            return self.scalar(node)
+        self.open.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            out: Any = [self.build(child, (*loc, i), depth + 1) for i, child in enumerate(node.value)]
+        else:
+            out = self.mapping(node, loc, depth)
+        self.open.discard(id(node))
+        return out
+
+    def mapping(self, node: yaml.Node, loc: Key, depth: int) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key = self.scalar(key_node) if isinstance(key_node, yaml.ScalarNode) else None
+            if key == "<<":
+                raise self.fail(key_node, "the merge key '<<'", "use extends: or write the keys out")
+            if isinstance(key, bool) or not isinstance(key, str | int):
+                raise self.fail(key_node, "a key that is not text", "write keys as plain words")
+            name = str(key)
+            if name in out:
+                first = self.marks[(*loc, name)]
+                raise self.fail(key_node, f"duplicate key {name!r}, first at line {first.line}", "keep one of the two")
+            self.marks[(*loc, name)] = self.position(key_node)
+            out[name] = self.build(value_node, (*loc, name), depth + 1)
+        return out
+
+    def scalar(self, node: yaml.ScalarNode) -> Any:
+        kind = node.tag.rsplit(":", 1)[-1]
+        if not node.tag.startswith("tag:yaml.org,2002:") or kind not in ("str", "int", "float", "bool", "null"):
+            raise self.fail(node, f"the tag {node.tag!r}", "use plain YAML values without tags")
+        if kind == "str":
+            return str(node.value)
+        if kind == "null":
+            return None
+        try:
+            if kind == "bool":
+                return str(node.value).lower() == "true"
+            if kind == "int":
+                text = str(node.value)
+                return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
+            return float(self.loader.construct_yaml_float(node))
+        except ValueError as e:
+            raise self.fail(node, f"{node.value!r} is not a number", "correct the number") from e

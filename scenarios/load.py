@@ -1,0 +1,256 @@
+"""One door for every source: a path or a shipped name becomes a `Scenario`."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.clock import Clock
+from alpasim_plugin.config import Document, apply_overrides, load_yaml, validate
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import (
+    BackgroundFile,
+    Behaviour,
+    Box,
+    CameraSpec,
+    Degradation,
+    Environment,
+    Latency,
+    Rates,
+    Scenario,
+    Vehicle,
+)  # fmt: skip
+from alpasim_plugin.world.ground import flat
+from scenarios.build import build, last_us
+from scenarios.cameras import camera_spec
+from scenarios.schema import ScenarioSpec, VehicleSpec
+from scenarios.sources import SOURCES, detect, read_log
+from scenarios.variation import draw, jitter
+
+DOING = "reading a scenario"
+LIBRARY = Path(__file__).resolve().parent
+
+
+def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = ()) -> Scenario:
+    """Load a scenario file, a recorded log, or a shipped scenario by name.
+
+    Args:
+        path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, Cosmos-Drive-Dreams folder, or a name such as
+            ``smoke/straight``.
+        seed: Scene seed; None takes the file's.
+        overrides: ``key=value`` with dotted keys, applied before validation.
+
+    Returns:
+        The scenario. The same input and seed give a bit-identical one.
+
+    Raises:
+        InputError: Anything wrong with the input, with file, line and column where there is one.
+    """
+    path = find(path_or_name)
+    document = _document(path)
+    document = apply_overrides(document, overrides, DOING)
+    if seed is not None:
+        document = apply_overrides(document, [f"seed={int(seed)}"], DOING)
+    spec = validate(ScenarioSpec, document, DOING)
+    scene_id = spec.scene_id or _default_id(path)
+    fixed = tuple(text.partition("=")[0].strip() for text in overrides)
+    document = draw(document, spec, scene_id, spec.seed, fixed)
+    spec = validate(ScenarioSpec, document, DOING)
+    _check_actors(document, spec)
+    spec = jitter(spec, scene_id, spec.seed, fixed)
+    scenario = _from_log(document, spec, scene_id) if spec.log is not None else _from_road(document, spec, scene_id)
+    return _timed(document, spec, scenario)
+
+
+def find(path_or_name: str | Path) -> Path:
+    """Return the path of an existing file or folder, or of a shipped scenario's file.
+
+    Raises:
+        InputError: Neither exists; the nearest shipped names are given.
+    """
+    path = Path(path_or_name)
+    if path.exists():
+        return path
+    shipped = shipped_names()
+    name = str(path_or_name).removesuffix(".yaml")
+    if name in shipped:
+        return shipped[name]
+    near = difflib.get_close_matches(name, list(shipped), n=3, cutoff=0.5) or difflib.get_close_matches(
+        name.rsplit("/", 1)[-1], [n.rsplit("/", 1)[-1] for n in shipped], n=3, cutoff=0.5
+    )
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    raise InputError(
+        DOING, str(path_or_name), "no such file or folder, and no shipped scenario has that name",
+        f"{hint}give a path, or a name that 'simrun list scenarios' shows",
+    )  # fmt: skip
+
+
+def shipped_names() -> dict[str, Path]:
+    """Return the shipped scenarios: name without ending, to file. Suites are not among them."""
+    out = {}
+    for file in sorted(LIBRARY.glob("*/*.yaml")):
+        if file.parent.name not in ("suites", "base"):
+            out[f"{file.parent.name}/{file.stem}"] = file
+    return out
+
+
+def _document(path: Path) -> Document:
+    kind = detect(path)
+    if kind == "yaml":
+        return load_yaml(path, DOING)
+    data = {"version": 1, "log": {kind: str(path.resolve())}}
+    return Document(data, {}, str(path))
+
+
+def _default_id(path: Path) -> str:
+    resolved = path.resolve()
+    if path.suffix == ".yaml":
+        return f"{resolved.parent.name}-{resolved.stem}"
+    return resolved.stem if resolved.is_file() else resolved.name
+
+
+def _check_actors(document: Document, spec: ScenarioSpec) -> None:
+    seen: dict[str, int] = {}
+    for i, actor in enumerate(spec.actors):
+        if actor.id in seen:
+            first = document.mark(("actors", seen[actor.id], "id"))
+            raise document.error(DOING, ("actors", i, "id"), f"duplicate actor id {actor.id!r}, first at {first}", "give it another id")
+        seen[actor.id] = i
+    names = [c.name for c in spec.cameras or ()]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise document.error(DOING, ("cameras", i, "name"), f"duplicate camera name {name!r}", "give it another name")
+    if spec.log is not None and spec.actors:
+        raise document.error(DOING, ("actors",), "actors beside a recorded log", "remove actors; log.actors chooses the recorded traffic")
+
+
+def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario:
+    vehicle = _vehicle(spec.vehicle or VehicleSpec())
+
+    def fail(loc: tuple[str | int, ...], e: InputError) -> InputError:
+        return InputError(e.doing, f"{document.mark(loc)} ({e.with_what})", e.found, e.do_this)
+
+    built = build(spec, vehicle, fail)
+    start = spec.timing.start_us
+    cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else (camera_spec(),)
+    return Scenario(
+        scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
+        _rates(spec), start, last_us(spec), spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us),
+        _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, ()),
+    )  # fmt: skip
+
+
+def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario:
+    from alpasim_plugin.world.route import route_from_log
+
+    assert spec.log is not None
+    kind, text = spec.log.source
+    path = document.folder_of(("log", kind)) / text if document.marks else Path(text)
+    if not path.exists():
+        raise document.error(DOING, ("log", kind), f"{path} does not exist", "correct the path; it is relative to the scenario file")
+    record = read_log(kind, path, spec.log.ego)
+    behaviour = Behaviour("idm") if spec.log.actors == "idm" else Behaviour("replay")
+    actors = () if spec.log.actors == "none" else tuple(
+        a if a.is_static or behaviour.kind == "replay" else replace(a, behaviour=_idm(a)) for a in record.actors
+    )  # fmt: skip
+    cameras: tuple[CameraSpec, ...]
+    cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else record.cameras or (camera_spec(),)
+    first, last = int(record.ego_log.t_us[0]), int(record.ego_log.t_us[-1])
+    start = first + spec.timing.start_us
+    end = last if spec.timing.duration_us is None else start + spec.timing.duration_us
+    if end > last:
+        raise document.error(
+            DOING, ("timing", "duration_us"), f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long",
+            "shorten timing.duration_us or leave it out",
+        )  # fmt: skip
+    chosen_id = spec.scene_id or (record.scene_id if not document.marks else scene_id)
+    return Scenario(
+        chosen_id, record.source, spec.seed, record.lane_map, record.ground, record.ego_log,
+        _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
+        _rates(spec), start, end, spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us), _environment(spec),
+        _degradation(spec), _background(document, spec), record.world_origin,
+        _hash(document, spec, (record.content_hash,)), record.notes,
+    )  # fmt: skip
+
+
+def _idm(actor: Any) -> Behaviour:
+    from alpasim_plugin.world.state import speeds
+
+    if actor.label in ("pedestrian", "other"):
+        return Behaviour("replay")
+    return Behaviour("idm", {"desired_speed_mps": max(float(np.max(speeds(actor.track))), 2.0)})
+
+
+def _timed(document: Document, spec: ScenarioSpec, scenario: Scenario) -> Scenario:
+    """Check the periods and the length with the loop's own clock."""
+    try:
+        clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+    except InputError as e:
+        key = next((k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what), None)
+        loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
+        raise document.error(DOING, loc, f"{e.with_what}: {e.found}", e.do_this) from e
+    length = clock.n_steps * scenario.rates.control_us
+    if scenario.warmup_us >= length:
+        raise document.error(
+            DOING, ("timing", "warmup_us"), f"warmup_us = {scenario.warmup_us} of a scene of {length} us: nothing is left to drive",
+            "shorten timing.warmup_us or lengthen timing.duration_us",
+        )  # fmt: skip
+    return scenario
+
+
+def _vehicle(v: VehicleSpec) -> Vehicle:
+    return Vehicle(
+        Box(v.length_m, v.width_m, v.height_m), v.rear_axle_to_centre_m, v.wheelbase_m, v.max_steer_rad, v.max_steer_rate_radps,
+        v.max_accel_mps2, v.max_brake_mps2,
+    )  # fmt: skip
+
+
+def _rates(spec: ScenarioSpec) -> Rates:
+    return Rates(spec.rates.control_us, spec.rates.camera_us, spec.rates.policy_us)
+
+
+def _environment(spec: ScenarioSpec) -> Environment:
+    e = spec.environment
+    return Environment(e.buildings, e.building_height_m, e.trees_per_100m, e.poles_spacing_m, e.sky, e.texture)
+
+
+def _degradation(spec: ScenarioSpec) -> Degradation:
+    d = spec.degradation
+    return Degradation(d.kind, d.severity, d.onset_m, d.full_m)
+
+
+def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None:
+    if spec.background is None:
+        return None
+    path = document.folder_of(("background", "file")) / spec.background.file
+    if not path.is_file():
+        raise document.error(DOING, ("background", "file"), f"{path} does not exist", "correct the path")
+    matrix = np.eye(4) if spec.background.transform is None else np.array(spec.background.transform)
+    if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise document.error(
+            DOING, ("background", "transform"), "a matrix without inverse, or whose last row is not 0 0 0 1", "give rotation, scale and shift"
+        )
+    return BackgroundFile(str(path), matrix)
+
+
+def _hash(document: Document, spec: ScenarioSpec, parts: Sequence[str]) -> str:
+    """Hash the resolved specification and the bytes of every data file it uses."""
+    digest = hashlib.sha256(json.dumps(spec.model_dump(mode="json"), sort_keys=True).encode())
+    if spec.log is not None:
+        parts = (*parts, "log")
+    for part in parts:
+        digest.update(part.encode())
+    if spec.background is not None:
+        file = document.folder_of(("background", "file")) / spec.background.file
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+__all__ = ["SOURCES", "find", "load_scenario", "shipped_names"]

@@ -1,0 +1,232 @@
+"""The scenario file: versioned, strict, with units in its key names. ``python -m scenarios.schema`` writes the JSON Schema."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Field, model_validator
+
+from scenarios.schema_actors import ActorSpec
+from scenarios.schema_base import NonNegative, Part, Positive
+from scenarios.schema_road import LogSpec, RoadSpec
+
+SCHEMA_FILE = Path(__file__).with_name("schema.json")
+
+
+class LaneChangeSpec(Part):
+    """A lane change of the ego."""
+
+    at_m: NonNegative = Field(description="Start of the change, metres along the ego's way from where it starts.")
+    to_lane: int = Field(ge=0, description="Target forward lane; 0 is next to the centre line.")
+    length_m: Positive = Field(default=60.0, description="Length of the change along the road.")
+
+
+class EgoSpec(Part):
+    """How the expert that writes the ego's log drives. It follows the road, keeps its distance and slows down for bends."""
+
+    lane: int = Field(default=0, ge=0, description="Forward lane at the start; 0 is next to the centre line.")
+    start_m: NonNegative = Field(default=20.0, description="Distance of the rear axle from the road's beginning at the log's start.")
+    speed_mps: NonNegative = Field(default=10.0, description="Speed at the log's start.")
+    cruise_mps: Positive = Field(default=10.0, description="Desired speed on a free straight.")
+    max_lateral_accel_mps2: Positive = Field(default=2.0, description="Limit that slows the expert in bends.")
+    headway_s: Positive = Field(default=1.5, description="Time gap to a leader.")
+    lane_changes: tuple[LaneChangeSpec, ...] = Field(default=(), description="Lane changes, in driving order.")
+
+
+class EnvironmentSpec(Part):
+    """What stands around the road when the scene is dressed."""
+
+    buildings: float = Field(default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
+    building_height_m: tuple[Positive, Positive] = Field(default=(6.0, 18.0), description="Least and greatest height of facades.")
+    trees_per_100m: NonNegative = Field(default=4.0, description="Trees per road side.")
+    poles_spacing_m: NonNegative = Field(default=30.0, description="Distance between lamp posts; 0: none.")
+    sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
+    texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> EnvironmentSpec:
+        if self.building_height_m[0] > self.building_height_m[1]:
+            raise ValueError(f"building_height_m = {list(self.building_height_m)} | give the smaller height first")
+        return self
+
+
+class CameraModel(Part):
+    """A pinhole camera on the rig."""
+
+    name: str = Field(default="front", min_length=1, description="Name that policies ask for.")
+    width: int = Field(default=256, ge=8, le=8192, description="Image width in pixels.")
+    height: int = Field(default=144, ge=8, le=8192, description="Image height in pixels.")
+    hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
+    x_m: float = Field(default=1.6, description="Mount, metres ahead of the rear axle.")
+    y_m: float = Field(default=0.0, description="Mount, metres to the left.")
+    z_m: Positive = Field(default=1.5, description="Mount, metres above the ground.")
+    yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
+    pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
+    shutter_us: int = Field(default=0, ge=0, description="Exposure from shutter start to shutter end.")
+
+
+class RatesSpec(Part):
+    """Integer periods; camera and policy periods are whole multiples of the control period."""
+
+    control_us: int = Field(default=100_000, gt=0, description="Control period.")
+    camera_us: int = Field(default=100_000, gt=0, description="Camera period.")
+    policy_us: int = Field(default=100_000, gt=0, description="Policy period.")
+
+
+class TimingSpec(Part):
+    """Which part of the log is driven."""
+
+    start_us: int = Field(default=500_000, ge=0, description="First frame, after the log's first pose; the log before it is context.")
+    duration_us: int | None = Field(
+        default=None, gt=0, description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log."
+    )
+    warmup_us: int = Field(default=500_000, ge=0, description="The log is forced for so long after the first frame.")
+
+
+class LatencySpec(Part):
+    """Delay from observation to the plan taking effect."""
+
+    kind: Literal["none", "fixed", "measured"] = Field(default="none", description="No delay, a fixed one, or the measured one.")
+    fixed_us: int = Field(default=0, ge=0, description="Delay where kind is fixed.")
+
+
+class DegradationSpec(Part):
+    """How the renderer 3dgs differs from the scene as built."""
+
+    kind: Literal["surrogate", "none"] = Field(default="surrogate", description="Seeded stand-ins for a bad reconstruction, or nothing.")
+    severity: NonNegative = Field(default=1.0, description="Scales all terms; 0 leaves the scene as built.")
+    onset_m: NonNegative = Field(default=0.3, description="Distance from the logged path where the error starts to grow.")
+    full_m: Positive = Field(default=3.0, description="Distance where it is full.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> DegradationSpec:
+        if self.full_m <= self.onset_m:
+            raise ValueError(f"full_m = {self.full_m} is not beyond onset_m = {self.onset_m} | make full_m larger")
+        return self
+
+
+class BackgroundSpec(Part):
+    """A Gaussian file (.ply, .splat, .spz) used as background instead of the dressed map."""
+
+    file: str = Field(min_length=1, description="Path, relative to this file.")
+    transform: tuple[tuple[float, float, float, float], ...] | None = Field(
+        default=None, min_length=4, max_length=4, description="4 x 4 matrix from the file's frame to the world, row by row; may scale."
+    )
+
+
+class VehicleSpec(Part):
+    """The ego's body and chassis."""
+
+    length_m: Positive = Field(default=4.855, description="Body length.")
+    width_m: Positive = Field(default=1.88, description="Body width.")
+    height_m: Positive = Field(default=1.6, description="Body height.")
+    rear_axle_to_centre_m: float = Field(default=1.4, description="From the rear axle forwards to the body's middle.")
+    wheelbase_m: Positive = Field(default=2.85, description="Distance between the axles.")
+    max_steer_rad: Positive = Field(default=0.6, lt=1.5, description="Largest road-wheel angle.")
+    max_steer_rate_radps: Positive = Field(default=0.8, description="Largest steering rate.")
+    max_accel_mps2: Positive = Field(default=3.5, description="Largest acceleration.")
+    max_brake_mps2: Positive = Field(default=8.0, description="Largest deceleration.")
+
+
+class JitterSpec(Part):
+    """Ranges within which scenes of different seeds differ; 0 switches a term off. Uniform, relative unless the name has a unit."""
+
+    length: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of element lengths.")
+    curvature: float = Field(default=0.1, ge=0, le=0.5, description="Relative change of curvatures.")
+    lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Relative change of the lane width.")
+    speed: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
+    position_m: float = Field(default=1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
+    time_us: int = Field(default=150_000, ge=0, description="Shift of scripted moments, each way.")
+
+
+class RangeSpec(Part):
+    """A number drawn uniformly."""
+
+    low: float = Field(description="Smallest value.")
+    high: float = Field(description="Largest value.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> RangeSpec:
+        if self.low > self.high:
+            raise ValueError(f"low = {self.low} is above high = {self.high} | swap them")
+        return self
+
+
+class ChoiceSpec(Part):
+    """One of several values, drawn with equal chance."""
+
+    choice: tuple[Any, ...] = Field(min_length=1, description="Values to choose from.")
+
+
+class ScenarioSpec(Part):
+    """One scenario file."""
+
+    version: Literal[1] = Field(description="Version of this schema: 1.")
+    scene_id: str | None = Field(
+        default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Name of the scene; none: the file's folder and name."
+    )
+    description: str = Field(default="", description="One sentence for people.")
+    tags: tuple[str, ...] = Field(default=(), description="Words to find it by.")
+    seed: int = Field(default=0, ge=0, description="Scene seed: geometry, textures, scripted actors.")
+    road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
+    log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
+    ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
+    actors: tuple[ActorSpec, ...] = Field(default=(), description="Other road users.")
+    environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
+    cameras: tuple[CameraModel, ...] | None = Field(
+        default=None, min_length=1, description="Cameras; none: the log's own, or one named front."
+    )
+    rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
+    timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
+    latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
+    degradation: DegradationSpec = Field(default=DegradationSpec(), description="What the renderer 3dgs gets wrong.")
+    background: BackgroundSpec | None = Field(default=None, description="A Gaussian file as background.")
+    vehicle: VehicleSpec | None = Field(default=None, description="The ego vehicle; none: the log's own, or the default one.")
+    jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of different seeds differ.")
+    variations: dict[str, RangeSpec | ChoiceSpec] = Field(
+        default={}, description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed."
+    )
+    samples: tuple[dict[str, Any], ...] = Field(
+        default=(), description="Explicit samples, each dotted key to value; the scene seed picks one, round and round."
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ScenarioSpec:
+        if (self.road is None) == (self.log is None):
+            raise ValueError("give exactly one of 'road' and 'log' | add road: {segments: [...]} or log: {commonroad: FILE}")
+        return self
+
+
+def json_schema() -> str:
+    """Return the JSON Schema as committed text."""
+    schema = ScenarioSpec.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "simrun scenario"
+    return json.dumps(schema, indent=1, sort_keys=True) + "\n"
+
+
+def models() -> dict[str, type[BaseModel]]:
+    """Return every section's model by the key path under which it stands in a file, for the documentation."""
+    from scenarios.schema_actors import ACTOR_KINDS
+    from scenarios.schema_road import SEGMENT_KINDS
+
+    out: dict[str, type[BaseModel]] = {"": ScenarioSpec, "road": RoadSpec, "log": LogSpec, "ego": EgoSpec}
+    out["ego.lane_changes[]"] = LaneChangeSpec
+    out |= {f"road.segments[] kind: {kind}": model for kind, model in SEGMENT_KINDS.items()}
+    out |= {f"actors[] kind: {kind}": model for kind, model in ACTOR_KINDS.items()}
+    out |= {
+        "environment": EnvironmentSpec, "cameras[]": CameraModel, "rates": RatesSpec, "timing": TimingSpec, "latency": LatencySpec,
+        "degradation": DegradationSpec, "background": BackgroundSpec, "vehicle": VehicleSpec, "jitter": JitterSpec,
+        "variations.KEY (a range)": RangeSpec, "variations.KEY (a choice)": ChoiceSpec,
+    }  # fmt: skip
+    return out
+
+
+Seed = Annotated[int, Field(ge=0)]
+
+if __name__ == "__main__":
+    SCHEMA_FILE.write_text(json_schema(), encoding="utf-8")
+    sys.stdout.write(f"wrote {SCHEMA_FILE}\n")

@@ -1,0 +1,85 @@
+"""Seeds make scenes: declared variations, explicit samples, and jitter of the numbers of a scenario file.
+
+Every drawn number has its own stream, keyed by scene, seed and the number's key path, so adding an actor does not change the others.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from alpasim_plugin.config import Document, apply_overrides
+from alpasim_plugin.config_validate import dotted
+from alpasim_plugin.seeding import stream
+from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
+from scenarios.schema_base import Part
+
+_LENGTHS, _SPEEDS = ("length_m",), ("speed_mps", "cruise_mps", "desired_speed_mps", "end_speed_mps")
+_CURVATURES = ("curvature_per_m", "start_curvature_per_m", "end_curvature_per_m")
+_TIMES = ("at_us", "brake_at_us", "resume_at_us")
+
+
+def draw(document: Document, spec: ScenarioSpec, scene_id: str, seed: int, fixed: tuple[str, ...] = ()) -> Document:
+    """Return the document with the variations and the sample of this seed written into it.
+
+    Keys that the user fixed by an override keep their value.
+    """
+    chosen: dict[str, Any] = {}
+    for key, rule in spec.variations.items():
+        rng = stream(scene_id, seed, f"scenario/variation/{key}")
+        if isinstance(rule, RangeSpec):
+            chosen[key] = float(rng.uniform(rule.low, rule.high))
+        else:
+            chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
+    if spec.samples:
+        chosen |= spec.samples[seed % len(spec.samples)]
+    kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
+    return apply_overrides(document, kept, "drawing a variation", origin="variation")
+
+
+def jitter(spec: ScenarioSpec, scene_id: str, seed: int, fixed: tuple[str, ...] = ()) -> ScenarioSpec:
+    """Return the specification with road, ego and actors changed within the declared ranges."""
+    ids = {str(i): actor.id for i, actor in enumerate(spec.actors)}
+    touched = {_by_id(k, ids) for k in (*fixed, *spec.variations, *(k for sample in spec.samples for k in sample))}
+
+    def walk(part: Any, loc: tuple[str | int, ...], name: str) -> Any:
+        if isinstance(part, Part):
+            pairs = ((k, getattr(part, k)) for k in type(part).model_fields)
+            changed = {k: walk(v, (*loc, k), k) for k, v in pairs}
+            return part.model_copy(update={k: v for k, v in changed.items() if v is not getattr(part, k)})
+        if isinstance(part, tuple) and part and isinstance(part[0], Part):
+            # Actors are named by their ids, so that the order of the list does not matter.
+            keys = [getattr(item, "id", i) for i, item in enumerate(part)]
+            new = tuple(walk(item, (*loc, key), "") for item, key in zip(part, keys, strict=True))
+            return part if all(a is b for a, b in zip(new, part, strict=True)) else new
+        if isinstance(part, bool) or not isinstance(part, int | float) or ".".join(map(str, loc)) in touched:
+            return part
+        return _shake(part, loc, name, spec.jitter, scene_id, seed)
+
+    update = {"road": walk(spec.road, ("road",), "road"), "ego": walk(spec.ego, ("ego",), "ego")}
+    update["actors"] = walk(spec.actors, ("actors",), "actors")
+    return spec.model_copy(update=update)
+
+
+def _by_id(key: str, ids: dict[str, str]) -> str:
+    """Write ``actors.0.s_m`` as ``actors.lead.s_m``."""
+    head, _, rest = key.partition(".")
+    item, _, tail = rest.partition(".")
+    return f"actors.{ids[item]}.{tail}" if head == "actors" and item in ids else key
+
+
+def _shake(value: float, loc: tuple[str | int, ...], name: str, j: JitterSpec, scene_id: str, seed: int) -> float:
+    # One factor bends the whole road, so that transitions still end with the curvature of the arc after them.
+    key = "curvature" if name in _CURVATURES else dotted(loc)
+    u = float(stream(scene_id, seed, f"scenario/jitter/{key}").uniform(-1.0, 1.0))
+    if name in _TIMES:
+        return max(0, value + round(u * j.time_us))
+    if name == "s_m":
+        return value + u * j.position_m
+    relative = {
+        **dict.fromkeys(_LENGTHS, j.length if loc[0] == "road" else 0.0),
+        **dict.fromkeys(_CURVATURES, j.curvature),
+        **dict.fromkeys(_SPEEDS, j.speed),
+        "lane_width_m": j.lane_width,
+    }.get(name, 0.0)
+    return value * (1.0 + u * relative) if relative else value
