@@ -9,15 +9,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alpasim_plugin.renderers.base import make_renderer
+    from alpasim_plugin.renderers import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
-    from policies.base import make_policy
+    from policies import make_policy
     from scenarios.load import load_scenario
 
 _HOMES = {
     "load_scenario": "scenarios.load",
-    "make_policy": "policies.base",
-    "make_renderer": "alpasim_plugin.renderers.base",
+    "make_policy": "policies",
+    "make_renderer": "alpasim_plugin.renderers",
     "run_rollout": "alpasim_plugin.runtime.rollout",
 }
 

@@ -31,8 +31,7 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
     Raises:
         InputError: The name is unknown, the import fails, or what it makes is not a policy.
     """
-    is_import = ":" in name and "://" not in name
-    factory = _import(name) if is_import else POLICIES.get(name)
+    factory, is_import = find_policy(name)
     policy = factory(scenario) if not is_import or _takes_an_argument(factory) else factory()
     if not isinstance(policy, Policy):
         missing = [part for part in ("sensors", "reset", "act") if not hasattr(policy, part)]
@@ -43,6 +42,16 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
             "give it `sensors`, `reset(seed, route)` and `act(observation)`; see docs/policies.md",
         )
     return policy
+
+
+def find_policy(name: str) -> tuple[Callable[..., Policy], bool]:
+    """Return the factory of a policy and whether its name is an import path.
+
+    Raises:
+        InputError: The name is unknown or the import fails.
+    """
+    is_import = ":" in name and "://" not in name
+    return (_import(name) if is_import else POLICIES.get(name)), is_import
 
 
 def plan_times(t_us: int, horizon_s: float = PLAN_HORIZON_S) -> I64:

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from alpasim_plugin.renderers.base import RENDERERS
+from alpasim_plugin.renderers import RENDERERS
 from evaluators import METRICS
-from policies.base import POLICIES
+from policies import POLICIES
 from scenarios.suite import shipped
 
 EPILOG = "Example: `simrun list scenarios`"

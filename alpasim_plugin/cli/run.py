@@ -12,13 +12,13 @@ import typer
 
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.renderers.base import RENDERERS
+from alpasim_plugin.renderers import RENDERERS
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from evaluators import PRESETS
 from evaluators.report import render_table
-from policies.base import check_policy_name
+from policies.base import find_policy
 from scenarios.suite import expand
 
 INTERRUPTED = 130
@@ -68,7 +68,7 @@ def run(
     for name in names:
         RENDERERS.get(name)
     for name in drivers:
-        check_policy_name(name)
+        find_policy(name)
     _check_preset(preset)
     if baseline is not None and baseline not in names:
         raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.errors import SimrunError
-from alpasim_plugin.renderers.base import make_renderer
+from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
 from alpasim_plugin.types import Scenario
-from policies.base import make_policy
+from policies import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
