@@ -44,7 +44,8 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).unlink(missing_ok=True)
         scenario = _scenario(cell.ref)
-        with Recorder(scenario, cell.seed, folder, cell.rollout_key, options.images, options.video != "none") as recorder:
+        parts = {"sensorsim": cell.renderer, "egodriver": cell.policy}
+        with Recorder(scenario, cell.seed, folder, cell.rollout_key, options.images, options.video != "none", parts) as recorder:
             run_rollout(
                 scenario,
                 make_renderer(cell.renderer, scenario, seed=cell.seed, device=options.device, threads=threads),

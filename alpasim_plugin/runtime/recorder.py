@@ -34,6 +34,7 @@ class Recorder:
         session: Names the rollout in the log; equal rollouts have equal names.
         images: How camera frames enter the log.
         keep_frames: Keep every frame for a video, or only those of the strip.
+        versions: What to put into the log's header by service, such as ``{"sensorsim": "3dgs", "egodriver": "lane-camera"}``.
     """
 
     def __init__(
@@ -44,12 +45,13 @@ class Recorder:
         session: str = "",
         images: Literal["none", "jpeg", "png"] = "jpeg",
         keep_frames: bool = False,
+        versions: Mapping[str, str] | None = None,
     ) -> None:
         self._temporary = tempfile.TemporaryDirectory(prefix="simrun-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
         self._scenario, self._seed = scenario, seed
         self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, session or f"{scenario.scene_id}/{seed}"))
-        self._images, self._keep_frames = images, keep_frames
+        self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
         self._times = StageTimes()
         self._frames: list[dict[str, Any]] = []
         self._kept: list[tuple[int, U8]] = []
@@ -77,7 +79,7 @@ class Recorder:
         self._strip_us = {
             clock.start_us + int(f * clock.n_steps) * clock.rates.control_us for f in np.linspace(0.1, 0.9, STRIP_FRAMES)
         }
-        header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps)
+        header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps, self._versions)
         self._writer = AslWriter(self.folder / LOG_NAME, header)
         self._writer.begin(list(cameras.values()))
 
