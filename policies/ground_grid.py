@@ -79,8 +79,8 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     first, last = min(v[0], camera.height - 1.0), v[1]
     n = int(min(MAX_ROWS, max(first - last, 8) + 1))
     # Equal steps in the image row are steps of x^2 on the ground: each grid row has its own image row.
-    x = np.interp(-np.linspace(first, last, n), -rows_v, candidates)
-    y = HALF_WIDTH_M - CELL_M * np.arange(round(2 * HALF_WIDTH_M / CELL_M) + 1)
+    x = np.asarray(np.interp(-np.linspace(first, last, n), -rows_v, candidates), dtype=np.float64)
+    y = HALF_WIDTH_M - CELL_M * np.arange(round(2 * HALF_WIDTH_M / CELL_M) + 1, dtype=np.float64)
     points = np.stack([np.repeat(x, len(y)), np.tile(y, len(x)), np.zeros(len(x) * len(y))], axis=1)
     uv = _project(camera, T_camera_rig, points).reshape(len(x), len(y), 2)
     inside = (uv[..., 0] >= 0) & (uv[..., 0] <= camera.width - 1) & (uv[..., 1] >= 0) & (uv[..., 1] <= camera.height - 1)

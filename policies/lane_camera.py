@@ -189,7 +189,8 @@ class LaneCamera:
             names = ("lane_offset_m", "lane_heading_rad", "lane_curvature_1pm", "lane_bend_1pm2", "lane_width_m")
             out.update({name: float(value) for name, value in zip(names, lane.mean, strict=True)})
             out.update(lane_sigma_m=float(np.sqrt(lane.cov[0, 0])), blind_m=lane.blind_m)
-            out.update(paint_left_m=lane.left_m, paint_right_m=lane.right_m)
+        if self.lane is not None:
+            out.update(paint_left_m=self.lane.left_m, paint_right_m=self.lane.right_m)
         if self.obstacle is not None:
             o = self.obstacle
             out.update(obstacle_m=o.distance_m, obstacle_mps=o.speed_mps, obstacle_confirmed=o.confirmed)

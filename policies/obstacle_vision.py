@@ -110,10 +110,12 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     hit = (filled > FILLED) & (clear < CLEAR) & usable[:, None]
     if not hit.any():
         return None
-    i = int(np.argmax(hit.any(axis=1)))
-    pair = _box_mean(table, np.array([max(i - 1, 0), i]), np.array([max(i, 1), i + 1]), u[[i, i]])[:, hit[i]].mean(axis=1)
-    part = float(np.clip((pair[1] - 0.5) / max(pair[1] - pair[0], 0.1), 0.0, 1.0))
-    return float(grid.x_m[i] - part * grid.row_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
+    first = int(np.argmax(hit.any(axis=1)))
+    # A box that is mostly filled may begin before the thing does: the foot is where its rows become anomalous.
+    behind = np.arange(first, max(int(last[first]), first + 1))
+    level = _box_mean(table, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, hit[first]].mean(axis=1)
+    i = first + int(np.argmax(level > 0.5))
+    return float(grid.x_m[i] - 0.5 * grid.row_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
 
 
 def _sums_along_sight(value: U8, grid: GroundGrid) -> F64:

@@ -1,0 +1,251 @@
+"""Does a policy keep the contract? Canned situations, and a readable sentence for every fault.
+
+What is checked: cameras asked for exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
+radians and microseconds; they reach two seconds ahead; the same seed gives the same plans; a reset forgets the drive before; an
+older frame is accepted; the answer is in time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.geometry import inverse, se2, trajectory_from_poses, transform_points
+from alpasim_plugin.types import (
+    F64,
+    CameraSpec,
+    Degradation,
+    EgoState,
+    Environment,
+    Frame,
+    HeightField,
+    LaneMap,
+    Latency,
+    Observation,
+    Plan,
+    Policy,
+    Rates,
+    Route,
+    Scenario,
+    Vehicle,
+)
+from policies.base import make_policy
+from policies.conformance_faults import (
+    MIN_HORIZON_S,
+    Fault,
+    difference,
+    frame_fault,
+    remarks,
+    shape_fault,
+    side_fault,
+    time_fault,
+    unit_fault,
+)
+from policies.painted_road import PaintedRoad, pinhole_camera
+
+START_US = 1_700_000_000_000_000  # recordings use epoch time: a policy that counts in float32 is found out
+T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)  # away from the origin: world coordinates are told from rig coordinates
+STEPS = 6
+STEP_US = 100_000
+
+PLAN_FAULTS: tuple[tuple[str, Fault, str], ...] = (
+    ("values", shape_fault, "shapes fit and every value is finite"),
+    ("times", time_fault, f"times begin now, increase, and reach {MIN_HORIZON_S:.0f} s"),
+    ("frame", frame_fault, "plans begin at the ego and yaw follows the motion"),
+)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One property and whether it holds; ``sentence`` tells what was found."""
+
+    name: str
+    ok: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a conformance run found."""
+
+    checks: tuple[Check, ...]
+    notes: tuple[str, ...]
+    latency_ms: tuple[float, float]  # median and worst answer, the first excluded
+
+    @property
+    def ok(self) -> bool:
+        """Tell whether every check passed."""
+        return all(check.ok for check in self.checks)
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Give the sentences of the failed checks."""
+        return tuple(check.sentence for check in self.checks if not check.ok)
+
+    def __str__(self) -> str:
+        lines = [f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.sentence}" for check in self.checks]
+        lines += [f"note {note}" for note in self.notes]
+        return "\n".join([*lines, f"answers in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)"])
+
+
+@dataclass(frozen=True)
+class Situation:
+    """A stretch of road driven at a constant speed, the policy being asked every 0.1 s."""
+
+    name: str
+    curvature_1pm: float = 0.0
+    speed_mps: float = 10.0
+    frame_age_us: int = 0
+
+
+STRAIGHT, LEFT, RIGHT = Situation("straight"), Situation("left", 1 / 60), Situation("right", -1 / 60)
+STANDING, OLD_FRAME = Situation("standing", speed_mps=0.0), Situation("old frame", frame_age_us=STEP_US)
+
+
+def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scenario:
+    """Return the scenario that `check_policy` plays by default: straight on at 10 m/s, no actors, an empty map."""
+    t_us = START_US - 1_000_000 + STEP_US * np.arange(80)
+    poses = [T_WORLD_ROAD @ se2(10.0 * (int(t) - START_US) * 1e-6, 0.0, 0.0) for t in t_us]
+    log = trajectory_from_poses(t_us, np.array(poses))
+    return Scenario(
+        scene_id="conformance",
+        source="yaml",
+        seed=0,
+        lane_map=LaneMap({}),
+        ground=HeightField(0.0, 0.0, 1.0, np.zeros((2, 2))),
+        ego_log=log,
+        vehicle=Vehicle(),
+        route=Route(log.xyz),
+        actors=(),
+        cameras=tuple(cameras),
+        rates=Rates(),
+        start_us=START_US,
+        end_us=int(t_us[-1]),
+        warmup_us=0,
+        latency=Latency(),
+        environment=Environment(),
+        degradation=Degradation(),
+    )
+
+
+def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency_limit_ms: float = 100.0) -> Report:
+    """Drive a policy through the canned situations and report every breach of the contract.
+
+    A policy with ``controller = "perfect"`` replays a recording, so it is only asked what `canned_scenario` records.
+
+    Args:
+        policy: A policy made for ``scenario``, or its name (see `make_policy`).
+        scenario: Whose cameras the frames imitate; by default `canned_scenario`.
+        latency_limit_ms: Longest acceptable median answer.
+
+    Raises:
+        InputError: The name is unknown, or what it names is not a policy.
+    """
+    scenario = canned_scenario() if scenario is None else scenario
+    policy = make_policy(policy, scenario) if isinstance(policy, str) else policy
+    cameras = {camera.name: camera for camera in scenario.cameras}
+    unknown = [sensor.camera for sensor in policy.sensors if sensor.camera not in cameras]
+    if unknown:
+        sentence = f"the policy asks for cameras {unknown}; the scenario has {sorted(cameras)}"
+        return Report((Check("sensors", False, sentence),), (), (0.0, 0.0))
+    used = {sensor.camera: cameras[sensor.camera] for sensor in policy.sensors}
+    checks = [Check("sensors", True, f"asks for {sorted(used) or 'no camera'}")]
+    replays = getattr(policy, "controller", "") == "perfect"
+    plans: dict[str, list[Plan]] = {}
+    durations: list[float] = []
+    broken: list[Check] = []
+    for situation in (STRAIGHT, OLD_FRAME) if replays else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING):
+        answer = _drive(policy, situation, used, durations)
+        if isinstance(answer, str):
+            broken.append(Check("answers", False, answer))
+            continue
+        plans[situation.name] = answer
+        broken += _plan_faults(situation, answer)
+    checks += broken
+    if not broken:
+        checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
+        checks.append(_check("units", unit_fault(plans["straight"][0]), "at 10 m/s a plan advances as a car does"))
+        if not replays:
+            checks.append(_check("side", side_fault(plans["left"][-1], plans["right"][-1]), "no road leads to its wrong side"))
+        checks += _memory_checks(policy, used, plans["straight"], OLD_FRAME if replays else LEFT)
+    median, worst = (float(np.median(durations)), max(durations)) if durations else (0.0, 0.0)
+    if durations:
+        checks.append(Check("latency", median <= latency_limit_ms, f"answers in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
+    return Report(tuple(checks), tuple(remarks(plans)), (median, worst))
+
+
+def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterator[Observation]:
+    """Yield what the policy sees in a situation: painted frames, history, ego state and route."""
+    road = PaintedRoad(situation.curvature_1pm)
+
+    def pose(t_us: int) -> F64:
+        return T_WORLD_ROAD @ road.pose(situation.speed_mps * (t_us - START_US) * 1e-6)
+
+    for step in range(STEPS):
+        now = START_US + step * STEP_US
+        times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
+        T_world_rig = pose(now)
+        frames = {}
+        for name, camera in cameras.items():
+            seen_us = now - situation.frame_age_us
+            rgb = road.image(camera, inverse(T_WORLD_ROAD) @ pose(seen_us), seed=step)
+            rgb.setflags(write=False)  # a policy that scribbles on its input is found out
+            frames[name] = Frame(seen_us, name, rgb)
+        ahead = situation.speed_mps * (now - START_US) * 1e-6 + 80 / 19 * np.arange(20)
+        route = np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in ahead])
+        ego = EgoState(now, T_world_rig, situation.speed_mps, 0.0, situation.speed_mps * situation.curvature_1pm)
+        history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
+        yield Observation(now, frames, cameras, ego, history, transform_points(inverse(T_world_rig), route))
+
+
+def _drive(policy: Policy, situation: Situation, cameras: dict[str, CameraSpec], durations: list[float]) -> list[Plan] | str:
+    """Return the answers, or a sentence where the policy raised."""
+    road = PaintedRoad(situation.curvature_1pm)
+    where = f"in the situation {situation.name!r} the policy"
+    plans: list[Plan] = []
+    try:
+        policy.reset(0, Route(np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)])))
+        for step, observation in enumerate(observations(situation, cameras)):
+            began = time.perf_counter()
+            plans.append(policy.act(observation))
+            if step:
+                durations.append(1e3 * (time.perf_counter() - began))
+    except SimrunError as error:
+        return f"{where} failed: {error.doing}: {error.found}"
+    except Exception as error:  # whatever a foreign policy raises is a finding, not a crash of the check
+        return f"{where} raised {type(error).__name__}: {error}"
+    return plans
+
+
+def _plan_faults(situation: Situation, plans: list[Plan]) -> list[Check]:
+    """Return the first fault: the later checks need what the earlier ones assure."""
+    asked = [START_US + step * STEP_US for step in range(len(plans))]
+    for name, fault, _ in PLAN_FAULTS:
+        sentence = fault(plans, asked, T_WORLD_ROAD)
+        if sentence:
+            return [Check(name, False, f"in the situation {situation.name!r} {sentence}")]
+    return []
+
+
+def _memory_checks(policy: Policy, cameras: dict[str, CameraSpec], straight: list[Plan], other: Situation) -> list[Check]:
+    """Compare fresh drives with the one that was driven first of all."""
+    again = _drive(policy, STRAIGHT, cameras, [])
+    # The drive before ended elsewhere, at another speed, and was itself a first.
+    _drive(policy, other if other is OLD_FRAME else replace(other, speed_mps=4.0), cameras, [])
+    after = _drive(policy, STRAIGHT, cameras, [])
+    same = "the same seed and observations give the same plans"
+    apart = float("inf") if isinstance(again, str) else difference(straight, again)
+    if apart > 0:
+        return [Check("determinism", False, f"it does not hold that {same}: they differ by up to {apart:.3g} m")]
+    forgets = "a reset forgets the drive before"
+    apart = float("inf") if isinstance(after, str) else difference(straight, after)
+    sentence = forgets if apart == 0 else f"it does not hold that {forgets}: plans differ by up to {apart:.3g} m"
+    return [Check("determinism", True, same), Check("reset", apart == 0, sentence)]
+
+
+def _check(name: str, fault: str, fine: str) -> Check:
+    return Check(name, not fault, fault or fine)

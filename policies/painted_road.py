@@ -1,0 +1,144 @@
+"""A painted road seen through a pinhole camera, by casting every pixel onto the ground plane.
+
+It needs no renderer, so it serves to check a policy before there is a scene, and to check the renderers' policy tests from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.geometry import inverse, se2
+from alpasim_plugin.types import F64, U8, CameraSpec
+
+Colour = tuple[int, int, int]
+WHITE, YELLOW = (235, 235, 235), (230, 190, 60)
+DASH_M, PERIOD_M = 3.0, 9.0
+
+
+def pinhole_camera(
+    name: str = "front",
+    width: int = 256,
+    height: int = 144,
+    hfov_deg: float = 70.0,
+    mount_m: tuple[float, float, float] = (1.6, 0.0, 1.5),
+    pitch_deg: float = 0.0,
+) -> CameraSpec:
+    """Return a camera that looks along the rig's x axis; a positive pitch looks down."""
+    f = width / 2 / np.tan(np.radians(hfov_deg) / 2)
+    K = np.array([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
+    pitch = np.radians(pitch_deg)
+    forward, right = np.array([np.cos(pitch), 0.0, -np.sin(pitch)]), np.array([0.0, -1.0, 0.0])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = mount_m
+    return CameraSpec(name, width, height, K, T)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A painted line at ``offset_m`` to the left of the ego lane's centre."""
+
+    offset_m: float
+    dashed: bool = False
+    colour: Colour = WHITE
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A flat patch of another colour, such as a crosswalk or a stain."""
+
+    s_m: tuple[float, float]
+    offset_m: tuple[float, float]
+    colour: Colour
+
+
+@dataclass(frozen=True)
+class Block:
+    """A cuboid on the road; its face towards the ego is darker and stands on a dark edge, as cars do."""
+
+    s_m: float  # of its centre
+    offset_m: float = 0.0
+    size_m: tuple[float, float, float] = (4.5, 1.8, 1.5)  # length, width, height
+    colour: Colour = (150, 30, 30)
+
+
+@dataclass(frozen=True)
+class PaintedRoad:
+    """A road of constant curvature through the world's origin, where its ego lane runs along x; grass and sky around it."""
+
+    curvature_1pm: float = 0.0  # left positive
+    lines: tuple[Line, ...] = (Line(1.75, dashed=True), Line(-1.75), Line(5.25, colour=YELLOW))
+    road_m: tuple[float, float] = (-3.0, 6.5)
+    patches: tuple[Patch, ...] = ()
+    blocks: tuple[Block, ...] = ()
+    line_width_m: float = 0.15
+    noise: float = 4.0  # grey levels
+    asphalt: Colour = (95, 95, 98)
+    grass: Colour = (80, 110, 60)
+    sky: Colour = (170, 195, 225)
+
+    def pose(self, s_m: float, offset_m: float = 0.0, yaw_rad: float = 0.0) -> F64:
+        """Return the pose ``(4, 4)`` at arc length s of the ego lane, ``offset_m`` to its left and turned by ``yaw_rad`` from it."""
+        k = self.curvature_1pm
+        angle = k * s_m
+        x = s_m if k == 0 else float(np.sin(angle)) / k
+        y = 0.0 if k == 0 else (1 - float(np.cos(angle))) / k
+        return se2(x - offset_m * float(np.sin(angle)), y + offset_m * float(np.cos(angle)), angle + yaw_rad)
+
+    def coordinates(self, x_m: F64, y_m: F64) -> tuple[F64, F64]:
+        """Return arc length and offset to the left of world points."""
+        k = self.curvature_1pm
+        if k == 0:
+            return x_m, y_m
+        sign, radius = float(np.sign(k)), np.hypot(x_m, y_m - 1 / k)
+        angle = np.arctan2(x_m * sign, (1 / k - y_m) * sign)
+        return np.asarray(angle / k * sign), np.asarray(sign * (abs(1 / k) - radius))
+
+    def image(self, camera: CameraSpec, T_world_rig: F64, seed: int = 0, supersample: int = 2) -> U8:
+        """Draw the road ``(H, W, 3)`` as the camera sees it from a rig pose."""
+        n = supersample
+        T = T_world_rig @ camera.T_rig_camera
+        u, v = np.meshgrid((np.arange(camera.width * n) + 0.5) / n, (np.arange(camera.height * n) + 0.5) / n)
+        K = camera.K
+        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1) @ T[:3, :3].T
+        down = np.minimum(rays[..., 2], -1e-6)
+        depth = -T[2, 3] / down
+        ground = (rays[..., 2] < 0) & (depth < 400.0)
+        s, offset = self.coordinates(T[0, 3] + depth * rays[..., 0], T[1, 3] + depth * rays[..., 1])
+        image = np.empty((*u.shape, 3), dtype=np.float32)
+        image[:] = self.sky
+        image[ground] = self.grass
+        on_road = ground & (offset > self.road_m[0]) & (offset < self.road_m[1])
+        image[on_road] = self.asphalt
+        for line in self.lines:
+            paint = on_road & (np.abs(offset - line.offset_m) < self.line_width_m / 2)
+            if line.dashed:
+                paint &= np.mod(s, PERIOD_M) < DASH_M
+            image[paint] = line.colour
+        for patch in self.patches:
+            inside = (s > patch.s_m[0]) & (s < patch.s_m[1]) & (offset > patch.offset_m[0]) & (offset < patch.offset_m[1])
+            image[on_road & inside] = patch.colour
+        for block in sorted(self.blocks, key=lambda b: -b.s_m):
+            self._draw(image, K, T, block, n)
+        small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        noise = np.random.Generator(np.random.Philox(key=seed)).normal(0.0, self.noise, small.shape)
+        return np.asarray(np.clip(small + noise, 0, 255).astype(np.uint8))
+
+    def _draw(self, image: np.ndarray, K: F64, T_world_camera: F64, block: Block, n: int) -> None:
+        length, width, height = block.size_m
+        ends = [(sx * length / 2, sy * width / 2, z, 1.0) for sx in (-1, 1) for z in (0.0, height) for sy in (-1, 1)]
+        T = inverse(T_world_camera) @ self.pose(block.s_m, block.offset_m)
+        corners = (T @ np.array(ends).T).T[:, :3]
+        if (corners[:, 2] < 0.2).all():
+            return
+        corners[:, 2] = np.maximum(corners[:, 2], 0.2)
+        uv = ((corners / corners[:, 2:]) @ K.T)[:, :2] * n
+        shades = ((uv, 1.0), (uv[:4], 0.8))  # the whole outline, then the face towards the ego
+        for points, shade in shades:
+            hull = cv2.convexHull(points.astype(np.float32)).astype(np.int32)
+            cv2.fillConvexPoly(image, hull, tuple(shade * c for c in block.colour))
+        foot = [tuple(int(c) for c in uv[i]) for i in (0, 1)]
+        cv2.line(image, foot[0], foot[1], (20.0, 20.0, 20.0), n)
