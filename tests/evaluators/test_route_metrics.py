@@ -1,0 +1,131 @@
+"""Distance from the recorded path and progress along it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evaluators import rollout_values, score
+from evaluators.reference import point_to_segment, route_by_step
+from evaluators.route import progress_so_far, to_path
+from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
+
+
+def scored(log):
+    return by_name(score(log, scene(TWO_LANES, log)))
+
+
+def test_driving_the_recording_again_has_no_distance_and_full_progress():
+    log = rollout(track(np.linspace(0, 30, 31), 0.0))
+    found = scored(log)
+    assert found["route_distance_m"].value.max() < 1e-12
+    assert found["dist_to_gt_location"].value.max() < 1e-12
+    assert found["progress"].value[-1] == pytest.approx(1.0)
+    assert found["progress_rel"].value == pytest.approx(np.ones(31))
+    assert found["dist_traveled_m"].value[-1] == pytest.approx(30.0)
+    assert found["gt_dist_traveled_m"].value[0] == pytest.approx(30.0)
+
+
+def test_route_distance_is_the_mean_over_the_scored_steps_of_the_distance_to_the_path():
+    y = np.array([5.0, 5.0, 0.0, 1.0, 2.0])  # 5 m away in the warm-up: does not count
+    log = rollout(track(np.arange(5.0), y), log=track(np.arange(5.0), 0.0), warmup_us=200_000)
+    values = rollout_values(score(log, scene(TWO_LANES, log)))
+    assert values["route_distance_m"].value == pytest.approx(1.0)
+    assert values["dist_to_gt_trajectory"].value == pytest.approx(2.0)
+    assert values["dist_traveled_m"].value == pytest.approx(2 * np.sqrt(2.0))
+
+
+def test_the_point_compared_is_the_box_centre():
+    # Same box centres, other heading: the rear axle is elsewhere, the distance is zero.
+    log = rollout(track(np.arange(5.0), 0.0, yaw=0.3), log=track(np.arange(5.0), 0.0))
+    assert scored(log)["route_distance_m"].value.max() < 1e-12
+
+
+def test_lagging_behind_shows_in_location_and_progress_but_not_in_route_distance():
+    log = rollout(track(np.arange(5.0) / 2, 0.0), log=track(np.arange(5.0), 0.0))
+    found = scored(log)
+    assert found["route_distance_m"].value.max() < 1e-12
+    assert found["dist_to_gt_location"].value == pytest.approx(np.arange(5.0) / 2)
+    assert found["progress"].value == pytest.approx(np.arange(5.0) / 8)
+    assert found["progress_rel"].value == pytest.approx([1.0, 0.5, 0.5, 0.5, 0.5])
+
+
+def test_a_recording_that_stands_still_has_no_progress_and_is_not_divided_by_zero():
+    log = rollout(track(np.arange(3.0), 0.0), log=track(0.0, 0.0, n=3))
+    found = scored(log)
+    assert not found["progress"].valid.any()
+    assert found["progress"].reason == "the recorded path has no length"
+    assert found["progress_rel"].value.tolist() == [1.0, 1.0, 1.0]
+    assert found["route_distance_m"].value == pytest.approx(np.arange(3.0))
+
+
+def test_one_step_rollout_and_one_pose_recording_are_scored():
+    log = rollout(track(3.0, 4.0), log=track(0.0, 0.0))
+    values = rollout_values(score(log, scene(TWO_LANES, log)))
+    assert values["route_distance_m"].value == pytest.approx(5.0)
+    assert values["progress_rel"].value == 1.0
+    assert values["dist_traveled_m"].value == 0.0
+    assert (values["progress"].value, values["progress"].valid) == (None, False)
+
+
+def test_steps_after_the_end_of_the_recording_have_no_recorded_location():
+    log = rollout(track(np.arange(5.0), 0.0), log=track(np.arange(3.0), 0.0))
+    found = scored(log)["dist_to_gt_location"]
+    assert found.valid.tolist() == [True, True, True, False, False]
+    assert found.reason == "the recording does not cover this time"
+
+
+def test_nothing_is_relevant_before_the_handover_and_a_pure_replay_gives_no_value():
+    log = rollout(track(np.arange(5.0), 0.0), warmup_us=300_000)
+    assert scored(log)["eval_relevant"].value.tolist() == [0, 0, 0, 1, 1]
+    whole = replace(log, force_gt_us=10_000_000)
+    value = rollout_values(score(whole, scene(TWO_LANES, whole)))["offroad"]
+    assert value.value is None
+    assert value.reason == "the policy never took over: every step belongs to the warm-up"
+
+
+def test_a_polyline_with_repeated_points_and_a_path_that_comes_back():
+    path = np.array([[0.0, 0], [0, 0], [10, 0], [10, 0], [0, 0]])
+    distance_m, s = to_path(path, np.array([[5.0, 1.0], [12.0, 0.0]]))
+    assert distance_m.tolist() == [1.0, 2.0]
+    assert s.tolist() == [5.0, 10.0]
+
+
+xy = st.tuples(st.integers(-6, 6).map(float), st.integers(-6, 6).map(float))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(xy, xy), min_size=2, max_size=8), st.sampled_from([0.0, 5_334_000.0]))
+def test_array_projection_and_twin_agree(points, offset):
+    recorded, driven = (np.array(column) for column in zip(*points, strict=True))
+    log = rollout(track(driven[:, 0] + offset, driven[:, 1]), log=track(recorded[:, 0] + offset, recorded[:, 1]))
+    if np.all(recorded == recorded[0]):
+        return
+    found = scored(log)
+    slow = route_by_step(log)
+    tol = 1e-9 if offset == 0 else 1e-6  # moving the rig to the box centre and back rounds at UTM size
+    np.testing.assert_allclose(found["dist_to_gt_trajectory"].value, [one.distance_m for one in slow], atol=tol)
+    np.testing.assert_allclose(found["dist_to_gt_location"].value, [one.away_m for one in slow], atol=tol)
+    if offset == 0:
+        # Where the ego is equally far from two parts of the path, rounding picks one of them.
+        for name, want in (("progress", [one.progress for one in slow]), ("progress_rel", [one.progress_rel for one in slow])):
+            same = np.isclose(found[name].value, want, atol=1e-9)
+            for k in np.flatnonzero(~same):
+                assert is_ambiguous(recorded if name == "progress" else recorded[: k + 1], driven[k])
+
+
+def is_ambiguous(path, point):
+    near = sorted(point_to_segment(point, a, b)[0] for a, b in pairwise(path))
+    return len(near) > 1 and near[1] - near[0] < 1e-9
+
+
+def test_progress_so_far_is_the_same_in_blocks(monkeypatch):
+    points = np.cumsum(np.ones((50, 2)), axis=0)
+    whole = progress_so_far(points, points * 0.9)
+    monkeypatch.setattr("evaluators.route._MAX_CELLS", 120)
+    np.testing.assert_array_equal(progress_so_far(points, points * 0.9), whole)

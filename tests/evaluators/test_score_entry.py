@@ -1,0 +1,130 @@
+"""The entry point: bad logs are refused, evaluators are checked, every metric states its facts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import EvaluatorError, InputError
+from alpasim_plugin.types import Box, Trajectory
+from evaluators import EVALUATORS, METRICS, MetricInfo, score
+from evaluators.base import run_evaluator, series
+from evaluators.metrics import declare, info
+from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
+
+
+def bad(**changes):
+    log = rollout(track(np.arange(4.0), 0.0), [car("a", track(np.arange(4.0) + 20, 0.0))])
+    broken = replace(log, **changes)
+    return broken, scene(TWO_LANES, log)
+
+
+def broken_track(index, **values) -> Trajectory:
+    poses = track(np.arange(4.0), 0.0)
+    arrays = {"t_us": poses.t_us.copy(), "xyz": poses.xyz.copy(), "quat": poses.quat.copy()}
+    for name, value in values.items():
+        arrays[name][index] = value
+    return Trajectory(**arrays)
+
+
+@pytest.mark.parametrize(
+    ("poses", "text"),
+    [
+        (broken_track(2, t_us=100_000), "time 100000 us is repeated"),
+        (broken_track(3, t_us=50_000), "time 200000 us is followed by the earlier 50000 us"),
+        (broken_track(1, xyz=np.nan), "a pose that is not finite at 100000 us"),
+        (broken_track(1, quat=np.inf), "a pose that is not finite at 100000 us"),
+        (broken_track(2, quat=[2.0, 0, 0, 0]), "a quaternion of length 2 at 200000 us"),
+        (Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4))), "no pose at all"),
+        (Trajectory(np.arange(3), np.zeros((2, 3)), np.zeros((3, 4))), "3 times, positions of shape (2, 3)"),
+    ],
+)
+@pytest.mark.parametrize("who", ["ego", "ego_log", "actor"])
+def test_a_log_with_a_broken_track_is_refused(who, poses, text):
+    changes = {"actors": {"a": car("a", poses)}} if who == "actor" else {who: poses}
+    with pytest.raises(EvaluatorError) as caught:
+        score(*bad(**changes))
+    assert text in str(caught.value)
+    assert {"ego": "the ego ", "ego_log": "the recorded drive", "actor": "actor 'a'"}[who] in caught.value.with_what
+    assert "session 'uuid'" in caught.value.with_what
+
+
+@pytest.mark.parametrize("box", [Box(0.0, 1.0, 1.0), Box(4.0, -1.0, 1.0), Box(np.nan, 1.0, 1.0)])
+def test_a_box_without_size_is_refused(box):
+    log, where = bad()
+    with pytest.raises(EvaluatorError, match="positive length and width"):
+        score(replace(log, actors={"a": car("a", track(0.0, 0.0, n=4), box)}), where)
+
+
+def test_unknown_preset_lists_the_known_ones():
+    log, where = bad()
+    with pytest.raises(InputError, match="known: paper"):
+        score(log, where, "papper")
+
+
+def test_every_series_states_unit_direction_and_reduction_as_declared():
+    log, where = bad()
+    found = score(log, where)
+    assert len({one.name for one in found}) == len(found)
+    for one in found:
+        facts = info(one.name)
+        assert (one.unit, one.direction, one.aggregation) == (facts.unit, facts.direction, facts.aggregation)
+        assert one.t_us.shape == one.value.shape == one.valid.shape
+        assert np.isfinite(one.value[one.valid]).all()
+        assert np.isnan(one.value[~one.valid]).all()
+
+
+def test_every_declared_metric_has_one_line_of_help():
+    for name, facts in METRICS.items():
+        assert facts.help, name
+        assert "\n" not in facts.help
+        assert facts.is_flag or facts.direction == "none" or facts.unit in ("m", "")
+
+
+def test_scoring_twice_gives_the_same_bytes():
+    log, where = bad()
+    for a, b in zip(score(log, where), score(log, where), strict=True):
+        assert a.value.tobytes() == b.value.tobytes()
+
+
+def test_an_evaluator_that_raises_is_named_and_its_cause_kept():
+    log, where = bad()
+
+    def broken(rollout, scene):
+        raise ZeroDivisionError("by zero")
+
+    with pytest.raises(EvaluatorError, match="evaluator 'mine', scene 'scene'") as caught:
+        run_evaluator("mine", broken, log, where)
+    assert "ZeroDivisionError: by zero" in caught.value.found
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+def test_an_invalid_value_without_a_reason_is_refused():
+    log, where = bad()
+
+    def silent(rollout, scene):
+        return [series("offroad", rollout.ego.t_us, 0.0, False)]
+
+    with pytest.raises(EvaluatorError, match="4 invalid steps, reason ''"):
+        run_evaluator("silent", silent, log, where)
+
+
+def test_a_metric_given_twice_is_refused(monkeypatch):
+    log, where = bad()
+    monkeypatch.setitem(EVALUATORS._builtin, "again", lambda preset: lambda rollout, scene: [series("offroad", rollout.ego.t_us, 0.0)])
+    monkeypatch.setitem(EVALUATORS._help, "again", "")
+    with pytest.raises(EvaluatorError, match="metric 'offroad' was given twice"):
+        score(log, where)
+
+
+def test_a_metric_nobody_declared_is_refused_and_can_be_declared(monkeypatch):
+    with pytest.raises(EvaluatorError, match="no evaluator declares it"):
+        info("jerk_max")
+    monkeypatch.setattr("evaluators.metrics.METRICS", dict(METRICS))
+    facts = MetricInfo("m/s^3", "lower", "max", "largest jerk")
+    declare("jerk_max", facts)
+    assert info("jerk_max") is facts
+    with pytest.raises(EvaluatorError, match="declared already with other facts"):
+        declare("offroad", facts)
