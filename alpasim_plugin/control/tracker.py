@@ -69,9 +69,9 @@ class PlanTracker:
         xy = np.array([now.x_m, now.y_m])
         s_now = reference.project(xy, float(planned[0]), 2.0 + abs(now.speed_mps) * 0.5)
         to_go = planned[1:] - s_now
-        direction = 1.0
-        if now.speed_mps < HOLD_SPEED_MPS and to_go[-1] < -2 * HOLD_MOVE_M:
-            direction = -1.0
+        # What counts is that the plan goes back, not that the car has gone too far.
+        goes_back = float(planned[-1] - planned[0]) < -2 * HOLD_MOVE_M
+        direction = -1.0 if goes_back and now.speed_mps < HOLD_SPEED_MPS else 1.0
         if direction * to_go[-1] < HOLD_MOVE_M and abs(now.speed_mps) < HOLD_SPEED_MPS:
             return Command(now.steer_rad, 0.0, self.vehicle.max_brake_mps2 / 2)
         accel = _fit_acceleration(to_go[:-1], now.speed_mps)

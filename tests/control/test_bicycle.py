@@ -1,0 +1,126 @@
+"""The vehicle model against its closed solution, at standstill, in reverse and at the limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.control.bicycle import BicycleState, Command, exact_arc, step
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import Vehicle
+
+VEHICLE = Vehicle()
+# No limits: the wheel follows at once, so that a manoeuvre can be anything.
+FREE = Vehicle(max_steer_rad=1.2, max_steer_rate_radps=1e6, max_accel_mps2=100.0, max_brake_mps2=100.0)
+
+
+def error_m(a: BicycleState, b: BicycleState) -> float:
+    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m)
+
+
+def test_error_against_the_exact_circle_falls_with_the_fourth_power_of_the_step() -> None:
+    start = BicycleState(3.0, -2.0, 0.4, 20.0, 0.5)
+    exact = exact_arc(start, -3.0, 4.0, VEHICLE.wheelbase_m)
+    steps = [0.2, 0.1, 0.05, 0.025]
+    errors = [error_m(step(start, Command(0.5, -3.0), 4.0, VEHICLE, h), exact) for h in steps]
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert np.all((orders > 3.8) & (orders < 4.2)), (errors, orders)
+
+
+def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circle_for_a_minute() -> None:
+    start = BicycleState(0.0, 0.0, 0.0, 5.0, VEHICLE.max_steer_rad)
+    end = step(start, Command(VEHICLE.max_steer_rad), 60.0, VEHICLE)
+    assert error_m(end, exact_arc(start, 0.0, 60.0, VEHICLE.wheelbase_m)) < 1e-4
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    speed=st.floats(-10, 40), steer=st.floats(-0.55, 0.55), yaw=st.floats(-4, 4), drive=st.floats(-3, 3), seconds=st.floats(0.001, 2.0)
+)
+def test_any_held_command_matches_the_closed_solution(speed: float, steer: float, yaw: float, drive: float, seconds: float) -> None:
+    start = BicycleState(1e5, -2e5, yaw, speed, steer)
+    end = step(start, Command(steer, drive), seconds, VEHICLE)
+    exact = exact_arc(start, drive, seconds, VEHICLE.wheelbase_m)
+    assert error_m(end, exact) < 1e-5
+    assert end.yaw_rad == pytest.approx(exact.yaw_rad, abs=1e-9)
+    assert end.speed_mps == pytest.approx(exact.speed_mps, abs=1e-9)
+
+
+def test_turning_wheel_follows_the_integral_of_the_heading() -> None:
+    """With a steer that grows linearly, yaw is the integral of v tan(steer) / L = -v ln(cos(steer)) / (L rate)."""
+    speed, target = 4.0, 0.5
+    seconds = target / VEHICLE.max_steer_rate_radps
+    end = step(BicycleState(0.0, 0.0, 0.0, speed, 0.0), Command(10.0), seconds, VEHICLE)
+    assert end.steer_rad == pytest.approx(target, abs=1e-12)
+    expected = -speed * math.log(math.cos(target)) / (VEHICLE.wheelbase_m * VEHICLE.max_steer_rate_radps)
+    assert end.yaw_rad == pytest.approx(expected, abs=1e-9)
+
+
+def test_wheel_turns_no_faster_and_no_further_than_the_vehicle_can() -> None:
+    state, last = BicycleState(0.0, 0.0, 0.0, 8.0, -0.2), -0.2
+    for _ in range(150):
+        state = step(state, Command(5.0), 0.01, VEHICLE)
+        assert state.steer_rad - last <= VEHICLE.max_steer_rate_radps * 0.01 + 1e-12
+        last = state.steer_rad
+    assert state.steer_rad == pytest.approx(VEHICLE.max_steer_rad)
+
+
+def test_standing_vehicle_stays_where_it_is_while_its_wheel_turns() -> None:
+    end = step(BicycleState(5.0, 6.0, 1.0, 0.0, 0.0), Command(0.6, 0.0, 3.0), 10.0, VEHICLE)
+    assert (end.x_m, end.y_m, end.yaw_rad, end.speed_mps) == (5.0, 6.0, 1.0, 0.0)
+    assert end.steer_rad == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("speed", [12.3, -4.56])
+def test_brake_ends_at_exactly_zero_speed_after_the_textbook_distance(speed: float) -> None:
+    end = step(BicycleState(0.0, 0.0, 0.0, speed, 0.0), Command(0.0, 0.0, 5.0), 10.0, VEHICLE)
+    assert end.speed_mps == 0.0
+    assert end.x_m == pytest.approx(math.copysign(speed**2 / 10.0, speed), abs=1e-9)
+
+
+def test_brake_holds_against_a_weaker_drive_and_yields_to_a_stronger_one() -> None:
+    standing = BicycleState(0.0, 0.0, 0.0, 0.0, 0.0)
+    assert step(standing, Command(0.0, 1.0, 1.5), 3.0, VEHICLE).speed_mps == 0.0
+    assert step(standing, Command(0.0, 2.0, 1.5), 3.0, VEHICLE).speed_mps == pytest.approx(1.5)
+    assert step(standing, Command(0.0, -2.0, 1.5), 3.0, VEHICLE).speed_mps == pytest.approx(-1.5)
+
+
+def test_reverse_gear_stops_the_car_and_then_drives_it_back() -> None:
+    end = step(BicycleState(0.0, 0.0, 0.0, 3.0, 0.0), Command(0.0, -1.5), 4.0, VEHICLE)
+    assert end.speed_mps == pytest.approx(-3.0)
+    assert end.x_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_reversing_retraces_the_forward_path() -> None:
+    start = BicycleState(0.0, 0.0, 0.3, 7.0, 0.4)
+    there = step(start, Command(0.4), 5.0, VEHICLE)
+    back = step(BicycleState(there.x_m, there.y_m, there.yaw_rad, -7.0, 0.4), Command(0.4), 5.0, VEHICLE)
+    assert error_m(back, start) < 1e-7
+
+
+def test_near_right_angle_steering_stays_finite_and_exact() -> None:
+    start = BicycleState(0.0, 0.0, 0.0, 3.0, 1.2)
+    end = step(start, Command(1.2), 30.0, FREE)
+    assert error_m(end, exact_arc(start, 0.0, 30.0, FREE.wheelbase_m)) < 1e-4
+
+
+def test_accelerations_are_cut_to_what_the_vehicle_can() -> None:
+    start = BicycleState(0.0, 0.0, 0.0, 20.0, 0.0)
+    assert step(start, Command(0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(20.0 + VEHICLE.max_accel_mps2)
+    assert step(start, Command(0.0, 0.0, 99.0), 1.0, VEHICLE).speed_mps == pytest.approx(20.0 - VEHICLE.max_brake_mps2)
+
+
+def test_zero_seconds_change_nothing() -> None:
+    start = BicycleState(1.0, 2.0, 3.0, 4.0, 0.1)
+    assert step(start, Command(0.5, 1.0), 0.0, VEHICLE) == start
+
+
+@pytest.mark.parametrize(("command", "seconds"), [(Command(math.nan), 0.1), (Command(0.0, math.inf), 0.1), (Command(0.0), -0.1)])
+def test_senseless_input_is_refused_with_its_value(command: Command, seconds: float) -> None:
+    with pytest.raises(InputError, match="advancing the vehicle") as caught:
+        step(BicycleState(0.0, 0.0, 0.0, 1.0, 0.0), command, seconds, VEHICLE)
+    assert "not finite" in caught.value.found
