@@ -1,0 +1,270 @@
+"""Road users while a scene is driven: replay of tracks, and drivers that react once the loop is closed.
+
+Replayed actors exist exactly during their track. Reactive ones follow their track until the loop closes, then drive along the same
+line, on along the lanes where it ends, and leave the scene at the end of the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
+from alpasim_plugin.types import F64, Actor, EgoState, HeightField, LaneMap, Scenario, Vehicle
+from alpasim_plugin.world.curves import smoothstep
+from alpasim_plugin.world.ground import ground_pose
+from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration
+from alpasim_plugin.world.lane_map import LaneIndex
+from alpasim_plugin.world.path import Path, polyline_path
+from alpasim_plugin.world.state import bodies_from, concatenate
+
+MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
+MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows it to its end
+LINE_STEP_M = 0.5  # poses nearer to each other than this say nothing about a track's direction
+EXTENSION_M = 300.0
+MAX_TURN_RAD = 0.8
+FADE_M, FADE_STEP_M = 20.0, 2.0
+SPEED_SPAN_US = 100_000
+
+
+class Actors:
+    """All road users of one rollout.
+
+    Args:
+        actors: Road users with their tracks.
+        vehicle: Ego body, which reactive drivers see.
+        closed_us: Time at which reactive drivers stop following their tracks.
+        lane_map: Map along which reactive drivers go on where their track ends; None: they leave the scene there.
+        ground: Height field that carries reactive drivers; None keeps the heights of their line.
+    """
+
+    def __init__(
+        self, actors: Sequence[Actor], vehicle: Vehicle, closed_us: int, lane_map: LaneMap | None = None, ground: HeightField | None = None
+    ) -> None:
+        self.vehicle, self.closed_us = vehicle, closed_us
+        index = LaneIndex(lane_map) if lane_map is not None and any(a.behaviour.kind == "idm" for a in actors) else None
+        self.drivers = [_Driver(a, index, ground) for a in actors if a.behaviour.kind == "idm"]
+        self.replay = _Replay([a for a in actors if a.behaviour.kind != "idm"])
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to the beginning of the scene."""
+        self.t_us: int | None = None
+        self.replay.reset()
+        for driver in self.drivers:
+            driver.reset()
+
+    def step(self, t_us: int, ego: EgoState) -> Mapping[str, F64]:
+        """Advance to ``t_us`` and return ``T_world_box`` ``(4, 4)`` of every actor present.
+
+        Reactive drivers take one acceleration from the positions at the last call and hold it over the step.
+
+        Raises:
+            InputError: Time does not increase.
+        """
+        if self.t_us is not None and t_us <= self.t_us:
+            raise InputError("moving the actors", f"t = {t_us} us", f"the last time was {self.t_us} us", "step forwards, or reset first")
+        poses = self.replay.at(t_us)
+        if self.drivers:
+            if self.t_us is not None and t_us > self.closed_us:
+                self._advance(max(self.t_us, self.closed_us), t_us, ego, poses)
+            for driver in self.drivers:
+                pose = driver.pose(t_us, self.closed_us)
+                if pose is not None:
+                    poses[driver.actor.actor_id] = pose
+        self.t_us = t_us
+        return poses
+
+    def _advance(self, from_us: int, to_us: int, ego: EgoState, poses: Mapping[str, F64]) -> None:
+        n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
+        dt_s = (to_us - from_us) * 1e-6 / n
+        fixed = concatenate([_ego_bodies(ego, self.vehicle), self.replay.bodies(poses)])
+        for driver in self.drivers:
+            driver.close(from_us, to_us)
+        for _ in range(n):
+            others = [d.bodies() for d in self.drivers]
+            for i, driver in enumerate(self.drivers):
+                if driver.present:
+                    driver.decide(concatenate([fixed, *others[:i], *others[i + 1 :]]))
+            for driver in self.drivers:
+                driver.advance(dt_s)
+
+
+def make_actors(scenario: Scenario) -> Actors:
+    """Return the actors of a scenario; the loop closes at ``start_us + warmup_us``."""
+    closed_us = scenario.start_us + scenario.warmup_us
+    return Actors(scenario.actors, scenario.vehicle, closed_us, scenario.lane_map, scenario.ground)
+
+
+def _ego_bodies(ego: EgoState, vehicle: Vehicle) -> Bodies:
+    yaw = yaw_of(ego.T_world_rig)
+    direction = np.array([np.cos(yaw), np.sin(yaw)])
+    centre = ego.T_world_rig[:2, 3] + vehicle.rear_axle_to_centre_m * direction
+    return bodies_from(centre, np.array([yaw]), [vehicle.box], ego.speed_mps * direction)
+
+
+class _Replay:
+    """Tracks that nobody disturbs, advanced together: one cursor per actor, one batch of interpolations a step."""
+
+    def __init__(self, actors: Sequence[Actor]) -> None:
+        self.actors = list(actors)
+        self.boxes = [a.box for a in actors]
+        self.first = np.array([int(a.track.t_us[0]) for a in actors], dtype=np.int64)
+        self.last = np.array([int(a.track.t_us[-1]) for a in actors], dtype=np.int64)
+        counts = np.array([len(a.track) for a in actors], dtype=np.int64)
+        self.begin = np.concatenate([[0], np.cumsum(counts)])[:-1] if len(actors) else counts
+        self.end = self.begin + counts - 1
+        if actors:
+            self.t = np.concatenate([a.track.t_us for a in actors])
+            self.xyz = np.concatenate([a.track.xyz for a in actors])
+            self.quat = np.concatenate([a.track.quat for a in actors])
+        self.reset()
+
+    def reset(self) -> None:
+        self.cursor = self.begin.copy()
+
+    def at(self, t_us: int) -> dict[str, F64]:
+        rows = np.flatnonzero((self.first <= t_us) & (t_us <= self.last))
+        if len(rows) == 0:
+            return {}
+        i = self.cursor[rows]
+        while True:
+            behind = (i + 1 < self.end[rows]) & (self.t[np.minimum(i + 1, self.end[rows])] <= t_us)
+            if not behind.any():
+                break
+            i = i + behind
+        self.cursor[rows] = i
+        j = np.minimum(i + 1, self.end[rows])
+        span = np.maximum(self.t[j] - self.t[i], 1).astype(np.float64)
+        f = np.clip((t_us - self.t[i]).astype(np.float64) / span, 0.0, 1.0)
+        xyz = self.xyz[i] * (1 - f)[:, None] + self.xyz[j] * f[:, None]
+        poses = se3(xyz, slerp(self.quat[i], self.quat[j], f))
+        return {self.actors[k].actor_id: poses[n] for n, k in enumerate(rows)}
+
+    def bodies(self, poses: Mapping[str, F64]) -> Bodies:
+        """Return the bodies present, with the velocity of the track's current piece."""
+        rows = [k for k, a in enumerate(self.actors) if a.actor_id in poses]
+        T = np.array([poses[self.actors[k].actor_id] for k in rows]).reshape(-1, 4, 4)
+        i = self.cursor[rows]
+        j = np.minimum(i + 1, self.end[rows])
+        if rows:
+            dt_s = np.maximum(self.t[j] - self.t[i], 1).astype(np.float64) * 1e-6
+            velocity = (self.xyz[j, :2] - self.xyz[i, :2]) / dt_s[:, None]
+        else:
+            velocity = np.zeros((0, 2))
+        return bodies_from(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]), [self.boxes[k] for k in rows], velocity)
+
+
+@dataclass
+class _Motion:
+    """Where a reactive driver is on its line."""
+
+    s_m: float
+    speed_mps: float
+    offset_m: float = 0.0  # left of the line, kept
+    accel_mps2: float = 0.0
+
+
+class _Driver:
+    """A reactive driver: its line, its state, its model."""
+
+    def __init__(self, actor: Actor, index: LaneIndex | None, ground: HeightField | None) -> None:
+        self.actor, self.ground = actor, ground
+        self.params = IdmParams.from_mapping(actor.behaviour.params)
+        self.path = _driving_line(actor, index)
+        self.motion: _Motion | None = None
+        self.present = True
+
+    def reset(self) -> None:
+        self.motion, self.present = None, True
+
+    def close(self, from_us: int, to_us: int) -> None:
+        """Take the state over from the track, once, when the track has begun."""
+        first, last = int(self.actor.track.t_us[0]), int(self.actor.track.t_us[-1])
+        if self.motion is not None or not self.present or self.path is None or to_us < first:
+            return
+        if from_us > last:
+            self.present = False  # the track ended while the log was forced
+            return
+        at = max(from_us, first)
+        lo, hi = max(first, at - SPEED_SPAN_US), min(last, at + SPEED_SPAN_US)
+        poses = interpolate(self.actor.track, [at, lo, hi])
+        s, d = self.path.project(poses[:, :2, 3])
+        speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
+        self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
+
+    def bodies(self) -> Bodies:
+        m = self.motion
+        if m is None or self.path is None:
+            return bodies_from(np.zeros((0, 2)), np.zeros(0), [], np.zeros((0, 2)))
+        xyz, yaw = self.path.at(m.s_m, m.offset_m)
+        direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
+        return bodies_from(xyz[:2], yaw, [self.actor.box], m.speed_mps * direction)
+
+    def decide(self, others: Bodies) -> None:
+        m = self.motion
+        if m is None or self.path is None:
+            return
+        front = m.s_m + self.actor.box.length_m / 2
+        leader = find_leader(self.path, front, self.actor.box.width_m / 2, others)
+        m.accel_mps2 = idm_acceleration(m.speed_mps, leader.gap_m, m.speed_mps - leader.speed_mps, self.params)
+
+    def advance(self, dt_s: float) -> None:
+        m = self.motion
+        if m is None or self.path is None:
+            return
+        a = max(m.accel_mps2, -m.speed_mps / dt_s)  # a car that brakes stops, it does not reverse
+        m.s_m += m.speed_mps * dt_s + 0.5 * a * dt_s * dt_s
+        m.speed_mps = max(0.0, m.speed_mps + a * dt_s)
+        if m.s_m > self.path.length_m:
+            self.present, self.motion = False, None
+
+    def pose(self, t_us: int, closed_us: int) -> F64 | None:
+        """Return the pose of the box centre, or None where the actor is not in the scene."""
+        if self.motion is None:
+            first, last = int(self.actor.track.t_us[0]), int(self.actor.track.t_us[-1])
+            on_track = first <= t_us <= last and self.present and (t_us <= closed_us or self.path is None)
+            return interpolate(self.actor.track, t_us) if on_track else None
+        assert self.path is not None
+        xyz, yaw = self.path.at(self.motion.s_m, self.motion.offset_m)
+        if self.ground is None:
+            return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
+        T = ground_pose(self.ground, float(xyz[0]), float(xyz[1]), float(yaw))
+        return np.asarray(T @ se3([0.0, 0.0, self.actor.box.height_m / 2], [1.0, 0.0, 0.0, 0.0]))
+
+
+def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:
+    """Return the line of a track, thinned where it stands and extended along the lanes; None for a track that goes nowhere."""
+    xyz = actor.track.xyz
+    keep = [0]
+    for i in range(1, len(xyz)):
+        if np.hypot(*(xyz[i, :2] - xyz[keep[-1], :2])) > LINE_STEP_M:
+            keep.append(i)
+    line = xyz[keep]
+    if len(line) < 2 or np.hypot(*(line[-1, :2] - line[0, :2])) < MIN_PATH_M:
+        return None
+    path = polyline_path(line)
+    end, heading = path.at(path.length_m)
+    ahead = _lanes_ahead(index, end, float(heading)) if index is not None else None
+    return path if ahead is None else polyline_path(np.concatenate([line, ahead]))
+
+
+def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
+    """Return the way on from the end of a track: the lane there that runs the same way, and what follows it."""
+    candidates = [i for i in index.containing(end[:2]) if abs(float(wrap_angle(index.heading_rad(i, end) - heading))) < MAX_TURN_RAD]
+    if not candidates:
+        return None
+    lane = min(candidates, key=lambda i: abs(float(wrap_angle(index.heading_rad(i, end) - heading))))
+    xyz = index.path_ahead(lane, EXTENSION_M, start=end).xyz
+    if len(xyz) < 2:
+        return None
+    way = polyline_path(xyz)
+    _, offset = way.project(end[None, :2])
+    # The track need not run in the lane's middle: keep its offset and fade it out.
+    s = np.arange(FADE_STEP_M, way.length_m, FADE_STEP_M)
+    points, _ = way.at(s, float(offset[0]) * (1.0 - smoothstep(s / FADE_M)))
+    points[:, 2] = end[2]
+    return np.asarray(points)
