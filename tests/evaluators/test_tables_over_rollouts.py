@@ -1,0 +1,286 @@
+"""Means, intervals, pairs and the ledger over rollouts, against numbers worked out by hand or by scipy."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from alpasim_plugin.errors import InputError
+from evaluators import aggregate, censoring, paired
+from evaluators.aggregate.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
+
+
+def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
+    """Rows from a table of values: one row of it per scene, one column per seed; None is invalid."""
+    return [
+        {
+            "renderer": renderer,
+            "policy": "p",
+            "scene": f"scene-{i}",
+            "seed": k,
+            "status": status,
+            metric: value,
+            f"{metric}_valid": value is not None,
+        }
+        for i, scene in enumerate(values)
+        for k, value in enumerate(scene)
+    ]
+
+
+def entry(values, metric="route_distance_m"):
+    return aggregate(rows_of(values, metric))["3dgs"][metric]
+
+
+def test_mean_and_the_papers_half_width():
+    values = [[1.0, 2.0], [4.0, 5.0], [3.0, 9.0]]
+    flat = np.ravel(values)
+    found = entry(values)
+    assert found["mean"] == pytest.approx(4.0)
+    assert found["ci95"] == pytest.approx(1.96 * np.std(flat, ddof=1) / np.sqrt(6))
+    assert (found["n_rollouts"], found["n_scenes"], found["unit"], found["direction"]) == (6, 3, "m", "lower")
+
+
+def test_clustered_interval_is_a_t_interval_on_scene_means():
+    values = [[1.0, 2.0], [4.0, 5.0], [3.0, 9.0]]
+    means = [1.5, 4.5, 6.0]
+    low, high = stats.t.interval(0.95, 2, loc=np.mean(means), scale=stats.sem(means))
+    assert entry(values)["ci95_clustered"] == pytest.approx([low, high])
+
+
+def test_with_unequal_seeds_scenes_weigh_alike_in_the_clustered_interval():
+    found = entry([[1.0, 2.0, 3.0, None], [10.0]])
+    assert found["mean"] == pytest.approx(4.0)  # over rollouts
+    assert np.mean(found["ci95_clustered"]) == pytest.approx(6.0)  # over scenes
+    assert found["n_invalid"] == 1
+
+
+def test_repeats_of_a_cell_are_averaged_first():
+    rows = rows_of([[1.0], [5.0]]) + rows_of([[3.0]])
+    found = aggregate(rows)["3dgs"]["route_distance_m"]
+    assert found["mean"] == pytest.approx(3.5)
+    assert found["n_rollouts"] == 2
+
+
+def test_one_rollout_has_a_mean_and_no_interval_and_says_why():
+    found = entry([[0.0]], "offroad")
+    assert (found["mean"], found["ci95"], found["ci95_clustered"]) == (0.0, None, None)
+    assert found["ci95_reason"] == "one rollout has no spread"
+    assert found["ci95_clustered_reason"] == "needs at least two scenes, found 1"
+
+
+def test_many_seeds_of_one_scene_have_the_papers_interval_but_no_clustered_one():
+    found = entry([[1.0, 2.0, 3.0]])
+    assert found["ci95"] == pytest.approx(1.96 / np.sqrt(3))
+    assert found["ci95_clustered"] is None
+    assert found["ci95_clustered_reason"] == "needs at least two scenes, found 1"
+
+
+def test_a_rate_of_zero_gets_exact_bounds_over_scenes():
+    found = entry([[0.0, 0.0]] * 10, "collision_at_fault")
+    assert (found["mean"], found["ci95"], found["n_events"]) == (0.0, 0.0, 0)
+    assert found["ci95_clustered"] == pytest.approx([0.0, 1 - 0.025 ** (1 / 10)])
+    assert found["note"] == "0 of 10 scenes: exact bounds, as equal scenes have no spread"
+    assert entry([[1.0]] * 4, "offroad")["ci95_clustered"] == pytest.approx([0.025 ** (1 / 4), 1.0])
+
+
+def test_equal_values_that_are_no_rate_have_no_width_and_a_note():
+    found = entry([[2.0], [2.0]])
+    assert found["ci95_clustered"] == [2.0, 2.0]
+    assert found["note"] == "all 2 scenes are equal: the interval has no width"
+
+
+def test_failed_and_invalid_rollouts_do_not_enter_and_are_counted():
+    rows = rows_of([[1.0, None], [3.0, 3.0]]) + rows_of([[0.0]], status="failed")
+    found = aggregate(rows)["3dgs"]["route_distance_m"]
+    assert (found["mean"], found["n_rollouts"], found["n_invalid"]) == (pytest.approx(7 / 3), 3, 1)
+
+
+def test_a_metric_that_is_valid_nowhere_is_null_with_a_reason_and_not_zero():
+    found = entry([[None, None], [None, None]], "offroad")
+    assert (found["mean"], found["ci95"], found["ci95_clustered"]) == (None, None, None)
+    assert found["reason"] == "valid in none of 4 rollouts"
+    failed = aggregate(rows_of([[1.0]], status="failed"))["3dgs"]["route_distance_m"]
+    assert failed["reason"] == "no rollout was run to its end"
+
+
+def test_infinite_values_do_not_reach_a_mean():
+    assert entry([[1.0], [float("inf")], [float("nan")]])["mean"] == 1.0
+
+
+def test_nested_metrics_as_in_manifests_are_read_too():
+    rows = [
+        {
+            "renderer": "a",
+            "policy": "p",
+            "scene": s,
+            "seed": 0,
+            "status": "ok",
+            "metrics": {"offroad": {"value": v, "valid": v is not None}},
+        }
+        for s, v in (("x", 1.0), ("y", 0.0), ("z", None))
+    ]
+    assert aggregate(rows)["a"]["offroad"]["mean"] == 0.5
+
+
+def test_tables_are_json():
+    rows = rows_of([[0.0, 1.0], [0.0, None]], "offroad") + rows_of([[1.0, 1.0], [0.0, 0.0]], "offroad", "clean")
+    json.dumps([aggregate(rows), paired(rows, "clean"), censoring(rows)], allow_nan=False)
+
+
+# --- pairs --------------------------------------------------------------------------------------------------------------
+
+
+def pair(base, other, metric="route_distance_m"):
+    rows = rows_of(base, metric, "clean") + rows_of(other, metric, "3dgs")
+    return paired(rows, "clean")["3dgs"][metric]
+
+
+def test_differences_are_taken_cell_by_cell_and_averaged_per_scene():
+    base = [[1.0, 2.0], [10.0, 20.0], [5.0, 5.0]]
+    other = [[1.5, 3.0], [10.7, 20.9], [5.4, 5.6]]
+    means = [0.75, 0.8, 0.5]
+    found = pair(base, other)
+    low, high = stats.t.interval(0.95, 2, loc=np.mean(means), scale=stats.sem(means))
+    assert found["diff"] == pytest.approx(np.mean(means))
+    assert found["ci95"] == pytest.approx([low, high])
+    assert found["p_value"] == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
+    assert (found["verdict"], found["n_cells"], found["n_scenes"], found["baseline"]) == ("worse", 6, 3, "clean")
+    assert pair(other, base)["verdict"] == "better"
+
+
+def test_pairing_sees_what_overlapping_intervals_hide():
+    base = [[float(10 * i)] for i in range(8)]
+    other = [[10 * i + 0.5 + 0.01 * i] for i in range(8)]
+    rows = rows_of(base, renderer="clean") + rows_of(other)
+    alone = aggregate(rows)
+    assert alone["clean"]["route_distance_m"]["ci95_clustered"][1] > alone["3dgs"]["route_distance_m"]["ci95_clustered"][0]
+    assert paired(rows, "clean")["3dgs"]["route_distance_m"]["verdict"] == "worse"
+
+
+def test_flags_take_the_exact_sign_test_on_scenes():
+    base = [[0.0, 0.0]] * 8
+    other = [[1.0, 0.0]] * 6 + [[0.0, 0.0]] * 2
+    found = pair(base, other, "collision_at_fault")
+    assert found["p_value"] == pytest.approx(2 * 0.5**6)
+    assert found["test"] == "exact sign test on scenes"
+    assert found["verdict"] == "worse"
+    assert pair(base, [[1.0, 0.0]] * 5 + [[0.0, 0.0]] * 3, "collision_at_fault")["verdict"] == "undecided"  # p = 0.0625
+
+
+def test_seeds_of_one_scene_are_not_independent_evidence():
+    found = pair([[0.0] * 50], [[1.0] * 50])
+    assert found["diff"] == 1.0
+    assert (found["ci95"], found["p_value"], found["verdict"]) == (None, None, "undecided")
+    assert found["reason"] == "needs at least two scenes, found 1"
+
+
+def test_no_difference_at_all_is_undecided_with_p_one():
+    found = pair([[1.0], [2.0], [3.0]], [[1.0], [2.0], [3.0]])
+    assert (found["diff"], found["ci95"], found["p_value"], found["verdict"]) == (0.0, [0.0, 0.0], 1.0, "undecided")
+
+
+def test_equal_differences_have_no_spread_and_take_the_sign_test():
+    found = pair([[0.0]] * 4, [[0.5]] * 4)
+    assert found["p_value"] == pytest.approx(2 * 0.5**4)
+    assert found["verdict"] == "undecided"
+
+
+def test_cells_that_one_side_lacks_are_left_out_and_counted():
+    found = pair([[1.0, 2.0], [3.0, None]], [[2.0, None], [4.0, 9.0]])
+    assert (found["diff"], found["n_cells"], found["n_missing"]) == (1.0, 2, 2)
+    empty = pair([[1.0, None]], [[None, 2.0]])
+    assert (empty["diff"], empty["verdict"]) == (None, "undecided")
+    assert empty["reason"] == "no scene-seed cell has this metric on both sides"
+
+
+def test_a_metric_without_a_better_side_gets_no_verdict():
+    assert pair([[0.0], [0.0], [0.1]], [[5.0], [5.0], [5.0]], "dist_traveled_m")["verdict"] == "undecided"
+
+
+def test_higher_is_better_for_progress():
+    assert pair([[0.5], [0.5], [0.4]], [[0.9], [0.9], [0.9]], "progress")["verdict"] == "better"
+
+
+def test_an_unknown_baseline_lists_the_known_ones():
+    with pytest.raises(InputError, match="choose one of 3dgs"):
+        paired(rows_of([[1.0]]), "clean")
+
+
+# --- ledger -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_ledger_counts_every_cause_and_bounds_every_rate():
+    ledger = {"steps_total": 10, "steps_warmup": 2, "steps_after_event": 3, "steps_after_drift": 0, "steps_scored": 5, "dropped": ""}
+    rows = [{**row, "censored": ledger} for row in rows_of([[1.0, 0.0], [None, 0.0]], "offroad")]
+    rows += [{**rows[0], "scene": "scene-9", "status": "failed", "failure_class": "policy", "censored": None}]
+    found = censoring(rows)["3dgs"]
+    assert found["rollouts"] == 5
+    assert found["failed"] == {"policy": 1}
+    assert (found["steps_total"], found["steps_warmup"], found["steps_after_event"], found["steps_scored"]) == (40, 8, 12, 20)
+    assert found["invalid"]["offroad"] == {"rollouts": 1, "reasons": {"not given": 1}}
+    assert found["bounds"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(3 / 5)]
+
+
+def test_a_dropped_rollout_is_listed_with_its_reason():
+    rows = rows_of([[None]], "offroad")
+    rows[0]["censored"] = {
+        "steps_total": 4,
+        "steps_warmup": 4,
+        "steps_after_event": 0,
+        "steps_after_drift": 0,
+        "steps_scored": 0,
+        "dropped": "never",
+    }
+    assert censoring(rows)["3dgs"]["dropped"] == {"never": 1}
+
+
+# --- intervals ----------------------------------------------------------------------------------------------------------
+
+
+def test_t_factors_are_the_tabulated_ones():
+    for n, factor in ((5, 2.776), (10, 2.262), (20, 2.093), (32, 2.0395), (60, 2.0010), (80, 1.9905), (300, 1.968)):
+        values = np.arange(n, dtype=float)
+        one = t_interval(values)
+        assert (one.high - one.centre) / (np.std(values, ddof=1) / np.sqrt(n)) == pytest.approx(factor, abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"),
+    [(0, 60, 0.0, 0.060), (0, 300, 0.0, 0.0126), (1, 60, 0.003, 0.089), (21, 300, 0.046, 0.105), (3, 10, 0.108, 0.603)],
+)
+def test_wilson_bounds_are_the_tabulated_ones(k, n, low, high):
+    assert wilson_rate(k, n) == pytest.approx((low, high), abs=6e-4)
+
+
+def test_exact_bounds_agree_with_scipy():
+    for k, n in ((0, 7), (3, 20), (20, 20), (5, 300)):
+        want = stats.binomtest(k, n).proportion_ci(0.95, "exact")
+        assert exact_rate(k, n) == pytest.approx((want.low, want.high))
+
+
+def test_equal_seeds_per_scene_make_the_clustered_centre_the_mean():
+    values = np.arange(12.0)
+    assert clustered(values, [f"s{i // 3}" for i in range(12)]).centre == pytest.approx(values.mean())
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.8])
+def test_coverage_of_the_clustered_interval_and_under_coverage_of_the_papers(correlation):
+    """60 scenes x 5 seeds, probit scene effect, true rate 10 %."""
+    rng = np.random.Generator(np.random.Philox(int(correlation * 10)))
+    scenes = [f"s{i:02d}" for i in range(60) for _ in range(5)]
+    threshold = stats.norm.ppf(0.1)
+    naive = by_scene = 0
+    repeats = 600
+    for _ in range(repeats):
+        effect = np.repeat(rng.normal(0, np.sqrt(correlation), 60), 5)
+        hits = (effect + rng.normal(0, np.sqrt(1 - correlation), 300) < threshold).astype(float)
+        half, _ = normal_half_width(hits)
+        naive += abs(hits.mean() - 0.1) <= half
+        one = clustered(hits, scenes)
+        by_scene += one.low <= 0.1 <= one.high
+    assert 0.91 <= by_scene / repeats <= 0.97
+    if correlation == 0.8:
+        assert naive / repeats < 0.82
