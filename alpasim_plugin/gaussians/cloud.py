@@ -131,7 +131,7 @@ class GaussianCloud:
             faults = {
                 "non-finite mean": ~np.all(np.isfinite(raw.means), axis=1),
                 "non-finite opacity": ~np.isfinite(raw.opacities),
-                "non-finite colour": ~np.all(np.isfinite(raw.sh.reshape(n, -1)), axis=1),
+                "non-finite colour": ~np.all(np.isfinite(raw.sh), axis=(1, 2)),
                 "NaN or negative scale": np.any(np.isnan(raw.scales) | (raw.scales < 0), axis=1),
                 "overflowing scale": np.any(raw.scales > high, axis=1),
                 "zero quaternion": largest[:, 0] == 0,
@@ -167,7 +167,7 @@ class GaussianCloud:
             "zero or non-finite quaternion": np.isfinite(self.quats).all(axis=1) & (np.abs(self.quats).max(axis=1, initial=0.0) > 0),
             "negative, non-finite or overflowing scale": np.all((self.scales >= 0) & (self.scales <= LARGEST_SCALE_M), axis=1),
             "opacity outside 0..1": (self.opacities >= 0) & (self.opacities <= 1),
-            "non-finite colour": np.isfinite(self.sh.reshape(len(self), -1)).all(axis=1),
+            "non-finite colour": np.isfinite(self.sh).all(axis=(1, 2)),
         }
         for cause, good in checks.items():
             if not good.all():

@@ -8,12 +8,12 @@ import math
 CAM_FX, CAM_FY, CAM_CX, CAM_CY = 0, 1, 2, 3
 CAM_SLOPE_LOW_X, CAM_SLOPE_HIGH_X, CAM_SLOPE_LOW_Y, CAM_SLOPE_HIGH_Y = 4, 5, 6, 7
 CAM_WIDTH, CAM_HEIGHT = 8, 9
-CAM_NEAR, CAM_FAR, CAM_LOD = 10, 11, 12
-CAM_SIZE = 13
+CAM_LOD = 10
 
-# A node's pose, one float64 array: rotation node to camera, camera centre in the node, rotation from the node to the axes of its colours.
-POSE_ROTATION, POSE_CENTRE, POSE_COLOUR = 0, 9, 12
-POSE_SIZE = 21
+# A node's pose, one float64 array: rotation node to camera, camera centre in the node, rotation from the node to the axes of its colours,
+# and the depth range.
+POSE_ROTATION, POSE_CENTRE, POSE_COLOUR, POSE_NEAR, POSE_FAR = 0, 9, 12, 21, 22
+POSE_SIZE = 23
 
 # One group of sixteen prepared Gaussians: columns of sixteen lanes each.
 GEO_FACTOR = 0  # nine columns: R_q diag(s), row by row

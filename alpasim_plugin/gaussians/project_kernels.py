@@ -14,12 +14,10 @@ from alpasim_plugin.gaussians.layout import (
     BUNDLE,
     CAM_CX,
     CAM_CY,
-    CAM_FAR,
     CAM_FX,
     CAM_FY,
     CAM_HEIGHT,
     CAM_LOD,
-    CAM_NEAR,
     CAM_SLOPE_HIGH_X,
     CAM_SLOPE_HIGH_Y,
     CAM_SLOPE_LOW_X,
@@ -32,6 +30,8 @@ from alpasim_plugin.gaussians.layout import (
     GEO_SIZE,
     POSE_CENTRE,
     POSE_COLOUR,
+    POSE_FAR,
+    POSE_NEAR,
     POSE_ROTATION,
     RECORD,
     SPHERE_SIZE,
@@ -59,7 +59,7 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
     x = pose[r] * dx + pose[r + 1] * dy + pose[r + 2] * dz
     y = pose[r + 3] * dx + pose[r + 4] * dy + pose[r + 5] * dz
     z = pose[r + 6] * dx + pose[r + 7] * dy + pose[r + 8] * dz
-    if z + radius < camera[CAM_NEAR]:
+    if z + radius < pose[POSE_NEAR]:
         return True
     right = (camera[CAM_WIDTH] - camera[CAM_CX] + _LOWPASS_REACH_PX) / camera[CAM_FX]
     left = (camera[CAM_CX] + _LOWPASS_REACH_PX) / camera[CAM_FX]
@@ -128,7 +128,7 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
     # Depth decides the order and is kept in float64 up to here; everything else tolerates float32 relative to the camera.
     z64 = v.splat(pose[r + 6]) * dx + v.splat(pose[r + 7]) * dy + v.splat(pose[r + 8]) * dz
     z = v.to_f32(z64)
-    mask = (z >= v.splat(camera[CAM_NEAR])) & (z <= v.splat(camera[CAM_FAR]))
+    mask = (z64 >= v.splat(pose[POSE_NEAR])) & (z64 <= v.splat(pose[POSE_FAR]))
     if v.bits(mask) == 0:
         return 0
     dx, dy, dz = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)

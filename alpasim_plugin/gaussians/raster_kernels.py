@@ -22,9 +22,7 @@ from alpasim_plugin.gaussians.layout import BLOCK_REACH, L11, L12, L22, PEAK, RA
 
 _f = np.float32
 _nodes = np.cos(np.pi * (np.arange(6) + 0.5) / 6) / 2  # interpolation at Chebyshev nodes of [-0.5, 0.5]
-P0, P1, P2, P3, P4, P5 = (
-    _f(c) for c in chebyshev.cheb2poly(chebyshev.chebfit(2 * _nodes, 2.0 ** (_nodes - 0.5), 5)) * 2.0 ** np.arange(6)
-)
+P0, P1, P2, P3, P4, P5 = (_f(c) for c in chebyshev.cheb2poly(chebyshev.chebfit(2 * _nodes, 2.0 ** (_nodes - 0.5), 5)) * 2.0 ** np.arange(6))
 CUT = _f((np.log2(ALPHA_MIN) + 4.0) / 8.0)
 _ALPHA_MAX = _f(ALPHA_MAX)
 _STOP = _f(TRANSMITTANCE_STOP)

@@ -13,7 +13,17 @@ from alpasim_plugin.gaussians.binning import CHUNK, depth_order, fill_tiles, gat
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
 from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
-from alpasim_plugin.gaussians.layout import POSE_CENTRE, POSE_COLOUR, POSE_ROTATION, POSE_SIZE, RECORD, SPHERE_SIZE, TILE
+from alpasim_plugin.gaussians.layout import (
+    POSE_CENTRE,
+    POSE_COLOUR,
+    POSE_FAR,
+    POSE_NEAR,
+    POSE_ROTATION,
+    POSE_SIZE,
+    RECORD,
+    SPHERE_SIZE,
+    TILE,
+)
 from alpasim_plugin.gaussians.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.project_kernels import nodes_in_view, project_node
@@ -72,11 +82,11 @@ def rasterize_prepared(
         [
             *(camera.fx, camera.fy, camera.cx, camera.cy),
             *(low_x, high_x, low_y, high_y),
-            *(camera.width, camera.height, near_m, FAR_M, lod_px),
+            *(camera.width, camera.height, lod_px),
         ],
         np.float32,
     )
-    poses = _node_poses(nodes, camera)
+    poses = _node_poses(nodes, camera, near_m)
     in_view = nodes_in_view(np.array([prepared.sphere for prepared, _ in nodes]).reshape(-1, SPHERE_SIZE), poses, view)
     total = sum(len(nodes[i][0]) for i in in_view)
     records = _buffers.get("records", total * RECORD, np.float32)
@@ -115,22 +125,32 @@ def rasterize_prepared(
     return RasterOutput(rgb, alpha, depth, stats)
 
 
-def _node_poses(nodes: Sequence[Node], camera: PinholeCamera) -> F64:
+def _node_poses(nodes: Sequence[Node], camera: PinholeCamera, near_m: float) -> F64:
     """Pack the nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64."""
     poses = np.empty((len(nodes), POSE_SIZE))
-    T_world_node = np.array([_IDENTITY if T is None else T for _, T in nodes], dtype=np.float64).reshape(-1, 4, 4)
+    given = [_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for _, T in nodes]
+    if not all(T.shape == (4, 4) for T in given) or not _all_rigid(np.array(given).reshape(-1, 4, 4)):
+        for T in given:  # the precise message is composed only where the cheap test of all nodes at once fails
+            require_rigid(T, "placing a node")
+    T_world_node = np.array(given).reshape(-1, 4, 4)
     rotation = T_world_node[:, :3, :3]
-    gram = rotation @ rotation.transpose(0, 2, 1)
-    # A cheap test of all nodes at once; the precise message is composed only where it fails.
-    if not np.all(np.abs(gram - np.eye(3)) <= 1e-5) or np.any(np.linalg.det(rotation) < 0):
-        for _, T in nodes:
-            if T is not None:
-                require_rigid(T, "placing a node")
     poses[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
     poses[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
     turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
-    poses[:, POSE_COLOUR:] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
+    poses[:, POSE_NEAR], poses[:, POSE_FAR] = near_m, FAR_M
+    poses[:, POSE_COLOUR:POSE_NEAR] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
     return poses
+
+
+def _all_rigid(T: F64) -> bool:
+    """Tell whether all of ``(N, 4, 4)`` pass `require_rigid`."""
+    gram = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
+    return bool(
+        np.all(np.abs(gram - np.eye(3)) <= 1e-5)
+        and np.all(np.linalg.det(T[:, :3, :3]) > 0)
+        and np.isfinite(T).all()
+        and np.all(np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9)
+    )
 
 
 def rasterize_cpu(

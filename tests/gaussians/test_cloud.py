@@ -1,0 +1,129 @@
+"""Build, clean, move and join clouds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud
+from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
+
+
+def arrays(n: int = 8) -> dict[str, np.ndarray]:
+    cloud = random_cloud(n)
+    return {f: getattr(cloud, f).copy() for f in ("means", "quats", "scales", "opacities", "sh")}
+
+
+@pytest.mark.parametrize(
+    ("field", "row", "value", "cause"),
+    [
+        ("means", 2, np.nan, "non-finite mean"),
+        ("means", 2, -np.inf, "non-finite mean"),
+        ("opacities", 3, np.nan, "non-finite opacity"),
+        ("sh", 1, np.inf, "non-finite colour"),
+        ("scales", 4, np.nan, "NaN or negative scale"),
+        ("scales", 4, -0.1, "NaN or negative scale"),
+        ("scales", 5, np.inf, "overflowing scale"),
+        ("scales", 5, np.exp(20.1), "overflowing scale"),
+        ("quats", 6, 0.0, "zero quaternion"),
+        ("quats", 6, np.nan, "non-finite quaternion"),
+    ],
+)
+def test_each_cause_is_dropped_and_counted_under_its_name(field, row, value, cause):
+    data = arrays()
+    data[field][row] = value
+    cloud, report = GaussianCloud.cleaned(**data)
+    assert report.dropped == {**dict.fromkeys(report.dropped, 0), cause: 1}
+    assert (report.n_input, report.n_kept, len(cloud)) == (8, 7, 7)
+    assert f"dropped: 1 {cause}" in str(report)
+    assert np.array_equal(cloud.means, np.delete(data["means"], row, axis=0))
+
+
+def test_a_gaussian_with_two_faults_is_counted_once():
+    data = arrays()
+    data["means"][0] = np.nan
+    data["quats"][0] = 0
+    _, report = GaussianCloud.cleaned(**data)
+    assert sum(report.dropped.values()) == 1
+
+
+def test_clean_input_is_kept_and_says_so():
+    cloud, report = GaussianCloud.cleaned(**arrays())
+    assert str(report) == "8 of 8 Gaussians kept"
+    assert np.abs(np.linalg.norm(cloud.quats, axis=1) - 1).max() < 1e-15
+
+
+@pytest.mark.parametrize("length", [1e-30, 7.0, 1e30])
+def test_quaternions_of_any_length_are_normalised_in_float64(length):
+    data = arrays()
+    want = data["quats"] / np.linalg.norm(data["quats"], axis=1, keepdims=True)
+    data["quats"] = (want * length).astype(np.float32)
+    cloud, report = GaussianCloud.cleaned(**data)
+    assert report.n_kept == 8
+    assert np.abs(cloud.quats - want).max() < 1e-6
+
+
+def test_tiny_scales_and_odd_opacities_are_repaired_and_counted():
+    data = arrays()
+    data["scales"][1] = 0.0
+    data["opacities"][2], data["opacities"][3] = 1.2, -0.1
+    cloud, report = GaussianCloud.cleaned(**data)
+    assert report.repaired == {"scale raised to exp(-20) m": 1, "opacity clipped to [0, 1]": 2}
+    assert cloud.scales.min() == pytest.approx(np.exp(-20))
+    assert "repaired" in str(report)
+
+
+def test_no_gaussians_clean_to_no_gaussians():
+    cloud, report = GaussianCloud.cleaned(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 4, 3)))
+    assert (len(cloud), report.n_input, cloud.sh_degree) == (0, 0, 1)
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
+def test_shapes_that_disagree_are_an_error(field):
+    data = arrays()
+    data[field] = data[field][:-1]
+    with pytest.raises(InputError, match=r"building a Gaussian cloud[\s\S]*K in 1, 4, 9, 16"):
+        GaussianCloud(**data)
+
+
+def test_half_a_degree_of_colour_is_an_error():
+    with pytest.raises(InputError, match="K in 1, 4, 9, 16"):
+        GaussianCloud(**{**arrays(), "sh": np.zeros((8, 5, 3))})
+
+
+def test_moving_there_and_back_is_the_identity():
+    cloud, T = random_cloud(30), random_rigid(5)
+    back = cloud.transformed(T).transformed(np.linalg.inv(T))
+    assert np.abs(back.means - cloud.means).max() < 1e-12
+    assert np.abs(back.sh - cloud.sh).max() < 1e-12
+    assert np.abs(back.covariances() - cloud.covariances()).max() < 1e-12
+
+
+def test_moving_turns_covariances_and_leaves_scales_alone():
+    cloud, T = random_cloud(30), random_rigid(6)
+    moved = cloud.transformed(T)
+    R = T[:3, :3]
+    assert np.abs(moved.covariances() - R @ cloud.covariances() @ R.T).max() < 1e-12
+    assert moved.scales is cloud.scales
+    assert cloud.transformed(T, rotate_colour=False).sh is cloud.sh
+
+
+def test_moving_by_something_that_is_not_rigid_is_an_error():
+    with pytest.raises(InputError, match="no rotation"):
+        random_cloud(3).transformed(np.diag([2.0, 1, 1, 1]))
+
+
+def test_joining_pads_lower_degrees_and_keeps_order():
+    joined = GaussianCloud.concatenate([random_cloud(3, 1, degree=0), random_cloud(2, 2, degree=2), GaussianCloud.empty()])
+    assert joined.sh.shape == (5, 9, 3)
+    assert not joined.sh[:3, 1:].any()
+    assert np.array_equal(joined.means[3:], random_cloud(2, 2).means)
+    assert len(GaussianCloud.concatenate([])) == 0
+
+
+def test_whole_numbers_become_floats_and_single_precision_stays():
+    data = arrays()
+    cloud = GaussianCloud(np.arange(24).reshape(8, 3), data["quats"].astype(np.float32), data["scales"], data["opacities"], data["sh"])
+    assert cloud.means.dtype == np.float64
+    assert cloud.quats.dtype == np.float32

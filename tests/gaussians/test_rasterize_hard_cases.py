@@ -1,0 +1,265 @@
+"""Meet the cases in which splatting breaks: near plane, far off-axis, needles, saturation, huge and countless splats, bad numbers."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
+from alpasim_plugin.gaussians.cloud import quat_multiply
+from alpasim_plugin.gaussians.constants import ALPHA_MAX
+from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
+from tests.gaussians.gaussian_scenes import LSB, assert_same_image, camera, random_cloud, random_rigid, splats
+
+FAST = ("cpu", "torch")
+
+
+def wall(z: float, n: int = 12, opacity: float = 0.9, rgb=(0.8, 0.3, 0.1), spread: float = 1.0) -> GaussianCloud:
+    x, y = np.meshgrid(np.linspace(-spread, spread, n), np.linspace(-spread, spread, n))
+    return splats(np.column_stack([x.ravel(), y.ravel(), np.full(n * n, z)]), [spread / n, spread / n, 0.01], opacity, rgb)
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("near_m", [0.1, 0.2])
+def test_wall_moving_through_the_near_plane_never_flashes(backend, near_m):
+    behind = (0.1, 0.1, 0.2)
+    for z in np.arange(0.05, 0.4, 0.0125):
+        cloud = wall(z, spread=0.3)
+        out = rasterize(cloud, camera(), behind, backend, near_m=near_m)
+        assert_same_image(out, rasterize_reference(cloud, camera(), behind, near_m=near_m), 5e-5, odd_share=1e-3)
+        # Between the wall's colour and the background, never brighter or darker than both.
+        assert np.all(out.rgb <= np.maximum((0.8, 0.3, 0.1), behind) + 1e-5)
+        assert np.all(out.rgb >= np.minimum((0.8, 0.3, 0.1), behind) - 1e-5)
+        if z < near_m:
+            assert not out.alpha.any()
+        else:
+            assert out.alpha.min() > 0.5
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("angle_deg", [60, 70, 80, 85, 89, 89.99])
+def test_splat_far_off_axis_leaves_no_streak(backend, angle_deg):
+    angle = np.deg2rad(angle_deg)
+    cloud = splats([10 * np.sin(angle), 0, 10 * np.cos(angle)], 0.3, 0.95)
+    cam = camera()  # half view 31 degrees
+    out = rasterize(cloud, cam, backend=backend, near_m=1e-4)
+    assert_same_image(out, rasterize_reference(cloud, cam, near_m=1e-4, brute=True))
+    assert out.alpha.max() == 0
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_centre_behind_the_camera_is_not_drawn_even_where_the_body_reaches_in_front(backend):
+    out = rasterize(splats([0, 0, -0.5], 3.0, 0.9), camera(), backend=backend)
+    assert not out.alpha.any()
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_ten_splats_of_a_kilometre_are_exact(backend):
+    rng = np.random.default_rng(0)
+    cloud = splats(rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]), 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))
+    assert_same_image(rasterize(cloud, camera(), backend=backend), rasterize_reference(cloud, camera(), brute=True), 5e-5)
+
+
+def test_ten_splats_of_a_kilometre_take_bounded_time():
+    rng = np.random.default_rng(0)
+    cloud = splats(rng.uniform(-500, 500, (10, 3)) + np.array([0, 0, 600]), 1000.0, 0.3, rng.uniform(0, 1, (10, 3)))
+    cam = camera(960, 544, 700.0)
+    rasterize(cloud, cam)
+    begin = time.perf_counter()
+    for _ in range(5):
+        rasterize(cloud, cam)
+    # Ten evaluations per pixel: milliseconds. A rule that lets work explode takes seconds.
+    assert (time.perf_counter() - begin) / 5 < 0.25
+
+
+@pytest.mark.parametrize("backend", FAST)
+@pytest.mark.parametrize("length_px", [10, 1_000, 10_000, 100_000])
+def test_needles_at_every_angle_match_float64(backend, length_px):
+    cam = camera()
+    for angle in np.linspace(0.05, 3.1, 13):
+        s = length_px * 2.0 / 80.0
+        quat = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+        cloud = splats([0.1, -0.05, 2.0], [[s, 0.02, 0.003]], 0.9, quats=quat)
+        want = rasterize_reference(cloud, cam, brute=True)
+        assert want.alpha.max() > 0.8
+        assert_same_image(rasterize(cloud, cam, backend=backend), want, 1e-3 if length_px > 10_000 else 1e-4, odd_share=2e-3)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_needle_whose_centre_is_far_outside_still_crosses_the_image_exactly(backend):
+    cloud = splats([30.0, 0.0, 2.0], [[40.0, 0.01, 0.01]], 0.9, quats=[np.cos(0.005), 0, 0, np.sin(0.005)])
+    want = rasterize_reference(cloud, camera(), brute=True)
+    assert want.alpha.max() > 0.5
+    assert_same_image(rasterize(cloud, camera(), backend=backend), want, 0.5 * LSB, odd_share=1e-3)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_zero_scale_draws_a_dot(backend):
+    cloud = splats([0, 0, 3.0], 0.0, 0.9)
+    out = rasterize(cloud, camera(), backend=backend)
+    assert_same_image(out, rasterize_reference(cloud, camera(), brute=True))
+    assert 4 <= np.count_nonzero(out.alpha) <= 16
+    assert out.alpha.max() > 0.3
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+@pytest.mark.parametrize("bad", ["mean", "opacity", "colour", "scale", "quaternion"])
+def test_numbers_that_cannot_be_drawn_are_an_error_that_names_the_cure(backend, bad):
+    cloud = random_cloud(5)
+    field = {"mean": "means", "opacity": "opacities", "colour": "sh", "scale": "scales", "quaternion": "quats"}[bad]
+    value = getattr(cloud, field).copy()
+    value[3] = 0.0 if bad == "quaternion" else np.inf if bad == "scale" else np.nan
+    broken = GaussianCloud(**{**{f: getattr(cloud, f) for f in ("means", "quats", "scales", "opacities", "sh")}, field: value})
+    with pytest.raises(InputError, match=r"the first at index 3[\s\S]*GaussianCloud.cleaned"):
+        rasterize(broken, camera(), backend=backend)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_largest_scale_that_loading_admits_gives_no_nan(backend):
+    cloud, report = GaussianCloud.cleaned(
+        [[0, 0, 5.0], [0, 0, 6.0], [0, 0, 7.0]], [[1, 0, 0, 0]] * 3, [[np.exp(90), 1, 1], [np.exp(19.9), 1e-30, 1.0], [1, 1, 1]],
+        [0.5, 0.5, 0.5], np.zeros((3, 1, 3)),
+    )  # fmt: skip
+    assert report.dropped["overflowing scale"] == 1
+    out = rasterize(cloud, camera(), backend=backend)
+    assert_same_image(out, rasterize_reference(cloud, camera(), brute=True), 1e-4, odd_share=0.02)
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+def test_length_of_a_quaternion_does_not_matter(backend):
+    cloud = random_cloud(150, 3)
+    scaled = GaussianCloud(cloud.means, cloud.quats * 7.0, cloud.scales, cloud.opacities, cloud.sh)
+    assert_same_image(rasterize(scaled, camera(), backend=backend), rasterize(cloud, camera(), backend=backend), 1e-5, odd_share=2e-4)
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+def test_stack_of_opaque_walls_ends_at_099_because_the_second_layer_is_left_out(backend):
+    cloud = GaussianCloud.concatenate([splats([0, 0, z], 50.0, 1.0, (1.0, 0.5, 0.0)) for z in np.linspace(4, 9, 10)])
+    out = rasterize(cloud, camera(), (0.0, 0.0, 1.0), backend)
+    assert out.alpha.max() == pytest.approx(ALPHA_MAX, abs=1e-6)
+    assert out.alpha.min() == pytest.approx(ALPHA_MAX, abs=1e-6)
+    assert out.depth == pytest.approx(np.full(out.depth.shape, 4.0), abs=1e-4)
+    assert out.rgb[0, 0] == pytest.approx([0.99, 0.495, 0.01], abs=1e-5)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_layers_just_below_saturation_stop_where_the_definition_stops(backend):
+    for opacity in (0.5, 0.8, 0.9, 0.95, 0.985):
+        cloud = GaussianCloud.concatenate([splats([0, 0, z], 50.0, opacity, (1.0, z / 30, 0.0)) for z in np.linspace(4, 25, 30)])
+        want = rasterize_reference(cloud, camera(), brute=True)
+        # Four layers of 0.9 leave 1e-4, the stop itself: there rounding decides, by less than 1e-3 of full scale.
+        assert_same_image(rasterize(cloud, camera(), backend=backend), want, 1e-3 if opacity == 0.9 else 2e-5)
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_opacity_below_the_cut_draws_nothing_and_is_not_carried_along(backend):
+    cloud = random_cloud(200, 5)
+    faint = GaussianCloud(cloud.means, cloud.quats, cloud.scales, np.full(200, 0.0039), cloud.sh)
+    assert_same_image(rasterize(GaussianCloud.concatenate([cloud, faint]), camera(), backend=backend), rasterize_reference(cloud, camera()))
+    assert rasterize(faint, camera()).stats["visible"] == 0
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_splats_at_the_cut_agree_with_the_definition(backend):
+    cloud = random_cloud(400, 6)
+    thin = GaussianCloud(cloud.means, cloud.quats, cloud.scales, np.linspace(0.0039, 0.02, 400), cloud.sh)
+    found, want = rasterize(thin, camera(), backend=backend), rasterize_reference(thin, camera(), brute=True)
+    assert np.abs(found.rgb - want.rgb).max() <= LSB
+    assert np.mean(np.abs(found.alpha - want.alpha) > 1e-5) < 0.01
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+def test_equal_depths_keep_input_order(backend):
+    rng = np.random.default_rng(1)
+    for n in (6, 200):
+        xy = rng.uniform(-1, 1, (n, 2))
+        cloud = splats(np.column_stack([xy, np.full(n, 3.0)]), 0.2, 0.7, rng.uniform(0, 1, (n, 3)))
+        out = rasterize(cloud, camera(), backend=backend)
+        # Nudging the depths apart in input order must not change who is in front.
+        apart = GaussianCloud(cloud.means + np.arange(n)[:, None] * [0, 0, 1e-5], cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+        assert np.abs(out.rgb - rasterize(apart, camera(), backend="reference").rgb).max() < 0.01
+        backwards = rasterize(cloud.take(np.arange(n)[::-1]), camera(), backend=backend)
+        assert np.abs(out.rgb - backwards.rgb).max() > 0.05
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_equal_depths_stay_stable_while_the_camera_moves(backend):
+    """Coincident surfaces keep their order under motion: no flicker decided by rounding."""
+    red, green = wall(5.0, rgb=(1, 0, 0), spread=2.0), wall(5.0, rgb=(0, 1, 0), spread=2.0)
+    both = GaussianCloud.concatenate([red, green])
+    for step in range(5):
+        T = np.eye(4)
+        T[:3, 3] = [0.01 * step, 0.013 * step, 0.1 * step]
+        out = rasterize(both, camera(T_camera_world=T), backend=backend)
+        inner = out.rgb[20:44, 30:66]
+        assert np.all(inner[..., 0] > 3 * inner[..., 1])
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_utm_coordinates_give_the_local_image(backend):
+    cloud = random_cloud(400, 10)
+    T = random_rigid(10)
+    offset = np.array([4.5e5, 5.4e6, 120.0])
+    local = rasterize_reference(cloud.transformed(T), camera(T_camera_world=np.linalg.inv(T)), brute=True)
+    there = T.copy()
+    there[:3, 3] += offset
+    moved = cloud.transformed(T)
+    moved = GaussianCloud(moved.means + offset, moved.quats, moved.scales, moved.opacities, moved.sh)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = there[:3, :3].T, -there[:3, :3].T @ there[:3, 3]
+    out = rasterize(moved, camera(T_camera_world=pose), backend=backend)
+    assert np.abs(out.rgb - local.rgb).max() < LSB
+    assert_same_image(out, local, 1e-4, odd_share=1e-3)
+
+
+def test_countless_opaque_splats_in_one_tile_take_bounded_time():
+    rng = np.random.default_rng(2)
+    n = 100_000
+    cloud = splats(np.column_stack([rng.uniform(-0.02, 0.02, (n, 2)), rng.uniform(2, 9, n)]), 0.5, 0.99, rng.uniform(0, 1, (n, 3)))
+    cam = PinholeCamera(16, 16, np.array([[40.0, 0, 8], [0, 40, 8], [0, 0, 1]]), np.eye(4))
+    out = rasterize(cloud, cam)
+    # Every pixel is finished after a handful of splats, and then the tile is left.
+    assert out.stats["pairs"] >= 0.9 * n
+    assert out.stats["pairs_looked_at"] < 200
+    begin = time.perf_counter()
+    rasterize(cloud, cam)
+    assert time.perf_counter() - begin < 0.25
+    first = np.argsort(cloud.means[:, 2])[:2000]
+    assert_same_image(out, rasterize_reference(cloud.take(np.sort(first)), cam, brute=True))
+
+
+@pytest.mark.parametrize("backend", ["reference", *FAST])
+@pytest.mark.parametrize("cloud", [GaussianCloud.empty(), splats([0, 0, -5.0]), splats([500.0, 0, 5.0])], ids=["none", "behind", "aside"])
+def test_empty_view_is_the_background(backend, cloud):
+    out = rasterize(cloud, camera(), (0.25, 0.5, 0.75), backend)
+    assert np.all(out.rgb == np.float32([0.25, 0.5, 0.75]))
+    assert not out.alpha.any()
+    assert not out.depth.any()
+    assert not out.depth_valid.any()
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_colours_above_one_are_clamped_after_compositing(backend):
+    bright = splats([[0, 0, 3.0], [0, 0, 4.0]], 5.0, 0.5, [(3.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
+    out = rasterize(bright, camera(), backend=backend)
+    assert_same_image(out, rasterize_reference(bright, camera(), brute=True))
+    assert out.rgb.max() == 1.0
+    assert out.rgb[32, 48, 1] > 0.2
+
+
+@pytest.mark.parametrize("backend", FAST)
+def test_near_and_far_splats_in_one_view_keep_precision(backend):
+    rng = np.random.default_rng(3)
+    z = np.exp(rng.uniform(np.log(0.11), np.log(3000), 300))
+    cloud = splats(np.column_stack([rng.uniform(-0.5, 0.5, (300, 2)) * z[:, None], z]), (0.03 * z)[:, None] * [1, 0.5, 0.2], 0.6)
+    cloud = GaussianCloud(cloud.means, rng.normal(size=(300, 4)), cloud.scales, cloud.opacities, rng.normal(size=(300, 9, 3)) * 0.3)
+    assert_same_image(rasterize(cloud, camera(), backend=backend), rasterize_reference(cloud, camera(), brute=True), 3e-5, odd_share=5e-4)
+
+
+def test_quaternion_product_is_the_product_of_rotations():
+    a, b = random_cloud(20, 1), random_cloud(20, 2)
+    product = GaussianCloud(a.means, quat_multiply(a.quats, b.quats), a.scales, a.opacities, a.sh)
+    assert np.abs(product.rotations() - a.rotations() @ b.rotations()).max() < 1e-12

@@ -1,0 +1,200 @@
+"""Render prepared nodes: rigid poses, colour frames, culling, order, threads."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasterize_prepared
+from alpasim_plugin.gaussians import rasterize_cpu as cpu
+from alpasim_plugin.gaussians.bench import driving_camera, driving_like_scene
+from alpasim_plugin.gaussians.binning import depth_order
+from alpasim_plugin.gaussians.layout import BLOCK_REACH, RADIUS_X, RADIUS_Y, RECORD
+from alpasim_plugin.gaussians.raster_kernels import raster_tiles
+from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
+from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid, splats
+
+
+def small_object(seed: int, n: int = 150) -> GaussianCloud:
+    cloud = random_cloud(n, seed)
+    return GaussianCloud((cloud.means - [0, 0, 6]) * 0.2, cloud.quats, cloud.scales * 0.3, cloud.opacities, cloud.sh)
+
+
+@pytest.mark.parametrize("sh_frame", ["object", "world"])
+def test_nodes_at_poses_equal_one_cloud_moved_there(sh_frame):
+    background = random_cloud(200, 1)
+    nodes, clouds = [(prepare(background), None)], [background]
+    for seed in range(4):
+        T = random_rigid(seed, 1.5)
+        T[2, 3] += 5.0
+        nodes.append((prepare(small_object(seed), sh_frame=sh_frame), T))
+        clouds.append(small_object(seed).transformed(T, rotate_colour=sh_frame == "object"))
+    found = rasterize_prepared(nodes, camera(), (0.2, 0.3, 0.4))
+    assert_same_image(found, rasterize_reference(GaussianCloud.concatenate(clouds), camera(), (0.2, 0.3, 0.4)), 3e-5, odd_share=5e-4)
+
+
+def test_actor_at_the_identity_equals_the_same_gaussians_in_the_background():
+    cloud = random_cloud(300, 2)
+    first, second = prepare(cloud.take(np.arange(150))), prepare(cloud.take(np.arange(150, 300)))
+    split = rasterize_prepared([(first, None), (second, np.eye(4))], camera())
+    whole = rasterize_prepared([(prepare(cloud), None)], camera())
+    assert np.array_equal(split.rgb, whole.rgb)
+    assert np.array_equal(split.depth, whole.depth)
+
+
+def test_equal_depths_are_drawn_in_node_order():
+    red, green = prepare(splats([0, 0, 4.0], 3.0, 0.9, (1, 0, 0))), prepare(splats([0, 0, 4.0], 3.0, 0.9, (0, 1, 0)))
+    first = rasterize_prepared([(red, None), (green, np.eye(4))], camera()).rgb[32, 48]
+    second = rasterize_prepared([(green, np.eye(4)), (red, None)], camera()).rgb[32, 48]
+    assert first == pytest.approx([0.9, 0.09, 0], abs=2e-3)
+    assert second == pytest.approx([0.09, 0.9, 0], abs=2e-3)
+
+
+def test_long_runs_of_equal_depth_keep_input_order_on_any_number_of_threads():
+    rng = np.random.default_rng(0)
+    n = 6000
+    cloud = splats(np.column_stack([rng.uniform(-2, 2, (n, 2)), np.full(n, 4.0)]), 0.05, 0.8, rng.uniform(0, 1, (n, 3)))
+    one = rasterize_prepared([(prepare(cloud), None)], camera(), threads=1)
+    assert np.array_equal(one.rgb, rasterize_prepared([(prepare(cloud), None)], camera(), threads=3).rgb)
+    assert_same_image(one, rasterize_reference(cloud, camera()), 2e-5, odd_share=5e-4)
+
+
+def test_culling_bundles_and_nodes_never_changes_the_image():
+    """Nothing that the per-splat rule would draw is lost to a bounding sphere, from any direction."""
+    scene = driving_like_scene(3000, seed=4)
+    parts = [prepare(scene.take(np.flatnonzero(np.arange(3000) % 7 == k))) for k in range(7)]
+    for seed in range(6):
+        T = random_rigid(seed, 3.0)
+        T[:3, 3] += [20.0, 0, 3.0]
+        cam = camera(T_camera_world=np.linalg.inv(T))
+        out = rasterize_prepared([(part, None) for part in parts], cam)
+        whole = rasterize_reference(scene, cam)
+        assert_same_image(out, whole, 5e-5, odd_share=1e-3)
+        assert out.stats["gaussians"] == 3000
+
+
+def test_a_node_out_of_view_costs_nothing_and_one_in_view_is_kept():
+    thing = prepare(small_object(1))
+    away, ahead = np.eye(4), np.eye(4)
+    away[:3, 3], ahead[:3, 3] = [0, 0, -8.0], [0, 0, 5.0]
+    assert rasterize_prepared([(thing, away)], camera()).stats["visible"] == 0
+    assert rasterize_prepared([(thing, ahead)], camera()).stats["visible"] > 100
+
+
+def test_no_nodes_and_empty_nodes_are_the_background():
+    for nodes in ([], [(prepare(GaussianCloud.empty()), None)], [(prepare(splats([0, 0, 3.0], opacities=0.001)), np.eye(4))]):
+        out = rasterize_prepared(nodes, camera(), (0.1, 0.2, 0.3))
+        assert np.all(out.rgb == np.float32([0.1, 0.2, 0.3]))
+
+
+@pytest.mark.parametrize("fault", ["mirror", "scale", "nan", "shape"])
+def test_a_pose_that_is_not_rigid_is_an_error(fault):
+    T = np.eye(4)
+    if fault == "mirror":
+        T[0, 0] = -1
+    elif fault == "scale":
+        T[:3, :3] *= 1.01
+    elif fault == "nan":
+        T[1, 3] = np.nan
+    else:
+        T = np.eye(3)
+    with pytest.raises(InputError, match="placing a node"):
+        rasterize_prepared([(prepare(splats([0, 0, 3.0])), T)], camera())
+
+
+def test_level_of_detail_leaves_out_what_the_reference_leaves_out():
+    cloud = random_cloud(500, 11)
+    for lod_px in (0.5, 2.0, 8.0):
+        found, want = rasterize(cloud, camera(), lod_px=lod_px), rasterize(cloud, camera(), backend="reference", lod_px=lod_px)
+        assert_same_image(found, want, 2e-5, odd_share=5e-4)
+        assert found.stats["visible"] < rasterize(cloud, camera()).stats["visible"]
+        assert_same_image(rasterize(cloud, camera(), backend="torch", lod_px=lod_px), want, 2e-5, odd_share=5e-4)
+
+
+@pytest.mark.parametrize("n", [2_000, 30_000])
+def test_any_number_of_threads_gives_the_same_bits(n):
+    scene, cam = prepare(driving_like_scene(n)), driving_camera(200, 120)
+    one = rasterize_prepared([(scene, None)], cam, threads=1)
+    for threads in (2, 3, 7):
+        for _ in range(3):
+            other = rasterize_prepared([(scene, None)], cam, threads=threads)
+            assert np.array_equal(one.rgb, other.rgb)
+            assert np.array_equal(one.alpha, other.alpha)
+            assert np.array_equal(one.depth, other.depth)
+            assert one.stats == other.stats
+
+
+def test_two_python_threads_may_render_at_once():
+    scene, cam = prepare(driving_like_scene(20_000)), driving_camera(128, 72)
+    want = rasterize_prepared([(scene, None)], cam, threads=1).rgb
+    found: list[bool] = []
+
+    def work() -> None:
+        found.extend(np.array_equal(want, rasterize_prepared([(scene, None)], cam, threads=2).rgb) for _ in range(10))
+
+    workers = [threading.Thread(target=work) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert found == [True] * 30
+
+
+def _render_in_child(queue) -> None:
+    scene, cam = prepare(driving_like_scene(9_000)), driving_camera(64, 36)
+    queue.put(float(rasterize_prepared([(scene, None)], cam, threads=2).rgb.sum()))
+
+
+def test_a_forked_process_renders_after_its_parent_used_threads():
+    scene, cam = prepare(driving_like_scene(9_000)), driving_camera(64, 36)
+    want = float(rasterize_prepared([(scene, None)], cam, threads=2).rgb.sum())
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    child = context.Process(target=_render_in_child, args=(queue,))
+    child.start()
+    assert queue.get(timeout=60) == want
+    child.join(timeout=60)
+    assert child.exitcode == 0
+
+
+def test_fewer_than_one_thread_is_an_error():
+    with pytest.raises(InputError, match="threads=0"):
+        rasterize_prepared([], camera(), threads=0)
+
+
+def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monkeypatch):
+    """Same arithmetic with all culling switched off: what the tiles and blocks skip is exactly what the alpha cut would skip."""
+    scene, cam = prepare(driving_like_scene(2500, seed=3)), driving_camera(90, 50)
+    tiled = rasterize_prepared([(scene, None)], cam, threads=1)
+    seen = {}
+
+    def everywhere(cursor, tiles_x, starts, lists, records, background, rgb, alpha, depth):
+        count = seen["count"]
+        table = records[: count * RECORD].reshape(count, RECORD).copy()
+        table[:, [RADIUS_X, RADIUS_Y, BLOCK_REACH]] = 1e30
+        n_tiles = len(starts) - 1
+        full = np.tile(np.arange(count, dtype=np.int32), n_tiles)
+        raster_tiles(cursor, tiles_x, np.arange(n_tiles + 1) * count, full, table.reshape(-1), background, rgb, alpha, depth)
+
+    def counted(count, *args):
+        seen["count"] = count
+        return depth_order(count, *args)
+
+    monkeypatch.setattr(cpu, "depth_order", counted)
+    monkeypatch.setattr(cpu, "raster_tiles", everywhere)
+    brute = rasterize_prepared([(scene, None)], cam, threads=1)
+    assert seen["count"] > 1000
+    assert np.array_equal(tiled.rgb, brute.rgb)
+    assert np.array_equal(tiled.depth, brute.depth)
+
+
+def test_street_scene_stays_within_one_grey_level_of_float64():
+    cloud, cam = driving_like_scene(8_000), driving_camera(160, 90)
+    found, want = rasterize(cloud, cam, (0.5, 0.6, 0.8)), rasterize_reference(cloud, cam, (0.5, 0.6, 0.8))
+    error = np.abs(found.rgb - want.rgb).max(axis=2)
+    assert np.mean(error > 1e-4) < 5e-4
+    assert error.max() <= 1 / 255

@@ -1,0 +1,84 @@
+"""Check the vector operations of the kernels against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from alpasim_plugin.gaussians import simd as v
+
+
+@njit
+def _floats(x, out):
+    a, b = v.load(x, 0), v.load(x, 16)
+    v.store(out, 0, a + b)
+    v.store(out, 16, a - b)
+    v.store(out, 32, a * b)
+    v.store(out, 48, a / b)
+    v.store(out, 64, v.fma(a, b, a))
+    v.store(out, 80, v.fnma(a, b, a))
+    v.store(out, 96, v.sqrt(v.absolute(a)))
+    v.store(out, 112, v.negative(a))
+    v.store(out, 128, v.minimum(a, b))
+    v.store(out, 144, v.maximum(a, b))
+    v.store(out, 160, v.select((a < b) & (a > v.splat(np.float32(-0.5))), a, b))
+    v.store(out, 176, v.lane_pattern(np.float32(1), np.float32(10)))
+
+
+@njit
+def _masks(x):
+    a, b = v.load(x, 0), v.load(x, 16)
+    return v.bits(a < b), v.bits(a <= b), v.bits(a > b), v.bits(a >= b), v.bits((a < b) | (a > b)), v.lowest_bit(np.int64(40))
+
+
+@njit
+def _doubles(x, out):
+    v.store(out, 0, v.to_f32(v.load(x, 0) * v.load(x, 0) - v.splat(np.float64(0.25))))
+
+
+@njit
+def _counter(cells):
+    return v.fetch_add(cells, 1, 5), v.fetch_add(cells, 1, 7)
+
+
+def test_float_operations_equal_numpy_lane_by_lane():
+    x = np.random.default_rng(0).normal(size=32).astype(np.float32)
+    a, b = x[:16], x[16:]
+    out = np.zeros(192, np.float32)
+    _floats(x, out)
+    exact = [a + b, a - b, a * b, a / b, None, None, np.sqrt(np.abs(a)), -a, np.minimum(a, b), np.maximum(a, b)]
+    for i, want in enumerate(exact):
+        if want is not None:
+            assert np.array_equal(out[i * 16 : i * 16 + 16], want), i
+    assert np.allclose(out[64:80], a * b + a, rtol=1e-5, atol=1e-6)
+    assert np.allclose(out[80:96], a - a * b, rtol=1e-5, atol=1e-6)
+    assert np.array_equal(out[160:176], np.where((a < b) & (a > -0.5), a, b))
+    assert np.array_equal(out[176:], (np.arange(16) % 4 + 10 * (np.arange(16) // 4)).astype(np.float32))
+
+
+def test_comparisons_with_nan_are_false_and_bits_follow_the_lanes():
+    x = np.arange(32, dtype=np.float32)
+    x[16:] = 7.0
+    x[3] = np.nan
+    a = x[:16]
+    less, less_equal, greater, greater_equal, either, lowest = _masks(x)
+    weights = 1 << np.arange(16)
+    assert less == weights[a < 7].sum()
+    assert less_equal == weights[a <= 7].sum()
+    assert greater == weights[a > 7].sum()
+    assert greater_equal == weights[a >= 7].sum()
+    assert either == weights[(a < 7) | (a > 7)].sum()
+    assert lowest == 3
+
+
+def test_doubles_round_once_on_the_way_to_single_precision():
+    x = np.random.default_rng(1).normal(size=16) * 1e3
+    out = np.zeros(16, np.float32)
+    _doubles(x, out)
+    assert np.array_equal(out, (x * x - 0.25).astype(np.float32))
+
+
+def test_counter_returns_what_it_held():
+    cells = np.array([0, 10], np.int64)
+    assert _counter(cells) == (10, 15)
+    assert cells.tolist() == [0, 22]
