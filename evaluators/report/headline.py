@@ -121,25 +121,31 @@ def _paired_point(run: Run, arm: str, pairs: Mapping[str, Any]) -> Point:
     tone: Tone = "mixed" if len(kinds) == 2 else next(iter(kinds)) if kinds else "unclear"
     if not said and lead and all(t == "neutral" for t in tones.values()):
         tone = "neutral"
-    shown = said[:3] or [m for m in lead if m != "progress"][:3]
-    text = "; ".join(_difference(run, arm, m, pairs[m]) for m in shown)
+    moved = [*said, *(m for m in lead if m not in said and m != "progress" and finite(pairs[m].get("diff")) != 0.0)]
+    same = [m for m in lead if m not in moved and m != "progress"]
+    parts = [_difference(run, arm, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
+    parts += [f"no difference at all in {_listing(same)}"] if same else []
+    text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
     return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better)
 
 
-def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any]) -> str:
+def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
     here, there = (_level(run, name, metric) for name in (arm, str(entry.get("baseline"))))
+    if brief:
+        return f"{WORDS.get(metric, metric)}: {here} against {there}, undecided"
     stats = run.summary.get("metrics", {}).get(arm, {}).get(metric, {})
     unit = str(stats.get("unit", ""))
     scale, unit = (100.0, "points") if in_percent(metric, unit) else (1.0, unit)
     difference = float(entry["diff"]) * scale
     bounds = interval(entry.get("ci95"), float(entry["diff"]))
     ends = (bounds[0] * scale, bounds[1] * scale) if bounds else ()
-    places = 1 if scale == 100.0 else decimals(difference, *ends, digits=2)
-    text = f"{WORDS.get(metric, metric)}: {here} against {there} ({fixed(difference, places, sign=True)}"
+    places = 1 if scale == 100.0 else decimals(difference, *ends, digits=3)
+    tail = f"\u00a0{unit}" if unit else ""
+    text = f"{WORDS.get(metric, metric)}: {here} against {there} ({fixed(difference, places, sign=True)}{tail}"
     if ends:
         text += f", 95\u00a0% interval {fixed(ends[0], places, sign=True)} to {fixed(ends[1], places, sign=True)}"
-    return f"{text}\u00a0{unit})" if unit else f"{text})"
+    return f"{text})"
 
 
 def _level(run: Run, arm: str, metric: str) -> str:

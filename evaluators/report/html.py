@@ -23,6 +23,7 @@ from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.run_folder import Run, Series, read_run
 
 MAX_SCENE_PLOTS = 24
+OPEN_SCENE_PLOTS = 6
 MAX_STRIP_SCENES = 8
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
@@ -86,6 +87,7 @@ def context(run: Run) -> dict[str, Any]:
         "policies": run.policies,
         "charts": drift_charts(run.rollouts, series, arm_of),
         "views": views,
+        "open_views": OPEN_SCENE_PLOTS,
         "views_left_out": no_view,
         "strips": strips,
         "strips_left_out": no_strip,
@@ -117,7 +119,7 @@ def scene_views(
     """Lay out the most telling scenes within the limits of count and size.
 
     Returns:
-        The drawings in the order of the run, and the scenes that are not drawn.
+        The drawings (in the order of the run where all are shown at once, else the most telling first), and the scenes not drawn.
     """
     drawn: dict[str, SceneView] = {}
     spent = 0
@@ -130,7 +132,8 @@ def scene_views(
         if view is not None:
             drawn[scene] = view
             spent += len(view.lanes) + len(view.lines) + len(view.edges) + sum(len(t.d) for t in view.tracks)
-    return [drawn[s] for s in run.scenes if s in drawn], [s for s in run.scenes if s not in drawn]
+    order = run.scenes if len(drawn) <= OPEN_SCENE_PLOTS else interesting
+    return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
 
 
 def _asset(environment: Environment, name: str) -> str:

@@ -24,6 +24,7 @@ from alpasim_plugin.errors import InputError
 
 KEY_COLUMNS = ("renderer", "policy", "scene", "seed")
 ROW_COLUMNS = (*KEY_COLUMNS, "status", "failure_class", "failure", "path", "wall_s", "frames", "steps")
+TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
 SEPARATORS = ("/", "|", " ", ":", "+")  # how a summary may join renderer and policy into one key
 
 
@@ -161,7 +162,7 @@ class Run:
         keep = pc.field("metric").isin(list(metrics))
         if scenes is not None:
             keep = keep & pc.field("scene").isin(list(scenes))
-        return pads.dataset(path).to_table(columns=wanted, filter=keep)
+        return pads.dataset(path, format=TEXT_AS_CODES).to_table(columns=wanted, filter=keep)
 
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
@@ -183,26 +184,40 @@ Series = dict[tuple[str, str, str, int], dict[str, tuple[npt.NDArray[np.int64], 
 def series_by_cell(table: pa.Table) -> Series:
     """Split a step table into valid, time-sorted series.
 
+    Works on integer codes of the text columns: a run has millions of steps and few names.
+
     Returns:
         cell -> metric -> (``t_us (T,)``, ``value (T,)``).
     """
     table = table.filter(table["valid"]) if table.num_rows else table
     if not table.num_rows:
         return {}
-    keys = [*KEY_COLUMNS, "metric"]
-    table = table.sort_by([(name, "ascending") for name in (*keys, "t_us")])
-    columns = [table[name].to_pylist() for name in keys]
-    t_us = table["t_us"].to_numpy().astype(np.int64)
-    value = table["value"].to_numpy().astype(np.float64)
+    codes, names = zip(*(_coded(table[name]) for name in (*KEY_COLUMNS, "metric")), strict=True)
+    t_us = table["t_us"].to_numpy().astype(np.int64, copy=False)
+    value = table["value"].to_numpy().astype(np.float64, copy=False)
+    group = np.zeros(len(t_us), np.int64)
+    for code, values in zip(codes, names, strict=True):
+        group = group * len(values) + code
+    order = np.lexsort((t_us, group))
+    group, t_us, value = group[order], t_us[order], value[order]
+    starts = np.flatnonzero(np.diff(group, prepend=-1))
+    stops = np.append(starts[1:], len(group))
     found: Series = {}
-    start = 0
-    rows = list(zip(*columns, strict=True))
-    for stop in range(1, len(rows) + 1):
-        if stop == len(rows) or rows[stop] != rows[start]:
-            renderer, policy, scene, seed, metric = rows[start]
-            found.setdefault((renderer, policy, scene, seed), {})[metric] = (t_us[start:stop], value[start:stop])
-            start = stop
+    for start, stop in zip(starts, stops, strict=True):
+        row = order[start]
+        renderer, policy, scene, seed, metric = (values[code[row]] for code, values in zip(codes, names, strict=True))
+        found.setdefault((renderer, policy, scene, int(seed)), {})[metric] = (t_us[start:stop], value[start:stop])
     return found
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[npt.NDArray[np.int64], list[Any]]:
+    """Return per row the index into the list of distinct values, and that list."""
+    coded = column.combine_chunks()
+    if isinstance(coded, pa.ChunkedArray):  # several chunks too large for one
+        coded = pa.concat_arrays(coded.chunks)
+    if not pa.types.is_dictionary(coded.type):
+        coded = coded.dictionary_encode()
+    return coded.indices.to_numpy(zero_copy_only=False).astype(np.int64, copy=False), coded.dictionary.to_pylist()
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy import stats
+from scipy.interpolate import CubicSpline
 
 METRICS = {  # name -> unit, direction
     "collision_any": ("", "lower"),
@@ -45,9 +46,7 @@ class Plan:
     seeds: Sequence[int] = (0, 1, 2)
     steps: int = 120
     fail: Sequence[tuple[str, str, int]] = ()  # (renderer, scene, seed)
-    failure: str = (
-        "error: rendering a frame\n   with: camera front, t = 3.400000 s\n  found: 1204 NaN pixels <b>&\n     do: run with --set guard=off"
-    )
+    failure: str = "1204 NaN pixels <b>&\nat t = 3.400000 s"
     invalid: Sequence[str] = ("min_distance_to_obstacle_m",)  # metrics that are invalid in the first scene
     pictures: bool = True
     clips: bool = True
@@ -67,7 +66,7 @@ def make_run(folder: Path, plan: Plan | None = None) -> Path:
     rows, steps = [], []
     for scene, content in maps.items():
         for seed in plan.seeds:
-            wander = np.cumsum(rng.normal(0, 1, plan.steps)) * 0.02  # shared by the renderers: pairs are sharp
+            wander = _smooth(rng, plan.steps) * 0.3  # shared by the renderers: pairs are sharp
             for renderer in plan.renderers:
                 for policy in plan.policies:
                     row, series = _rollout(renderer, policy, scene, seed, content, wander, plan, rng)
@@ -136,6 +135,16 @@ def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
     }
 
 
+def _smooth(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Make a wandering curve of about unit size."""
+    knots = rng.normal(0, 1, 9)
+    return np.interp(np.linspace(0, 8, n), np.arange(9), knots) if n < 4 else _cubic(knots, n)
+
+
+def _cubic(knots: np.ndarray, n: int) -> np.ndarray:
+    return np.asarray(CubicSpline(np.arange(len(knots)), knots)(np.linspace(0, len(knots) - 1, n)))
+
+
 def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type: ignore[no-untyped-def]
     key = {"renderer": renderer, "policy": policy, "scene": scene, "seed": seed}
     row: dict[str, Any] = key | {
@@ -153,7 +162,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         return row, []
     harm = plan.harm.get(renderer, 0.8) * (1.6 if "hard" in scene else 1.0)
     t = np.arange(plan.steps)
-    offset = (wander * (0.6 + harm) + rng.normal(0, 0.015 * harm, plan.steps).cumsum()) * np.clip((t - 5) / 25, 0, 1)
+    offset = (wander * (0.6 + harm) + _smooth(rng, plan.steps) * 0.12 * harm) * np.clip((t - 5) / 25, 0, 1)
     xy = np.stack([content["ego_log"]["x_m"], content["ego_log"]["y_m"]], 1)
     tangent = np.gradient(xy, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -290,10 +299,15 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         "metrics": metrics,
         "paired": paired,
         "censoring": {},
-        "failures": {"n": len(failed)},
+        "failures": {"n_failed": len(failed), "n_rollouts": len(rows), "by_class": {"renderer": len(failed)}, "cells": [_failed(r) for r in failed]},
         "speed": speed,
         "pool": {"workers": 2, "threads_per_worker": 1, "frames_per_s_total": 41.2, "wall_s": sum(r["wall_s"] for r in rows) / 2},
     }
+
+
+def _failed(row: dict[str, Any]) -> dict[str, Any]:
+    error = {"doing": "rendering a frame", "with": "camera front <script>", "found": row["failure"], "do": "run with --set guard=off"}
+    return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
 
 
 def _mean(rows: list[dict[str, Any]], metric: str) -> dict[str, Any]:
