@@ -28,6 +28,7 @@ class Loft:
         lamp_z: Height of the lamps, share of the height.
         tuck: Share of the half width by which the roof is narrower than the belt.
         clearance: Height of the body's lower edge, share of the height.
+        rear_glass: Whether the rear end is glazed above the belt.
     """
 
     x: tuple[float, ...]
@@ -40,6 +41,7 @@ class Loft:
     lamp_z: float = 0.46
     tuck: float = 0.16
     clearance: float = 0.14
+    rear_glass: bool = True
 
     def quads(self, body: F64, glass: F64) -> tuple[F64, F64, F64]:
         """Return the skin.
@@ -85,7 +87,7 @@ class Loft:
             add([ring[1], ring[0], ring[3], ring[2]], body, 0.12)
             if t - belt > 0.05:
                 r = self._roof_half(i, w)
-                add([[x, -sign * w, belt], [x, sign * w, belt], [x, sign * r, t], [x, -sign * r, t]], glass, 0.25)
+                add([[x, -sign * w, belt], [x, sign * w, belt], [x, sign * r, t], [x, -sign * r, t]], *((glass, 0.25) if sign > 0 or self.rear_glass else (body, 0.12)))
             bumper = [[x, -sign * w * 0.95, 0.6 * low], [x, sign * w * 0.95, 0.6 * low], [x, sign * w, low * 1.6], [x, -sign * w, low * 1.6]]
             add(bumper, 0.30 * body + 0.04, 0.0)
         return np.stack(faces), np.stack(colours), np.array(gloss)
@@ -149,6 +151,7 @@ STATIONS: dict[str, Loft] = {
         lamp_z=0.24,
         tuck=0.02,
         clearance=0.16,
+        rear_glass=False,
     ),
     "bus": Loft(
         (0.5, 0.49, 0.47, -0.47, -0.5),

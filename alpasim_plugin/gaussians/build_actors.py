@@ -41,9 +41,10 @@ def build_actor(actor: Actor, scene_id: str, seed: int) -> SceneNode:
     draw, noise = rng.random(8), rng.standard_normal(4096)
     shape = _SHAPES.get(actor.label, _other)
     levels = []
-    for cell_m in CELLS_M:
+    coarser = float(np.clip(actor.box.length_m / 5.0, 1.0, 2.0))
+    for cell_m in np.array(CELLS_M) * coarser:
         cloud = GaussianCloud.concatenate([shape(actor.box, draw, noise, cell_m), _shadow(actor.box, actor.label)])
-        levels.append(Level(cell_m, cloud))
+        levels.append(Level(float(cell_m), cloud))
     return SceneNode(actor.actor_id, "actor", tuple(levels))
 
 
@@ -63,7 +64,7 @@ def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F6
     corners, rgb, gloss = loft.quads(body, GLASS_RGB)
     scale = np.array([length, width, height])
     quads = corners * scale + np.array([0.0, 0.0, -height / 2])
-    cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise)
+    cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
     # Light from above: roofs bright, flanks in between, undersides dark.
     shade = 0.80 + 0.24 * normals[:, 2]
     cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, _shaded(cloud.sh, shade[owner]))

@@ -25,7 +25,7 @@ FLOOR_M, BAY_M = 3.1, 3.0
 WIDTH_M = (9.0, 19.0)
 DEPTH_M = 9.0
 CLEAR_M = 2.8  # no wall stands nearer to the road
-TILE_M = 32.0
+CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))  # cells per bay, and the cell size at which the level is chosen
 
 WALLS = np.array(
     [[0.55, 0.30, 0.24], [0.63, 0.42, 0.33], [0.74, 0.68, 0.57], [0.80, 0.77, 0.72], [0.58, 0.58, 0.58], [0.66, 0.60, 0.50], [0.47, 0.50, 0.54], [0.70, 0.52, 0.36]]
@@ -58,21 +58,19 @@ def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
     }
     right, left = houses.front[:, 0], houses.front[:, 1]
     back = DEPTH_M * houses.away
-    starts = np.concatenate([right, left, right + back])
-    ends = np.concatenate([left, left + back, right])
-    owner = np.tile(np.arange(m), 3)
-    is_front = np.arange(3 * m) < m
+    starts = np.concatenate([right, left, right + back, left + back])
+    ends = np.concatenate([left, left + back, right, right + back])
+    owner = np.tile(np.arange(m), 4)
+    is_front = np.arange(4 * m) < m
     base = np.minimum(site.world(starts)[:, 2], site.world(ends)[:, 2])
+    top = (base[:m] + houses.height_m)[owner]  # on a slope the walls differ in height, the roof is level
     seeds = rng.integers(1 << 30, size=3)
     levels = []
-    for cells, cell_m in ((6, 0.5), (3, 1.0), (1, 2.6)):
-        cloud, wall = _walls(site, starts, ends, base, houses.height_m[owner], owner, is_front, style, cells, seeds)
-        roof, house = _roofs(site, houses, style["wall"], base[:m], 1.0 if cells == 6 else 3.0)
-        tile = np.floor((houses.front.mean(axis=1) - site.low) / TILE_M).astype(np.int64)
-        tile_of = tile[:, 1] * 100_000 + tile[:, 0]
-        joined = GaussianCloud.concatenate([cloud, roof])
-        levels.append((cell_m, joined, np.concatenate([tile_of[owner[wall]], tile_of[house]])))
-    return nodes_by_tile("houses", levels), houses
+    for cells, cell_m in CELLS:
+        cloud, wall = _walls(site, starts, ends, base, top - base, owner, is_front, style, cells, seeds)
+        roof, house = _roofs(site, houses, style["wall"], base[:m], 1.0 if cells > 3 else 3.0)
+        levels.append((cell_m, GaussianCloud.concatenate([cloud, roof]), np.concatenate([owner[wall], house])))
+    return nodes_by_tile("house", levels), houses
 
 
 def place_houses(site: Site) -> Houses:
@@ -143,33 +141,34 @@ def _walls(
     pick = (key * 48_271 % 2_147_483_647) / 2_147_483_647
     glass = GLASS[np.minimum((pick * pick * 4).astype(np.int64), 3)]
     wide = style["wide"][house]
-    if cells == 6:
-        window = (cu >= np.where(wide, 1, 2)) & (cu <= 4) & (cv >= 2) & (cv <= 4)
-        share = window.astype(np.float64)
-        sill = (cv == 1) & (cu >= np.where(wide, 1, 2)) & (cu <= 4)
+    fu, fv = (cu + 0.5) / cells, (cv + 0.5) / cells
+    first = np.where(wide, 0.17, 0.33)
+    front = is_front[wall]
+    shop = (floor == 0) & front & style["shop"][house]
+    entrance = (floor == 0) & front & ~style["shop"][house] & (bay == bays[wall] // 2)
+    nothing = np.zeros(len(wall), dtype=bool)
+    if cells >= 6:
+        share = ((fu > first) & (fu < 0.83) & (fv > 0.33) & (fv < 0.83)).astype(np.float64)
+        sill = (fu > first) & (fu < 0.83) & (fv > 0.17) & (fv < 0.33)
+        band, door = shop & (fv > 0.66) & (fv < 0.83), entrance & (fu > 0.33) & (fu < 0.66) & (fv < 0.66)
+        if cells > 6:  # glazing bars and a thinner sill
+            bar = (np.abs(fu - (first + 0.83) / 2) < 0.04) | (np.abs(fv - 0.62) < 0.04)
+            share *= np.where(bar, 0.55, 1.0)
+            sill &= fv > 0.25
     elif cells == 3:
         share = np.where(cu == 1, np.where(cv == 1, 1.0, np.where(cv == 2, 0.5, 0.0)), np.where(wide & (cv == 1), 0.3, 0.0))
-        sill = np.zeros(len(wall), dtype=bool)
+        sill, band, door = nothing, shop & (cv == 2), entrance & (cu == 1) & (cv <= 1)
     else:
         share = np.where(wide, 0.33, 0.25)
-        sill = np.zeros(len(wall), dtype=bool)
-    front = is_front[wall]
+        sill, band, door = nothing, shop, nothing
+    # Walls away from the street have fewer windows.
     share = np.where(front, share, 0.6 * share * (bay % 2 == 0))
-    ground_floor = (floor == 0) & front
-    shop = ground_floor & style["shop"][house]
-    if cells == 6:
-        share = np.where(shop, ((cu >= 1) & (cv <= 3)).astype(np.float64), share)
-        band = shop & (cv == 4)
-        door = ground_floor & ~style["shop"][house] & (bay == bays[wall] // 2) & (cu >= 2) & (cu <= 3) & (cv <= 3)
-    elif cells == 3:
-        share = np.where(shop, np.where(cv <= 1, 0.75, 0.0), share)
-        band, door = shop & (cv == 2), ground_floor & ~style["shop"][house] & (bay == bays[wall] // 2) & (cu == 1) & (cv <= 1)
-    else:
-        band, door = shop, np.zeros(len(wall), dtype=bool)
+    shop_share = ((fu > 0.12) & (fv < 0.66)) * 1.0 if cells >= 6 else np.where(cv <= 1, 0.75, 0.0)
+    share = np.where(shop, shop_share, share)
     shade = np.where(front, 1.0, 0.80) * (0.86 + 0.14 * np.clip(v * 2.5, 0, 1))
     texture = site.scenario.environment.texture
     # The same hash by place gives every level the wall's large stains; the fine grain belongs to the finest level.
-    grain = site.rng(f"facade-grain-{cells}").standard_normal(len(wall)) * (0.035 if cells == 6 else 0.015) * texture
+    grain = site.rng(f"facade-grain-{cells}").standard_normal(len(wall)) * (0.035 if cells >= 6 else 0.015) * texture
     rgb = style["wall"][house] * (shade + grain)[:, None]
     rgb = np.where(sill[:, None] & front[:, None], style["trim"][house] * shade[:, None], rgb)
     cornice = (iv == nv - 1) & (cells > 1)

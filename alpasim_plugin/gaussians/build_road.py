@@ -9,7 +9,6 @@ line in front of all ground within ``LIFT_M * distance / camera height``, which 
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -27,7 +26,6 @@ LIFT_M = 0.02
 KERB_M = 0.12
 MAX_LEVEL = 5  # cells of one image grow up to 2**5 of its pixels
 PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
-GROUND_SPREAD = 0.64
 
 
 def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
@@ -121,7 +119,7 @@ def _flat(site: Site, plan: F64, size_m: F64, rgb: F32, above_m: F64) -> Gaussia
     """Lay flat Gaussians on the ground."""
     means, normals = _on_ground(site, plan, above_m)
     quats = upright_quats(normals, site.frame.yaw_rad)
-    s = GROUND_SPREAD * size_m
+    s = SPREAD * size_m
     return cloud_of(means, quats, np.stack([s, s, THICKNESS * size_m], axis=1), rgb)
 
 
@@ -180,6 +178,3 @@ def _surroundings(site: Site) -> list[SceneNode]:
     cloud = _flat(site, plan, np.full(len(plan), cell), rgb.astype(np.float32), np.zeros(len(plan)))
     tile = np.floor(plan / 120.0).astype(np.int64)
     return nodes_by_tile("surroundings", [(cell, cloud, tile[:, 1] * 100_000 + tile[:, 0])])
-
-
-__all__ = ["KERB_M", "build_road", "cv2"]

@@ -8,7 +8,7 @@ from alpasim_plugin.gaussians.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.contours import contours, places
 from alpasim_plugin.gaussians.nodes import SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.site import Site
+from alpasim_plugin.gaussians.site import CELL_M, Site
 from alpasim_plugin.gaussians.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
 from alpasim_plugin.geometry import arc_lengths
 from alpasim_plugin.types import F64, I64, Bool
@@ -48,15 +48,17 @@ def _kerbs(site: Site) -> list[Item]:
             return []
         xy, along, away = (np.concatenate(c) for c in zip(*spots, strict=True))
         rng = site.rng(f"kerb-{step}")
-        rgb = np.array(KERB_RGB) * (1 + 0.06 * rng.standard_normal((len(xy), 1)))
+        rgb = np.array(KERB_RGB) * (1 + 0.03 * rng.standard_normal((len(xy), 1)))
         quats = quats_along(site.frame.turned(along))
-        face = site.world(xy, KERB_M / 2)
-        top = site.world(xy + 0.09 * away, KERB_M)
+        # Contours run through the centres of the first cells off the road: half a cell behind the edge.
+        xy = xy - 0.5 * CELL_M * away
+        face = site.world(xy, 0.45 * KERB_M)
+        top = site.world(xy + 0.08 * away, KERB_M)
         n = len(xy)
         size = np.full(n, SPREAD * step)
         clouds = [
-            cloud_of(face, quats, np.column_stack([size, np.full(n, 0.02), np.full(n, 0.05)]), 0.80 * rgb),
-            cloud_of(top, quats, np.column_stack([size, np.full(n, 0.075), np.full(n, 0.012)]), 1.05 * rgb),
+            cloud_of(face, quats, np.column_stack([size, np.full(n, 0.03), np.full(n, 0.07)]), 0.80 * rgb),
+            cloud_of(top, quats, np.column_stack([size, np.full(n, 0.09), np.full(n, 0.015)]), 1.05 * rgb),
         ]
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (2, 1))))
     return items
@@ -115,7 +117,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
     leaf = LEAVES[rng.integers(len(LEAVES), size=m)] * rng.uniform(0.85, 1.15, (m, 1))
     foot = site.world(at, 0.0 if site.highway else KERB_M)
     items: list[Item] = []
-    for cell_m, count in ((0.35, 170), (0.8, 48), (1.8, 14)):
+    for cell_m, count in ((0.25, 520), (0.36, 170), (0.8, 48), (1.8, 14)):
         crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
         top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
         trunks = rods(foot, top, 0.13, np.tile([0.30, 0.24, 0.19], (m, 1)), 0.5 if count > 100 else 4.0)
@@ -143,7 +145,7 @@ def _crowns(site: Site, foot: F64, crown: F64, stem: F64, leaf: F64, count: int)
     light = 0.78 + 0.34 * local[:, 2] + 0.16 * rng.standard_normal(m * count)
     rgb = leaf[owner] * np.clip(light, 0.35, 1.5)[:, None]
     # Coarser levels cover the same crown with fewer, larger blobs.
-    blob = size * (0.16 if count > 100 else 0.25 if count > 20 else 0.42)
+    blob = size * {520: 0.095, 170: 0.16, 48: 0.25, 14: 0.42}[count]
     scales = np.column_stack([blob, blob, 0.8 * blob]) * rng.uniform(0.7, 1.25, (m * count, 1))
     quats = rng.standard_normal((m * count, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)

@@ -72,7 +72,7 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
     painted = (covers[0] + covers[1]) > 0.04
     near_paint = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * cell_m if painted.any() else np.full_like(off, 1e3)
     feature = np.minimum(near_paint, edge)
-    cap = np.where(road, np.where(path < 4.0, 0.25, 0.5), 0.5) if cell_m < CELL_M else np.clip(0.05 * path, 0.5, 4.0)
+    cap = np.where(road, np.where(path < 2.5, 0.125, np.where(path < 6.0, 0.25, 0.5)), 0.5) if cell_m < CELL_M else np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
     return PlanImage(cell_m, low, np.clip(rgb, 0, 1), (~road).astype(np.float32), level)
@@ -91,7 +91,7 @@ def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
     """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to patches of ten metres."""
     total = np.zeros(shape, dtype=np.float32)
     rng = site.rng(tag)
-    for grid_m, weight in ((0.25, 0.55), (0.8, 0.5), (3.0, 0.45), (12.0, 0.5)):
+    for grid_m, weight in ((0.13, 0.6), (0.4, 0.45), (1.2, 0.4), (3.0, 0.4), (12.0, 0.45)):
         step = max(grid_m, cell_m)
         small = rng.standard_normal((int(shape[0] * cell_m / step) + 3, int(shape[1] * cell_m / step) + 3)).astype(np.float32)
         total += weight * cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)

@@ -27,7 +27,7 @@ from alpasim_plugin.gaussians.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.sky import Sky
 from alpasim_plugin.types import F64, Bool
 
-CELL_PX = 2.0
+CELL_PX = 3.5
 Change = Callable[[SceneNode, int], GaussianCloud]  # (node, level index) -> the cloud to draw in its place
 
 
@@ -61,6 +61,8 @@ class SceneGraph:
         self._change = change
         self._centre, self._radius = _spheres(self.background)
         self._far = np.array([node.far_m for node in self.background])
+        self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
+        self._actor_index = {name: i for i, name in enumerate(self.actors)}
         self._prepared: dict[tuple[str, int], PreparedCloud] = {}
 
     def __len__(self) -> int:
@@ -136,13 +138,14 @@ class SceneGraph:
             chosen.append((node, self._level(node, float(distance[i]), f), None))
         present = [name for name in self.actors if name in actor_poses]
         if present:
-            nodes = [self.actors[name] for name in present]
-            poses = [np.asarray(actor_poses[name], dtype=np.float64) for name in present]
-            local, radius = _spheres(nodes)
-            centre = np.stack([T[:3, :3] @ c + T[:3, 3] for T, c in zip(poses, local, strict=True)])
+            index = [self._actor_index[name] for name in present]
+            poses = np.stack([np.asarray(actor_poses[name], dtype=np.float64) for name in present])
+            centre = np.einsum("nij,nj->ni", poses[:, :3, :3], self._actor_centre[index]) + poses[:, :3, 3]
+            radius = self._actor_radius[index]
             distance = np.linalg.norm(centre - eye, axis=1) - radius
-            for i in np.flatnonzero(in_view(camera, centre, radius) & (distance < [node.far_m for node in nodes])):
-                chosen.append((nodes[i], self._level(nodes[i], float(distance[i]), f), poses[i]))
+            for i in np.flatnonzero(in_view(camera, centre, radius)):
+                node = self.actors[present[i]]
+                chosen.append((node, self._level(node, float(distance[i]), f), poses[i]))
         return chosen
 
     def _level(self, node: SceneNode, distance_m: float, focal_px: float) -> int:

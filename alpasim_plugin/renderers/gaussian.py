@@ -34,7 +34,7 @@ CACHED_SCENES = 4
 LOG_VIEW_WIDTH = 160
 LOG_VIEW_SPACING_M = 4.0
 LOG_VIEWS = 40
-SOFT_CELL_PX = 2.6  # a bad reconstruction has fewer, larger Gaussians
+SOFT_CELL_PX = 4.5  # a bad reconstruction has fewer, larger Gaussians
 
 T = TypeVar("T")
 _cache: OrderedDict[str, object] = OrderedDict()
