@@ -153,17 +153,23 @@ class Recorder:
             "frame_events": events,
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
+            "strip_t_us": [t_us for t_us, _ in self._strip()],
         }
 
     def save_pictures(self, video: bool) -> None:
         """Write the strip of frames, and the video if asked for."""
         if not self._kept:
             return
-        strip = [rgb for t_us, rgb in self._kept if any(abs(t_us - t) < self._scenario.rates.camera_us / 2 for t in self._strip_us)]
+        strip = [rgb for _, rgb in self._strip()]
         if strip:
-            write_bytes(self.folder / STRIP_NAME, encode_image(np.concatenate(strip[:STRIP_FRAMES], axis=1), "jpeg", 90))
+            write_bytes(self.folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90))
         if video:
             write_mp4(self.folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._scenario.rates.camera_us)
+
+    def _strip(self) -> list[tuple[int, U8]]:
+        """Return time and picture of the frames that go side by side into the strip."""
+        near_us = self._scenario.rates.camera_us / 2
+        return [(t_us, rgb) for t_us, rgb in self._kept if any(abs(t_us - t) < near_us for t in self._strip_us)][:STRIP_FRAMES]
 
     @property
     def _log(self) -> AslWriter:
