@@ -25,6 +25,7 @@ from evaluators.report.run_folder import Run, Series, read_run
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
 MAX_STRIP_SCENES = 8
+LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
 
@@ -97,6 +98,9 @@ def context(run: Run) -> dict[str, Any]:
         "scene_metrics": sections.SCENE_METRICS,
         "failures": failures,
         "more_failures": more_failures,
+        "ledger": sections.ledger(run, LEDGER_RATES),
+        "ledger_columns": sections.LEDGER_COLUMNS,
+        "ledger_rates": LEDGER_RATES,
         "provenance": sections.provenance(run),
     }
 

@@ -166,7 +166,16 @@ class Run:
 
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
-        """Give the most frequent stated reason per (renderer, metric) for which steps are invalid."""
+        """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason, from the ledger or else the steps."""
+        found = self._step_reasons()
+        for renderer, ledger in (self.summary.get("censoring") or {}).items():
+            for metric, entry in (ledger.get("invalid") or {}).items():
+                reasons = entry.get("reasons") or {}
+                if reasons:
+                    found[renderer, metric] = max(reasons, key=lambda reason: reasons[reason])
+        return found
+
+    def _step_reasons(self) -> dict[tuple[str, str], str]:
         path = self.folder / "steps.parquet"
         if not path.is_file():
             return {}

@@ -12,7 +12,7 @@ import numpy as np
 
 from evaluators.report.events import COLLISION
 from evaluators.report.metric_info import in_percent
-from evaluators.report.numbers import Cell, duration, finite, fixed, missing, plural, short
+from evaluators.report.numbers import Cell, duration, finite, fixed, interval, missing, plural, short
 from evaluators.report.run_folder import Rollout, Run
 
 MAX_SCENE_ROWS = 1200
@@ -276,3 +276,55 @@ def _pairs(value: Any) -> tuple[tuple[str, str], ...]:
     if not isinstance(value, Mapping):
         return ()
     return tuple((str(k), "none" if v is None else v if isinstance(v, str) else json.dumps(v)) for k, v in value.items())
+
+
+@dataclass(frozen=True)
+class LedgerRow:
+    """What did not enter the numbers of one renderer."""
+
+    renderer: str
+    counts: tuple[Cell, ...]  # in the order of LEDGER_COLUMNS
+    bounds: tuple[Cell, ...]  # in the order of the rates shown
+
+
+LEDGER_COLUMNS = (
+    ("rollouts", "rollouts planned"),
+    ("failed", "could not be run"),
+    ("dropped", "dropped by a rule"),
+    ("steps_total", "steps driven"),
+    ("steps_warmup", "in the warm-up"),
+    ("steps_after_event", "after the first event"),
+    ("steps_after_drift", "after leaving the log"),
+    ("steps_scored", "steps scored"),
+)
+
+
+def ledger(run: Run, rates: tuple[str, ...]) -> list[LedgerRow]:
+    """Lay out the censoring ledger; empty where the summary has none.
+
+    Args:
+        rates: Rates whose best and worst case are shown, should every rollout without a value have been without or with the event.
+    """
+    rows = []
+    for renderer, entry in (run.summary.get("censoring") or {}).items():
+        if not isinstance(entry, Mapping) or "rollouts" not in entry:
+            continue
+        bounds = entry.get("bounds") or {}
+        rows.append(LedgerRow(renderer, tuple(_tally(entry.get(key)) for key, _ in LEDGER_COLUMNS), tuple(_bound(bounds.get(r)) for r in rates)))
+    return rows
+
+
+def _tally(value: Any) -> Cell:
+    if isinstance(value, Mapping):
+        total = sum(int(n) for n in value.values())
+        return Cell(str(total), "; ".join(f"{cause}: {n}" for cause, n in value.items()), sort=total)
+    number = finite(value)
+    return missing("not counted") if number is None else Cell(fixed(number, 0), sort=number)
+
+
+def _bound(value: Any) -> Cell:
+    bounds = interval(value)
+    if bounds is None:
+        return missing("not a rate of this run")
+    low, high = (fixed(100 * v, 1) for v in bounds)
+    return Cell(f"{low}\u00a0%" if low == high else f"{low} to {high}\u00a0%", sort=bounds[1])

@@ -117,10 +117,14 @@ def metric_cell(name: str, entry: Mapping[str, Any], unit: str, places: int, rea
         low, high = (fixed(v * scale, places) for v in clustered)
         detail += f" \u00b7 {low} to {high}"
     notes = [f"{plural(n_rollouts, 'rollout')}, {plural(n_scenes, 'scene')}"]
+    if entry.get("n_invalid"):
+        notes.append(f"invalid in {entry['n_invalid']} more" + (f" ({reason})" if reason else ""))
     if half is None:
-        notes.append("no \u00b1: it needs at least two rollouts")
+        notes.append(f"no \u00b1: {entry.get('ci95_reason') or 'it needs at least two rollouts'}")
     if clustered is None:
-        notes.append("no interval over scenes: it needs at least two scenes")
+        notes.append(f"no interval over scenes: {entry.get('ci95_clustered_reason') or 'it needs at least two scenes'}")
+    if entry.get("note"):
+        notes.append(str(entry["note"]))
     count = count_of(mean, n_rollouts) if is_rate(name, unit) else ""
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
 
@@ -177,7 +181,7 @@ def pair_rows(summary: Mapping[str, Any]) -> list[PairRow]:
     for arm, pairs in (summary.get("paired") or {}).items():
         for name in ordered(pairs):
             entry = pairs[name] or {}
-            stats = (summary.get("metrics") or {}).get(arm, {}).get(name, {})
+            stats = {**((summary.get("metrics") or {}).get(arm, {}).get(name) or {}), **entry}  # an older summary has them in metrics only
             rows.append(_pair_row(arm, name, entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
     return rows
 
@@ -187,11 +191,10 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
     bounds = interval(entry.get("ci95"), diff)
     scale, unit = (100.0, "points") if in_percent(name, unit) else (1.0, unit)
     tail = f"\u00a0{unit}" if unit else ""
-    n_pairs = entry.get("n_pairs")
-    note = plural(int(n_pairs), "pair") if n_pairs is not None else ""
-    diff_cell, bounds_cell, span = missing(str(entry.get("reason") or "no pair has this metric valid on both sides")), missing(
-        "it needs at least two scenes"
-    ), None
+    note = _pair_note(entry)
+    reason = str(entry.get("reason") or "")
+    diff_cell, bounds_cell = missing(reason or "no pair has this metric valid on both sides"), missing(reason or "it needs at least two scenes")
+    span = None
     if diff is not None:
         ends = bounds or ()
         places = 1 if scale == 100.0 else decimals(*(v * scale for v in (diff, *ends)), digits=3)
@@ -202,10 +205,21 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
             reach = max(abs(bounds[0]), abs(bounds[1]), abs(diff)) or 1.0
             span = Span(*(round(50 + 46 * v / reach, 2) for v in (diff, *bounds)), zero=50.0)
     p = finite(entry.get("p_value"))
-    p_cell = missing("no test: it needs at least two scenes with a difference") if p is None else Cell(_p_text(p), sort=p)
+    p_cell = missing(reason or "no test was made") if p is None else Cell(_p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
     return PairRow(arm, str(entry.get("baseline") or "\u2014"), name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span)
+
+
+def _pair_note(entry: Mapping[str, Any]) -> str:
+    said = []
+    if entry.get("n_cells") is not None:
+        said.append(plural(int(entry["n_cells"]), "pair"))
+    if entry.get("n_scenes") is not None:
+        said.append(plural(int(entry["n_scenes"]), "scene"))
+    if entry.get("n_missing"):
+        said.append(f"{entry['n_missing']} cells lack a partner")
+    return ", ".join(said)
 
 
 def _p_text(p: float) -> str:

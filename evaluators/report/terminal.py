@@ -12,7 +12,8 @@ from rich.text import Text
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.tables import metric_rows
 
-MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts \u00b7 a to b: 95 % with scenes as clusters"
+NO_BREAK = "\u00a0"
+MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 % interval with scenes as clusters"
 
 
 def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Table:
@@ -45,7 +46,7 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Tab
 def _cell(cell: Cell) -> Text:
     if cell.missing:
         return Text(cell.text, style="dim")
-    text = Text(cell.text)
-    if cell.count:
-        text.append(f" ({cell.count})")
-    return text.append(f"\n{cell.detail}".replace(" to ", "\u00a0to\u00a0").replace("\u00b1\u00a0", "\u00b1"), style="dim")
+    half, _, bounds = cell.detail.partition(" \u00b7 ")
+    text = Text(cell.text, style="bold").append(f" {half.replace(NO_BREAK, '')}", style="not bold dim")
+    text.append(f" ({cell.count})" if cell.count else "", style="not bold")
+    return text.append(f"\n{bounds.replace(' ', NO_BREAK)}", style="not bold dim")

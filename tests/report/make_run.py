@@ -13,25 +13,25 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy import stats
 from scipy.interpolate import CubicSpline
 
-METRICS = {  # name -> unit, direction
-    "collision_any": ("", "lower"),
-    "collision_at_fault": ("", "lower"),
-    "collision_front": ("", "lower"),
-    "collision_lateral": ("", "lower"),
-    "collision_rear": ("", "lower"),
-    "offroad": ("", "lower"),
-    "route_distance_m": ("m", "lower"),
-    "progress": ("", "higher"),
-    "dist_to_gt_location": ("m", "lower"),
-    "min_distance_to_obstacle_m": ("m", "higher"),
-    "plan_deviation": ("m", "lower"),
-    "offroad_margin_m": ("m", "higher"),
-    "contact_time_s": ("s", "none"),
-}
-PAIRED = ("collision_any", "collision_at_fault", "offroad", "route_distance_m", "progress", "plan_deviation")
+from evaluators.aggregate import aggregate, censoring, paired
+
+METRICS = (
+    "collision_any",
+    "collision_at_fault",
+    "collision_front",
+    "collision_lateral",
+    "collision_rear",
+    "offroad",
+    "route_distance_m",
+    "progress",
+    "dist_to_gt_location",
+    "min_distance_to_obstacle_m",
+    "plan_deviation",
+    "dist_traveled_m",
+    "min_ade@1.0s(gt)",
+)
 STAGES = {"render": 0.62, "policy": 0.2, "fixer": 0.0, "log": 0.1, "control": 0.01, "actors": 0.03}
 DT_US = 100_000
 
@@ -199,8 +199,8 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "dist_to_gt_location": float(np.abs(offset[:end]).mean() + 0.4),
         "min_distance_to_obstacle_m": float(max(0.0, 1.6 - np.abs(offset[:end]).max())),
         "plan_deviation": float(0.05 + 0.04 * harm + rng.uniform(0, 0.02)),
-        "offroad_margin_m": float(1.1 + offset[:end].min()),
-        "contact_time_s": float(np.argmax(hit) * 0.1) if collided else None,
+        "dist_traveled_m": 0.8 * end,
+        "min_ade@1.0s(gt)": None,
     }
     if scene == plan.scenes[0]:
         values |= dict.fromkeys(plan.invalid)
@@ -208,10 +208,14 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
             key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "no other road user within 50 m"} for m in plan.invalid
         ]
     steps += [
-        key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "no contact in this rollout"}
-        for m in ("contact_time_s",)
+        key | {"t_us": 0, "metric": m, "value": None, "valid": False, "reason": "the policy gives no plan of 1.0 s"}
+        for m in ("min_ade@1.0s(gt)",)
         if values[m] is None
     ]
+    row["censored"] = {"dropped": "", "steps_total": plan.steps, "steps_warmup": 5, "steps_after_event": plan.steps - end}
+    row["censored"] |= {"steps_after_drift": 0, "steps_scored": end - 5}
+    row |= {f"{m}_reason": "no other road user within 50 m" for m in plan.invalid}
+    row |= {"min_ade@1.0s(gt)_reason": "the policy gives no plan of 1.0 s"}
     row |= values | {f"{m}_valid": v is not None for m, v in values.items()}
     return row, steps
 
@@ -268,16 +272,9 @@ def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
 
 
 def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
-    """Aggregate with plain formulas; the real aggregation has its own tests."""
-    metrics: dict[str, Any] = {}
-    paired: dict[str, Any] = {}
+    """Aggregate as the runtime does."""
     baseline = plan.renderers[0] if plan.renderers else ""
-    for renderer in plan.renderers:
-        of = [r for r in rows if r["renderer"] == renderer]
-        metrics[renderer] = {m: _mean(of, m) for m in METRICS}
-        if renderer != baseline:
-            against = [r for r in rows if r["renderer"] == baseline]
-            paired[renderer] = {m: _pair(of, against, m, baseline) for m in PAIRED}
+    ran = {r["renderer"] for r in rows}
     failed = [r for r in rows if r["status"] != "ok"]
     speed = {
         renderer: {
@@ -296,9 +293,9 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
     }
     return {
         "preset": "paper",
-        "metrics": metrics,
-        "paired": paired,
-        "censoring": {},
+        "metrics": aggregate(rows),
+        "paired": paired(rows, baseline) if len(ran) > 1 else {},
+        "censoring": censoring(rows),
         "failures": {"n_failed": len(failed), "n_rollouts": len(rows), "by_class": {"renderer": len(failed)}, "cells": [_failed(r) for r in failed]},
         "speed": speed,
         "pool": {"workers": 2, "threads_per_worker": 1, "frames_per_s_total": 41.2, "wall_s": sum(r["wall_s"] for r in rows) / 2},
@@ -308,47 +305,6 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
 def _failed(row: dict[str, Any]) -> dict[str, Any]:
     error = {"doing": "rendering a frame", "with": "camera front <script>", "found": row["failure"], "do": "run with --set guard=off"}
     return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
-
-
-def _mean(rows: list[dict[str, Any]], metric: str) -> dict[str, Any]:
-    unit, direction = METRICS[metric]
-    good = [r for r in rows if r[f"{metric}_valid"]]
-    values = np.array([r[metric] for r in good], float)
-    scenes = sorted({r["scene"] for r in good})
-    facts = {"n_rollouts": len(good), "n_scenes": len(scenes), "unit": unit, "direction": direction}
-    if not good:
-        return {"mean": None, "ci95": None, "ci95_clustered": None, "reason": "valid in no rollout", **facts}
-    means = np.array([np.mean([r[metric] for r in good if r["scene"] == s]) for s in scenes])
-    return {
-        "mean": float(values.mean()),
-        "ci95": float(1.96 * values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else None,
-        "ci95_clustered": _t_interval(means),
-        **facts,
-    }
-
-
-def _t_interval(means: np.ndarray) -> list[float] | None:
-    if len(means) < 2:
-        return None
-    half = float(stats.t.ppf(0.975, len(means) - 1) * means.std(ddof=1) / math.sqrt(len(means)))
-    return [float(means.mean() - half), float(means.mean() + half)]
-
-
-def _pair(of: list[dict[str, Any]], against: list[dict[str, Any]], metric: str, baseline: str) -> dict[str, Any]:
-    other = {(r["policy"], r["scene"], r["seed"]): r for r in against if r[f"{metric}_valid"]}
-    cells = [(r, other[(r["policy"], r["scene"], r["seed"])]) for r in of if r[f"{metric}_valid"] and (r["policy"], r["scene"], r["seed"]) in other]
-    if not cells:
-        return {"baseline": baseline, "diff": None, "ci95": None, "p_value": None, "verdict": "undecided"}
-    scenes = sorted({r["scene"] for r, _ in cells})
-    means = np.array([np.mean([a[metric] - b[metric] for a, b in cells if a["scene"] == s]) for s in scenes])
-    ci = _t_interval(means)
-    diff = float(np.mean([a[metric] - b[metric] for a, b in cells]))
-    sign = -1 if METRICS[metric][1] == "higher" else 1
-    verdict = "undecided"
-    if ci is not None and (ci[0] > 0 or ci[1] < 0):
-        verdict = "worse" if sign * diff > 0 else "better"
-    p = float(stats.ttest_1samp(means, 0).pvalue) if len(means) > 1 and means.std() > 0 else None
-    return {"baseline": baseline, "diff": diff, "ci95": ci, "p_value": p, "verdict": verdict, "n_pairs": len(cells)}
 
 
 def _run_json(plan: Plan, maps: dict[str, Any]) -> dict[str, Any]:
