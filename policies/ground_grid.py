@@ -12,7 +12,7 @@ from alpasim_plugin.errors import PolicyError
 from alpasim_plugin.geometry import inverse
 from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec
 
-FAR_M = 60.0
+FAR_M = 100.0
 NEAR_M = 4.5
 HALF_WIDTH_M = 8.0
 CELL_M = 0.05

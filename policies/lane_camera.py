@@ -180,7 +180,7 @@ class LaneCamera:
         age_s = (observation.t_us - self.seen_us) * 1e-6
         if age_s <= 0:
             return self.obstacle
-        return track_obstacle(self.obstacle, None, observation.ego.speed_mps, age_s, np.inf)
+        return track_obstacle(self.obstacle, None, observation.ego.speed_mps, age_s)
 
     def _debug(self, lane: LaneState | None, route: F64 | None, blended: Blend) -> dict[str, Any]:
         mode = ("straight" if route is None else "route") if lane is None else ("lane" if lane.blind_m == 0 else "memory")

@@ -18,9 +18,10 @@ from policies.ground_grid import CELL_M, GroundGrid
 
 STRIPS = 4
 CORRIDOR_HALF_M = 0.95  # half the ego's width: what stands outside can be passed
-MIN_HEIGHT_M = 0.6
-LEAST_HEIGHT_M = 0.3
+TALL = 0.8  # how high to look, as a share of the camera's height
+LOW = 0.35  # the least that is asked where a curve ends the look
 LEAVE_LANE_M = 1.4
+NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
 ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
 LEARN = 0.1
 FILLED, CLEAR = 0.7, 0.35
@@ -64,14 +65,12 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
 
 
 def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
-    """Return 0..255 per cell ``(R, C)``: how little it looks like the road, by its worst channel. Thin things (paint) are removed."""
+    """Return 0..255 per cell ``(R, C)``: how little it looks like the road, by its worst channel."""
     level = np.arange(256, dtype=np.float64)[:, None]
     away = np.abs(level - colour.centre) / colour.tolerance
     table = (255 * np.clip((away - 0.7) / 0.6, 0.0, 1.0)).astype(np.uint8)
     light, a, b = cv2.split(cv2.LUT(lab, table[:, None, :]))
     value = cv2.max(light, cv2.max(a, b))
-    wide = np.ones((1, round(0.35 / CELL_M) | 1), np.uint8)
-    value = cv2.morphologyEx(value, cv2.MORPH_OPEN, wide)
     value[~grid.inside] = 0
     return np.asarray(value)
 
@@ -80,8 +79,9 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     """Return (distance, its standard deviation) of the nearest thing in the corridor along ``centre_y`` (R,), or None.
 
     The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear and what lies behind it on the
-    camera's line of sight is filled, up to where a thing of `MIN_HEIGHT_M` would hide the ground. In a curve the line of sight leaves
-    the lane: what is seen there says nothing, and a row that keeps less than a thing of `LEAST_HEIGHT_M` would hide is no candidate.
+    camera's line of sight is filled, up to where a thing of `TALL` times the camera's height would hide the ground: a crosswalk does
+    not reach that far. In a curve the line of sight leaves the lane, and what is seen there says nothing; such a row must be filled by
+    something wider than the bars of a crosswalk, and it is no candidate where even a thing of `LOW` could not be told.
 
     Args:
         value: `anomaly` of the frame.
@@ -90,32 +90,37 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
         min_x_m: Nearest candidate.
         max_x_m: Furthest candidate.
     """
-    x_camera, height = grid.camera_xz
+    x_camera, _ = grid.camera_xz
     distance = grid.x_m - x_camera
     rows = np.arange(len(distance))
-    table = _sums_along_sight(value, grid)
-    last = np.searchsorted(distance, distance * height / max(height - MIN_HEIGHT_M, 0.2 * height))
-    least = np.searchsorted(distance, distance * height / max(height - LEAST_HEIGHT_M, 0.2 * height))
+    narrow, wide = (_sums_along_sight(cv2.morphologyEx(value, cv2.MORPH_OPEN, _bar(width)), grid) for width in (NARROW_M, WIDE_M))
+    full = np.searchsorted(distance, distance / (1 - TALL))
+    least = np.searchsorted(distance, distance / (1 - LOW))
     # The line of sight through the path at row i, and where it has left the path at a later row k.
     sight = (centre_y[:, None] - grid.camera_y) * (distance[None, :] / distance[:, None]) + grid.camera_y
     left_lane = (np.abs(sight - centre_y[None, :]) > LEAVE_LANE_M) & (rows[None, :] > rows[:, None])
-    last = np.minimum(last, np.where(left_lane.any(axis=1), np.argmax(left_lane, axis=1), len(rows)))
+    last = np.minimum(full, np.where(left_lane.any(axis=1), np.argmax(left_lane, axis=1), len(rows)))
+    short = last < full
     usable = (grid.x_m >= min_x_m) & (grid.x_m <= max_x_m) & (last >= np.minimum(least, len(rows))) & (last - rows >= 3)
     front = np.searchsorted(distance, 0.82 * distance)
     edges = np.linspace(CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1)
     u = np.rint(grid.sight_column((centre_y[:, None] + edges[None, :]), rows)).astype(np.intp)
-    u = np.clip(u, 0, table.shape[1] - 1)
-    filled = _box_mean(table, rows, last, u)
-    clear = _box_mean(table, front, np.maximum(rows - 1, front), u)
+    u = np.clip(u, 0, narrow.shape[1] - 1)
+    filled = np.where(short[:, None], _box_mean(wide, rows, last, u), _box_mean(narrow, rows, last, u))
+    clear = _box_mean(narrow, front, np.maximum(rows - 1, front), u)
     hit = (filled > FILLED) & (clear < CLEAR) & usable[:, None]
     if not hit.any():
         return None
     first = int(np.argmax(hit.any(axis=1)))
     # A box that is mostly filled may begin before the thing does: the foot is where its rows become anomalous.
     behind = np.arange(first, max(int(last[first]), first + 1))
-    level = _box_mean(table, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, hit[first]].mean(axis=1)
+    level = _box_mean(narrow, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, hit[first]].mean(axis=1)
     i = first + int(np.argmax(level > 0.5))
     return float(grid.x_m[i] - 0.5 * grid.row_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
+
+
+def _bar(width_m: float) -> U8:
+    return np.ones((1, round(width_m / CELL_M) | 1), dtype=np.uint8)
 
 
 def _sums_along_sight(value: U8, grid: GroundGrid) -> F64:
@@ -150,11 +155,11 @@ class ObstacleTrack:
 
 
 def track_obstacle(
-    track: ObstacleTrack | None, foot: tuple[float, float] | None, ego_mps: float, dt_s: float, blind_below_m: float
+    track: ObstacleTrack | None, foot: tuple[float, float] | None, ego_mps: float, dt_s: float, nearest_m: float = 0.0
 ) -> ObstacleTrack | None:
     """Carry the track over ``dt_s`` and correct it by a new foot; None when there is nothing (any more).
 
-    A track whose foot has gone out of the image at the bottom is kept for as long as the ego's own motion says it is near.
+    A foot at ``nearest_m``, the lower edge of the image, may be nearer than that: it confirms a track that says so.
     """
     if track is not None:
         transition = np.array([[1.0, dt_s], [0.0, 1.0]])
@@ -167,10 +172,11 @@ def track_obstacle(
     if foot is None:
         if track is None:
             return None
-        hidden = track.confirmed and track.distance_m < blind_below_m + 1.0
-        track = replace(track, misses=track.misses + (0 if hidden else 1))
+        track = replace(track, misses=track.misses + 1)
         return None if track.misses > (8 if track.confirmed else 2) else track
     measured, sigma = foot
+    if track is not None and measured <= nearest_m + 0.1 and track.distance_m < measured:
+        return replace(track, hits=track.hits + 1, misses=0)
     if track is None or abs(measured - track.distance_m) > 4.0 * np.sqrt(track.cov[0, 0] + sigma**2) + 2.0:
         # Nothing is known of its speed: as fast as the ego, give or take 5 m/s, until it is watched.
         return ObstacleTrack(measured, 0.6 * ego_mps, np.diag([sigma**2, (2.0 + 0.4 * ego_mps) ** 2]))
