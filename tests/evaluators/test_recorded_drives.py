@@ -1,0 +1,124 @@
+"""The human drives of real recordings, scored as log replay: safe, on the road, on their own path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.geometry import interpolate, inverse, offset_trajectory, se3, trajectory_from_poses
+from alpasim_plugin.types import LaneMap, RolloutLog, Scene
+from evaluators import PRESETS, rollout_values, score
+from evaluators.collision import find_contacts
+from evaluators.footprint import ActorTable, ego_footprints
+from scenarios.argoverse import read_argoverse
+from scenarios.commonroad import read_commonroad
+from scenarios.cosmos import read_cosmos
+from scenarios.recorded import RecordedLog
+from tests.evaluators.eval_build import by_name
+from tests.scenarios.real_drive import ruling
+
+PAPER = PRESETS["paper"]
+ARGOVERSE = ("7fab2350", "adcf7d18", "3bffdcff")
+LOGS = (*ARGOVERSE, "USA_US101-3_3_T-1", "USA_Lanker-1_1_T-1", "cosmos")
+
+
+@lru_cache(maxsize=3)
+def read(folder: Path, name: str) -> RecordedLog:
+    if name in ARGOVERSE:
+        return read_argoverse(folder / "av2" / name)
+    if name == "cosmos":
+        return read_cosmos(folder / "cosmos-drive-dreams" / "example")
+    return read_commonroad(folder / "commonroad" / f"{name}.xml")
+
+
+def replayed(log: RecordedLog, t_us: np.ndarray) -> tuple[RolloutLog, Scene]:
+    T_rig_box = np.eye(4)
+    T_rig_box[:3, 3] = [log.vehicle.rear_axle_to_centre_m, 0.0, log.vehicle.box.height_m / 2]
+    rig = trajectory_from_poses(t_us, interpolate(log.ego_log, t_us))
+    actors = {one.actor_id: one for one in log.actors}
+    first = int(t_us[0])
+    rollout = RolloutLog(
+        log.scene_id,
+        "replay",
+        log.vehicle.box,
+        T_rig_box,
+        offset_trajectory(rig, T_rig_box),
+        actors,
+        (),
+        (),
+        log.ego_log,
+        first,
+        first,
+        0,
+        100_000,
+    )
+    return rollout, Scene(log.scene_id, log.lane_map, log.ego_log, log.vehicle)
+
+
+def grid(log: RecordedLog) -> np.ndarray:
+    return np.arange(log.ego_log.t_us[0], log.ego_log.t_us[-1] + 1, 100_000)
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_the_human_drive_hits_nobody_stays_on_the_road_and_on_its_path(shared_data, name):
+    rollout, scene = replayed(*(log := read(shared_data, name), grid(log)))
+    series = score(rollout, scene)
+    values = rollout_values(series)
+    assert values["collision_any"].value == 0.0
+    assert values["offroad"].value == 0.0
+    assert values["wrong_lane"].value == 0.0
+    assert values["route_distance_m"].value < 1e-9
+    assert values["progress"].value > 0.99
+    assert values["progress_rel"].value == pytest.approx(1.0)
+
+
+# Steps (of 0.1 s) whose footprint the lanes do not hold; none of them touches a road edge.
+UNHELD = {
+    "7fab2350": range(150, 160),  # right-hand side up to 9 cm outside the lane, in the junction's exit
+    "adcf7d18": (),
+    "3bffdcff": (),
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_lane_containment_agrees_with_a_plain_rule_written_elsewhere(shared_data, name):
+    log = read(shared_data, name)
+    rollout, scene = replayed(log, grid(log))
+    _, _, neither, off = ruling(log, grid(log))
+    no_edges = replace(scene, lane_map=LaneMap(scene.lane_map.lanes))
+    unheld = np.flatnonzero(~by_name(score(rollout, no_edges))["offroad"].valid)
+    assert off == []
+    assert unheld.tolist() == neither
+    if name in UNHELD:
+        assert unheld.tolist() == list(UNHELD[name])
+
+
+@pytest.mark.parametrize(("name", "gap_m", "at_s"), [("7fab2350", 0.521, 11.90), ("adcf7d18", 0.385, 4.90), ("3bffdcff", 0.190, 14.00)])
+def test_least_gap_to_anybody_in_the_ego_plane_is_the_published_one(shared_data, name, gap_m, at_s):
+    """Each frame is seen in the ego's own plane, with the recorded car's size, as the publisher's annotations are."""
+    log = read(shared_data, name)
+    own_size = replace(PAPER, ego_size_m=None)
+    t_us = np.unique(np.concatenate([one.track.t_us for one in log.actors]))
+    t_us = t_us[(t_us >= log.ego_log.t_us[0]) & (t_us <= log.ego_log.t_us[-1])]
+    to_ego = inverse(interpolate(log.ego_log, t_us))
+    gaps = np.full(len(t_us), np.inf)
+    rollout, _ = replayed(log, t_us[:1])
+    for k, t in enumerate(t_us):
+        here = {}
+        for one in rollout.actors.values():
+            row = np.flatnonzero(one.track.t_us == t)
+            if len(row):
+                pose = to_ego[k] @ se3(one.track.xyz[row], one.track.quat[row])
+                here[one.actor_id] = replace(one, track=trajectory_from_poses([t], pose))
+        ego = trajectory_from_poses([t], rollout.T_rig_box[None])
+        in_plane = replace(rollout, ego=ego, actors=here)
+        origin = np.zeros(3)
+        _, gap = find_contacts(ego_footprints(in_plane, own_size, origin), ActorTable(in_plane, own_size, origin), ego.t_us)
+        gaps[k] = gap[0]
+    best = int(np.argmin(gaps))
+    assert gaps[best] == pytest.approx(gap_m, abs=1e-3)
+    assert (t_us[best] - t_us[0]) * 1e-6 == pytest.approx(at_s, abs=0.01)
