@@ -14,6 +14,8 @@ Random numbers belong to (scene, seed, part of the scene), never to ``w``: movin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -21,7 +23,7 @@ from scipy.spatial import KDTree
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.nodes import SceneNode
-from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.gaussians.sh import C0, C1
 from alpasim_plugin.geometry import arc_lengths, interpolate, project, resample, se3
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F32, F64, Bool, Degradation, Scenario
@@ -53,6 +55,20 @@ class LogView:
         return np.asarray(inside & (~self.solid[row, column] | (z < limit)))
 
 
+class _Recipe(NamedTuple):
+    """A cloud and its faults: ``x_on`` is there on the path, ``x_off`` is added in proportion to ``w``."""
+
+    cloud: GaussianCloud  # Gaussians that the log saw, colours flattened and tinted
+    ray: F32  # (N, 3) from the log camera, metres
+    shift_on: F32  # (N,) share of the ray
+    shift_off: F32
+    grow_on: F32  # (N,) logarithm of the size factor
+    grow_off: F32
+    fade: F32  # (N,) 0..1
+    tint_off: F32  # (N, 1, 3) change of the constant colour coefficient
+    missing_from: F32  # (N,) the w from which it is missing
+
+
 class Surrogate:
     """Degrade the parts of one scene.
 
@@ -72,7 +88,7 @@ class Surrogate:
         self._eyes = self._line + [0.0, 0.0, camera[2]]
         self._tree = KDTree(self._line[:, :2])
         self._reach = extended(path, scenario.ego_log.quat[0])
-        self._seen: dict[tuple[str, int], Bool] = {}
+        self._recipes: dict[tuple[str, int], _Recipe] = {}
 
     def weight(self, T_world_rig: F64) -> float:
         """Return ``w`` of a rig pose, 0..1, in steps of ``1 / STEPS``."""
@@ -82,34 +98,56 @@ class Surrogate:
 
     def background(self, node: SceneNode, level: int, cloud: GaussianCloud, w: float) -> GaussianCloud:
         """Degrade one level of a background node."""
+        r = self._recipe(node, level, cloud)
+        s = self.amount.severity
+        keep = np.flatnonzero(r.missing_from > w)
+        kept, shift = r.cloud.take(keep), np.clip((r.shift_on + w * r.shift_off)[keep], -0.75, 1.5)[:, None]
+        grow = (1 + shift) * np.exp(r.grow_on + w * r.grow_off)[keep, None]
+        return GaussianCloud(
+            kept.means + r.ray[keep] * shift,
+            kept.quats,
+            kept.scales * grow,
+            kept.opacities * (1 - np.float32(min(s * w, 1.5)) * 0.25 * r.fade[keep]),
+            kept.sh + np.float32(w) * r.tint_off[keep],
+        )
+
+    def _recipe(self, node: SceneNode, level: int, cloud: GaussianCloud) -> _Recipe:
+        """Draw everything about a cloud's faults that does not depend on ``w``; kept, because ``w`` changes while driving."""
+        key = (node.name, level)
+        if key in self._recipes:
+            return self._recipes[key]
         n, s = len(cloud), self.amount.severity
         rng = stream(self.scenario.scene_id, self.scenario.seed, f"degrade/{node.name}/{level}")
-        draw = rng.random((n, 4))
-        normal = rng.standard_normal((n, 3))
-        ray, cell = self._rays(cloud.means)
+        draw, normal = rng.random((n, 5), dtype=np.float32), rng.standard_normal((n, 3), dtype=np.float32)
         # Depth errors: an own part per Gaussian, a part shared by a neighbourhood, and a few that slide far and become floaters.
-        smooth = _wave(cell, self.scenario, "degrade/depth-field")
+        ray, place = self._rays(cloud.means)
+        smooth = _wave(place, self.scenario, "degrade/depth-field")
         own = 0.35 * normal[:, 0] + np.where(draw[:, 0] < 0.12, normal[:, 1], 0.0)
-        shift = s * ((0.012 + 0.085 * w) * own + (0.004 + 0.10 * w) * smooth)
-        floater = draw[:, 1] < 0.012 * min(s, 2.0)
-        shift = np.where(floater, shift - s * w * (0.25 + 0.4 * draw[:, 2]), shift)
-        shift = np.clip(shift, -0.75, 1.5)
-        grow = (1 + shift) * np.exp(s * ((0.14 + 0.10 * draw[:, 3]) + w * (0.25 * draw[:, 3] + 0.12)))
-        blotch = _wave(cell * 1.7 + 31.0, self.scenario, "degrade/colour-field")[:, None]
-        rgb = cloud.sh[:, 0] * C0 + 0.5
-        rgb = rgb * (1 + s * (0.03 + 0.05 * w) * normal[:, 2:3]) + s * (0.008 + 0.04 * w) * blotch * [1.0, 0.6, -0.8]
-        patchy = _wave(cell * 0.6 + 77.0, self.scenario, "degrade/missing-field")
-        missing = draw[:, 0] < s * w * np.clip(0.10 + 0.30 * patchy, 0.02, 0.7)
-        unseen = ~self._seen_by_log(node, level, cloud) & (draw[:, 2] < 0.95 * min(s, 1.0))
-        keep = ~(missing | unseen)
-        out = GaussianCloud(
-            cloud.means + ray * shift[:, None],
-            cloud.quats,
-            (cloud.scales * grow[:, None]).astype(np.float32),
-            (cloud.opacities * (1 - np.clip(s * w, 0, 1.5) * 0.25 * draw[:, 2])).astype(np.float32),
-            ((np.clip(rgb, 0, 1) - 0.5) / C0)[:, None, :].astype(np.float32),
+        floater = draw[:, 1] < 0.02 * min(s, 2.0)
+        shift_on = s * (0.012 * own + 0.004 * smooth)
+        shift_off = s * (0.085 * own + 0.10 * smooth) - np.where(floater, s * (0.25 + 0.4 * draw[:, 2]), 0.0)
+        blotch = _wave(place * 1.7 + 31.0, self.scenario, "degrade/colour-field")[:, None] * np.array([1.0, 0.6, -0.8])
+        rgb = flattened(cloud.sh)[:, 0] * C0 + 0.5
+        tint_on, tint_off = (s * (a * rgb * normal[:, 2:3] + b * blotch) for a, b in ((0.03, 0.008), (0.05, 0.022)))
+        patchy = _wave(place * 0.6 + 77.0, self.scenario, "degrade/missing-field")
+        missing_from = draw[:, 3] / np.maximum(s * np.clip(0.10 + 0.30 * patchy, 0.02, 0.7), 1e-9)
+        unseen = ~self._seen_by_log(cloud) & (draw[:, 2] < 0.95 * min(s, 1.0))
+        keep = np.flatnonzero(~unseen)
+        sh = ((np.clip(rgb + tint_on, 0, 1) - 0.5) / C0)[:, None, :].astype(np.float32)
+        flat = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh)
+        columns = (
+            ray,
+            shift_on,
+            shift_off,
+            s * (0.14 + 0.10 * draw[:, 4]),
+            s * (0.25 * draw[:, 4] + 0.12) + np.where(floater, 0.6, 0.0),
+            draw[:, 2],
+            (tint_off / C0)[:, None, :],
+            missing_from,
         )
-        return out.take(np.flatnonzero(keep))
+        recipe = _Recipe(flat.take(keep), *(column[keep].astype(np.float32) for column in columns))
+        self._recipes[key] = recipe
+        return recipe
 
     def actor(self, node: SceneNode, level: int, cloud: GaussianCloud, w: float) -> GaussianCloud:
         """Degrade one level of an actor: soft, incomplete, without sheen; ghosts are fainter."""
@@ -118,13 +156,13 @@ class Surrogate:
         draw, normal = rng.random((n, 2)), rng.standard_normal((n, 3))
         ghost = node.name.endswith(GHOST)
         size = cloud.scales.max(axis=1, keepdims=True)
-        opacity = cloud.opacities * (min(0.55, s * (0.10 + 0.40 * w)) if ghost else 1 - min(0.6, s * (0.02 + 0.30 * w)) * draw[:, 1])
+        opacity = cloud.opacities * (min(0.55, s * (0.05 + 0.40 * w)) if ghost else 1 - min(0.6, s * (0.02 + 0.30 * w)) * draw[:, 1])
         out = GaussianCloud(
             cloud.means + s * (0.15 + 0.9 * w) * size * normal,
             cloud.quats,
             (cloud.scales * np.exp(s * (0.12 + 0.45 * w) * (0.5 + draw[:, 1:]))).astype(np.float32),
             opacity.astype(np.float32),
-            cloud.sh[:, :1],
+            flattened(cloud.sh),
         )
         return out.take(np.flatnonzero(draw[:, 0] >= s * (0.03 + 0.30 * w)))
 
@@ -157,18 +195,29 @@ class Surrogate:
         eye = self._eyes[np.clip(i - back, 0, len(self._eyes) - 1)]
         return means - eye, means[:, :2] - self._line[0, :2]
 
-    def _seen_by_log(self, node: SceneNode, level: int, cloud: GaussianCloud) -> Bool:
-        key = (node.name, level)
-        if key not in self._seen:
-            seen = np.zeros(len(cloud), dtype=bool)
-            size = cloud.scales.max(axis=1).astype(np.float64)
-            for view in self.views:
-                rest = np.flatnonzero(~seen)
-                if len(rest) == 0:
-                    break
-                seen[rest] = view.sees(cloud.means[rest], size[rest])
-            self._seen[key] = seen if self.views else np.ones(len(cloud), dtype=bool)
-        return self._seen[key]
+    def _seen_by_log(self, cloud: GaussianCloud) -> Bool:
+        if not self.views:
+            return np.ones(len(cloud), dtype=bool)
+        seen = np.zeros(len(cloud), dtype=bool)
+        size = cloud.scales.max(axis=1).astype(np.float64)
+        for view in self.views:
+            rest = np.flatnonzero(~seen)
+            if len(rest) == 0:
+                break
+            seen[rest] = view.sees(cloud.means[rest], size[rest])
+        return seen
+
+
+def flattened(sh: F32) -> F32:
+    """Return colours ``(N, 1, 3)`` without view dependence: the mean over the views from outside.
+
+    A sheen that grows away from the normal n is ``add * (1 + d . n)``; over the hemisphere of views, weighted by the area seen, ``d . n``
+    averages -2/3.
+    """
+    if sh.shape[1] == 1:
+        return sh
+    add = C1 * np.linalg.norm(sh[:, 1:4], axis=1)
+    return np.asarray(sh[:, :1] - (2.0 / 3.0) * (add / C0)[:, None, :], dtype=np.float32)
 
 
 def extended(path: F64, quat: F64, by_m: float = 200.0) -> F64:
@@ -186,10 +235,13 @@ def extended(path: F64, quat: F64, by_m: float = 200.0) -> F64:
 def wander(scene_id: str, seed: int, component: str, t_us: int, n: int) -> F64:
     """Return ``(n,)`` numbers of about unit spread that wander with time and depend on nothing but the key and ``t_us``."""
     knot, part = divmod(int(t_us), KNOT_US)
-    a = stream(scene_id, seed, component, knot).standard_normal(n)
-    b = stream(scene_id, seed, component, knot + 1).standard_normal(n)
     f = part / KNOT_US
-    return np.asarray(a * (1 - f) + b * f)
+    return _knot(scene_id, seed, component, knot, n) * (1 - f) + _knot(scene_id, seed, component, knot + 1, n) * f
+
+
+@lru_cache(maxsize=4096)
+def _knot(scene_id: str, seed: int, component: str, knot: int, n: int) -> F64:
+    return stream(scene_id, seed, component, knot).standard_normal(n)
 
 
 def _wave(at: F64, scenario: Scenario, component: str) -> F64:

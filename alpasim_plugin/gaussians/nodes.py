@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.types import I64
+from alpasim_plugin.types import F64, I64
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,17 @@ class SceneNode:
     kind: str
     levels: tuple[Level, ...]
     far_m: float = 1.0e9
+
+    @cached_property
+    def sphere(self) -> tuple[F64, float]:
+        """Return a centre ``(3,)`` and radius around the three-sigma extent of all levels."""
+        clouds = [level.cloud for level in self.levels if len(level.cloud)]
+        if not clouds:
+            return np.zeros(3), 0.0
+        reach = [3 * c.scales.max(axis=1, keepdims=True) for c in clouds]
+        low = np.min([(c.means - r).min(axis=0) for c, r in zip(clouds, reach, strict=True)], axis=0)
+        high = np.max([(c.means + r).max(axis=0) for c, r in zip(clouds, reach, strict=True)], axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
 def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:

@@ -66,6 +66,9 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
     rgb[road] = asphalt[road]
     covers = [_coverage(strokes, colour, low, cell_m, (rows, columns)) for colour in (WHITE, YELLOW)]
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
+        if cell_m < CELL_M:
+            # Next to the crisp strokes laid over it, half-covered cells would show as teeth along a line.
+            cover = np.clip((cover - 0.35) / 0.5, 0.0, 1.0)
         worn = cover * (0.95 - 0.12 * texture * np.clip(grain, 0, 2))
         rgb += worn[..., None] * (np.array(PAINT_IMAGE_RGB[colour], dtype=np.float32) - rgb)
 

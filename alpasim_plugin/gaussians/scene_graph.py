@@ -179,13 +179,4 @@ def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
 
 
 def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:
-    """Return a sphere (centre ``(N, 3)``, radius ``(N,)``) around the three-sigma extent of each node's levels."""
-    centres, radii = np.zeros((len(nodes), 3)), np.zeros(len(nodes))
-    for i, node in enumerate(nodes):
-        clouds = [level.cloud for level in node.levels if len(level.cloud)]
-        if not clouds:
-            continue
-        low = np.min([(c.means - 3 * c.scales.max(axis=1, keepdims=True)).min(axis=0) for c in clouds], axis=0)
-        high = np.max([(c.means + 3 * c.scales.max(axis=1, keepdims=True)).max(axis=0) for c in clouds], axis=0)
-        centres[i], radii[i] = (low + high) / 2, np.linalg.norm(high - low) / 2
-    return centres, radii
+    return np.array([node.sphere[0] for node in nodes]).reshape(-1, 3), np.array([node.sphere[1] for node in nodes])

@@ -67,7 +67,7 @@ class SurrogateRenderer(CleanRenderer):
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
         super().__init__(scenario, seed, device, threads)
-        self.surrogate, self._graphs = reconstruction_of(scenario, self.scene)
+        self.surrogate, self.ghosts, self._graphs = reconstruction_of(scenario, self.scene)
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; how bad it is follows the rig's lateral distance from the logged path."""
@@ -84,11 +84,10 @@ class SurrogateRenderer(CleanRenderer):
 
     def _graph(self, w: float) -> SceneGraph:
         if w not in self._graphs:
-            moving = [a.actor_id for a in self.scenario.actors if not a.is_static]
-            ghosts = [SceneNode(i + GHOST, "actor", self.scene.actors[i].levels[1:]) for i in moving]
-            self._graphs[w] = self.scene.changed(partial(self._change, w), ghosts, SOFT_CELL_PX)
+            self._graphs[w] = self.scene.changed(partial(self._change, w), self.ghosts, SOFT_CELL_PX)
         return self._graphs[w]
 
+    # A bound method of the first renderer stays in the shared graphs; it uses only the surrogate, which is shared as well.
     def _change(self, w: float, node: SceneNode, level: int) -> GaussianCloud:
         change = self.surrogate.actor if node.kind == "actor" else self.surrogate.background
         return change(node, level, node.levels[level].cloud, w)
@@ -128,10 +127,12 @@ def scene_of(scenario: Scenario) -> SceneGraph:
     return _cached(f"scene:{scene_key(scenario)}", partial(_build, scenario))
 
 
-def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, dict[float, SceneGraph]]:
-    """Return the surrogate and the graphs it has made so far, by weight; shared by all rollouts of a process."""
+def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, list[SceneNode], dict[float, SceneGraph]]:
+    """Return the surrogate, the ghosts of moving actors and the graphs made so far, by weight; shared by all rollouts of a process."""
     key = f"surrogate:{scene_key(scenario)}:{scenario.degradation!r}"
-    return _cached(key, lambda: (Surrogate(scenario, log_views(scenario, scene)), {}))
+    moving = [a.actor_id for a in scenario.actors if not a.is_static]
+    ghosts = [SceneNode(i + GHOST, "actor", scene.actors[i].levels[1:]) for i in moving]
+    return _cached(key, lambda: (Surrogate(scenario, log_views(scenario, scene)), ghosts, {}))
 
 
 def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:
