@@ -104,21 +104,17 @@ def test_least_gap_to_anybody_in_the_ego_plane_is_the_published_one(shared_data,
     own_size = replace(PAPER, ego_size_m=None)
     t_us = np.unique(np.concatenate([one.track.t_us for one in log.actors]))
     t_us = t_us[(t_us >= log.ego_log.t_us[0]) & (t_us <= log.ego_log.t_us[-1])]
+    rollout, _ = replayed(log, t_us)
     to_ego = inverse(interpolate(log.ego_log, t_us))
-    gaps = np.full(len(t_us), np.inf)
-    rollout, _ = replayed(log, t_us[:1])
-    for k, t in enumerate(t_us):
-        here = {}
-        for one in rollout.actors.values():
-            row = np.flatnonzero(one.track.t_us == t)
-            if len(row):
-                pose = to_ego[k] @ se3(one.track.xyz[row], one.track.quat[row])
-                here[one.actor_id] = replace(one, track=trajectory_from_poses([t], pose))
-        ego = trajectory_from_poses([t], rollout.T_rig_box[None])
-        in_plane = replace(rollout, ego=ego, actors=here)
-        origin = np.zeros(3)
-        _, gap = find_contacts(ego_footprints(in_plane, own_size, origin), ActorTable(in_plane, own_size, origin), ego.t_us)
-        gaps[k] = gap[0]
+    in_plane = {}
+    for one in log.actors:
+        seen = np.isin(one.track.t_us, t_us)
+        poses = to_ego[np.searchsorted(t_us, one.track.t_us[seen])] @ se3(one.track.xyz[seen], one.track.quat[seen])
+        in_plane[one.actor_id] = replace(one, track=trajectory_from_poses(one.track.t_us[seen], poses))
+    still = trajectory_from_poses(t_us, np.broadcast_to(rollout.T_rig_box, (len(t_us), 4, 4)))
+    flat = replace(rollout, ego=still, actors=in_plane)
+    origin = np.zeros(3)
+    _, gaps = find_contacts(ego_footprints(flat, own_size, origin), ActorTable(flat, own_size, origin), t_us)
     best = int(np.argmin(gaps))
     assert gaps[best] == pytest.approx(gap_m, abs=1e-3)
     assert (t_us[best] - t_us[0]) * 1e-6 == pytest.approx(at_s, abs=0.01)
