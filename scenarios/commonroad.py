@@ -15,7 +15,7 @@ import shapely
 
 from alpasim_plugin.geometry import offset_trajectory
 from alpasim_plugin.geometry_lanes import lane_polygon
-from alpasim_plugin.types import F64, Box, HeightField, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.types import F64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat, from_points
 from scenarios.commonroad_map import read_lanelets
 from scenarios.commonroad_obstacles import Obstacle, read_obstacles
@@ -62,12 +62,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     T_centre_rig = np.eye(4)
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
     first, last = _time_range(obstacles, dt_s)
-    actors = [
-        actor
-        for o in obstacles
-        if o is not chosen
-        for actor in actors_of_track(o.obstacle_id, o.label, o.box, _actor_track(files, file, o, dt_s, first, last), fixed=o.static)
-    ]
+    actors = [actor for o in obstacles if o is not chosen for actor in _actors(files, file, o, dt_s, first, last)]
     notes = (
         why,
         f"ego box {chosen.box.length_m} x {chosen.box.width_m} m from the file; rear axle assumed {vehicle.rear_axle_to_centre_m:.2f} m "
@@ -118,12 +113,14 @@ def _time_range(obstacles: tuple[Obstacle, ...], dt_s: float) -> tuple[int, int]
     return round(first * dt_s * 1e6), round(last * dt_s * 1e6)
 
 
-def _actor_track(files: SourceFiles, path: Path, obstacle: Obstacle, dt_s: float, first_us: int, last_us: int) -> Trajectory:
-    """Return an actor's poses; a static obstacle with one state is there for the whole recording."""
+def _actors(files: SourceFiles, path: Path, obstacle: Obstacle, dt_s: float, first_us: int, last_us: int) -> list[Actor]:
+    """Make an obstacle's actors; a static obstacle, given by one state, is there for the whole recording."""
     track = obstacle.trajectory(files, path, dt_s)
-    if obstacle.static and len(track) == 1 and last_us > first_us:
-        return Trajectory(np.array([first_us, last_us]), np.repeat(track.xyz, 2, axis=0), np.repeat(track.quat, 2, axis=0))
-    return track
+    if not obstacle.static:
+        return actors_of_track(obstacle.obstacle_id, obstacle.label, obstacle.box, track)
+    if last_us > first_us:
+        track = Trajectory(np.array([first_us, last_us]), np.repeat(track.xyz, 2, axis=0), np.repeat(track.quat, 2, axis=0))
+    return [Actor(obstacle.obstacle_id, obstacle.label, obstacle.box, track, is_static=True)]
 
 
 def _choose_ego(

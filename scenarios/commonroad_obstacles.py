@@ -57,7 +57,7 @@ def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -
     """
     obstacles: list[Obstacle] = []
     skipped: Counter[str] = Counter()
-    for element in (e for tag in ("obstacle", "staticObstacle", "dynamicObstacle") for e in root.findall(tag)):
+    for element in (e for e in root if e.tag in ("obstacle", "staticObstacle", "dynamicObstacle")):
         where = f"{path}, obstacle {element.get('id')}"
         static = element.tag == "staticObstacle" or element.findtext("role") == "static"
         states = [s for s in (element.find("initialState"), *element.findall("trajectory/state")) if s is not None]
