@@ -82,6 +82,17 @@ for _tag, _pattern, _first in (
 
 
 def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[Any, dict[Key, Mark]]:
+    """Return plain data and the position of every key path.
+
+    Args:
+        text: YAML.
+        file: Name for positions and messages.
+        doing: What the caller is doing, for messages.
+        override: The text is a command-line value: positions inside it mean nothing.
+
+    Raises:
+        InputError: Not valid YAML, or outside the bounds.
+    """
     loader = _CoreLoader(text)
     try:
         node = loader.get_single_node()

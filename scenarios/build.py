@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,8 @@ from alpasim_plugin.types import Actor, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneChangeCount, Profile
 from alpasim_plugin.world.roads import build_road
-from scenarios.cast import Cast, cast_actors
+from scenarios.cast import Cast, Fail, cast_actors
+from scenarios.check import check_drive
 from scenarios.expert import Drive, ExpertStyle, drive
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_road import (
@@ -29,9 +29,6 @@ from scenarios.ways import Bump, EgoWay, LaneChange, ego_way
 
 TAIL_US = 4_000_000  # the log goes on for so long after the end, so that plans along it have a future
 DEFAULT_DURATION_US = 8_000_000
-
-Fail = Callable[[tuple[str | int, ...], InputError], InputError]
-
 
 @dataclass(frozen=True)
 class Built:
@@ -69,8 +66,22 @@ def build(spec: ScenarioSpec, vehicle: Vehicle, fail: Fail) -> Built:
     if spec.ego.start_m >= way.path.length_m:
         raise fail(("ego", "start_m"), _too_short(way.path.length_m, spec.ego.start_m))
     cast = cast_actors(spec, road, way, vehicle, end_us + TAIL_US, fail)
-    log = _drive(spec, way, vehicle, cast, end_us, fail)
-    return Built(road.lane_map, log.ego_log, Route(way.path.xyz[::4], way.lane_ids), cast.actors(log))
+    run = _drive(spec, way, vehicle, cast, end_us, fail)
+    actors = cast.actors(run)
+    try:
+        check_drive(road.lane_map, run.ego_log, vehicle, actors, end_us)
+    except InputError as e:
+        raise fail(_blame(spec, e.with_what), e) from e
+    return Built(road.lane_map, run.ego_log, Route(way.path.xyz[::4], way.lane_ids), actors)
+
+
+def _blame(spec: ScenarioSpec, with_what: str) -> tuple[str | int, ...]:
+    """Return the key path of the actor that an error names."""
+    name = with_what.removeprefix("actor ")
+    for i, actor in enumerate(spec.actors):
+        if name == actor.id or name.startswith(f"{actor.id}-"):
+            return ("actors", i)
+    return ("road", "segments")
 
 
 def last_us(spec: ScenarioSpec) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,7 +23,8 @@ from alpasim_plugin.world.scripted import (
     track_on_path,
     walk_track,
 )  # fmt: skip
-from scenarios.expert import Drive, ExpertStyle, Follower, Script, drive
+from scenarios.expert import Drive, ExpertStyle, Follower, drive
+from scenarios.foresight import Script
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_actors import (
     ActorSpec,
@@ -37,6 +39,8 @@ from scenarios.schema_actors import (
 )  # fmt: skip
 from scenarios.schema_road import NarrowGapSegment
 from scenarios.ways import EgoWay, lane_path
+
+Fail = Callable[[tuple[str | int, ...], InputError], InputError]
 
 SIZES = {
     "car": Box(4.6, 1.85, 1.55),
@@ -70,7 +74,7 @@ class Cast:
         return (*self.scripted, *idm)
 
 
-def cast_actors(spec: ScenarioSpec, road: Road, way: EgoWay, vehicle: Vehicle, end_us: int, fail: object) -> Cast:
+def cast_actors(spec: ScenarioSpec, road: Road, way: EgoWay, vehicle: Vehicle, end_us: int, fail: Fail) -> Cast:
     """Place every actor; those who are timed against the ego come last, after a drive without them.
 
     Raises:
@@ -89,7 +93,7 @@ def cast_actors(spec: ScenarioSpec, road: Road, way: EgoWay, vehicle: Vehicle, e
             else:
                 cast.scripted += _scripted(stage, actor)
         except InputError as e:
-            raise fail(("actors", i), e) from e  # type: ignore[operator]
+            raise fail(("actors", i), e) from e
     if late:
         style = ExpertStyle(spec.ego.speed_mps, spec.ego.cruise_mps, spec.ego.max_lateral_accel_mps2, spec.ego.headway_s)
         run = drive(way.path, spec.ego.start_m, vehicle, style, cast.scripts(), cast.followers, end_us)
@@ -97,7 +101,7 @@ def cast_actors(spec: ScenarioSpec, road: Road, way: EgoWay, vehicle: Vehicle, e
             try:
                 cast.scripted.append(_crossing(stage, crossing, run.ego_log))
             except InputError as e:
-                raise fail(("actors", i), e) from e  # type: ignore[operator]
+                raise fail(("actors", i), e) from e
     return cast
 
 

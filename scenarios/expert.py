@@ -1,28 +1,30 @@
 """The expert that writes the ego's log on a built road, driven together with the reactive traffic.
 
-The expert knows the scripted tracks, so it looks ahead along them: a body that will reach into its corridor within the next seconds is
-followed as if it were there already. Speed follows the Intelligent Driver Model with a limit in bends; jerk is bounded.
+Whoever is in the expert's corridor is followed with the Intelligent Driver Model. Whoever will come into it within the next seconds is
+foreseen (`scenarios.foresight`), so that the log yields early and smoothly. Bends limit the speed; acceleration and jerk are bounded.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.geometry import quat_from_yaw, yaw_from_quat
+from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.types import F64, I64, Box, Trajectory, Vehicle
-from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, find_leader, idm_acceleration, spans
+from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, nearest_ahead, spans
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.scripted import track_on_path
 from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
+from scenarios.foresight import Script, ScriptTable, foresee
 
 LOG_STEP_US = 10_000  # 100 Hz
 DECISION_US = 50_000
-LOOKAHEAD_S = np.arange(0.0, 4.01, 0.5)
-MAX_ACCEL_MPS2, MAX_BRAKE_MPS2, MAX_JERK_MPS3 = 2.0, 7.0, 12.0
+MAX_ACCEL_MPS2, MAX_BRAKE_MPS2, MAX_JERK_MPS3 = 2.0, 7.0, 10.0
+STOP_JERK_MPS3 = 5.0
 COMFORT_BRAKE_MPS2 = 1.5
+MIN_GAP_M = 2.5
 
 
 @dataclass(frozen=True)
@@ -48,14 +50,6 @@ class Follower:
 
 
 @dataclass(frozen=True)
-class Script:
-    """A track that reacts to nobody."""
-
-    track: Trajectory
-    box: Box
-
-
-@dataclass(frozen=True)
 class Drive:
     """What came out: the ego's log and one track per follower."""
 
@@ -75,42 +69,36 @@ def drive(
         style: Speeds and limits.
         scripts: Tracks known in advance.
         followers: Drivers that react to the ego and to each other.
-        end_us: Last time, a multiple of 50 ms.
+        end_us: Last time.
     """
-    limit = speed_limits(path, style)
-    table = _ScriptTable(scripts, end_us)
-    s, v, a = s0_m, min(style.speed_mps, float(np.interp(s0_m, path.s, limit))), 0.0
-    cars = [_Car(f) for f in followers]
-    log_s, log_t = [s], [0]
-    front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+    table = ScriptTable(scripts, end_us, DECISION_US)
+    expert = _Expert(path, s0_m, vehicle, style, table)
+    cars = [_Car(f, table.standing) for f in followers]
+    log_s, log_t = [expert.s], [0]
     sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
-        ego = _ego_bodies(path, s, v, vehicle)
-        others = [c.bodies() for c in cars]
-        wanted = _wanted_acceleration(path, s, v, front_m, vehicle, style, limit, table, others, t)
+        bodies = [c.bodies() for c in cars]
+        moving = table.moving(t)
+        wanted = expert.decide(concatenate([moving, *bodies]), cars, t)
+        ego = expert.bodies()
         for i, car in enumerate(cars):
-            car.decide(concatenate([ego, table.at(t), *others[:i], *others[i + 1 :]]))
+            car.decide(concatenate([ego, moving, *bodies[:i], *bodies[i + 1 :]]))
         for _ in range(DECISION_US // LOG_STEP_US):
-            step = MAX_JERK_MPS3 * sub_s
-            a = float(np.clip(wanted, a - step, a + step))
-            if v + a * sub_s < 0:
-                a = -v / sub_s
-            s += v * sub_s + 0.5 * a * sub_s * sub_s
-            v = max(0.0, v + a * sub_s)
-            log_s.append(s)
+            expert.advance(wanted, sub_s)
+            log_s.append(expert.s)
             log_t.append(log_t[-1] + LOG_STEP_US)
         for car in cars:
             car.advance(DECISION_US * 1e-6)
-        if s + front_m + 1.0 > path.length_m:
+        if expert.front_s + 1.0 > path.length_m:
             break
-    t_us, s_log = np.array(log_t, dtype=np.int64), np.array(log_s)
-    xyz, yaw = path.at(s_log)
+    t_us = np.array(log_t, dtype=np.int64)
+    xyz, yaw = path.at(np.array(log_s))
     times = t_us[:: DECISION_US // LOG_STEP_US]
     return Drive(Trajectory(t_us, xyz, quat_from_yaw(yaw)), tuple(car.track(times) for car in cars))
 
 
 def speed_limits(path: Path, style: ExpertStyle) -> F64:
-    """Return the speed ``(N,)`` allowed by bends ahead, reachable with a comfortable brake."""
+    """Return the speed ``(N,)`` that bends allow, reachable with a comfortable brake from everywhere before them."""
     k = np.abs(path.curvature)
     v2 = np.minimum(style.cruise_mps**2, style.max_lateral_accel_mps2 / np.maximum(k, 1e-6))
     # v^2(s) <= v^2(s') + 2 b (s' - s) for all s' > s: a running minimum from the far end.
@@ -118,96 +106,76 @@ def speed_limits(path: Path, style: ExpertStyle) -> F64:
     return np.asarray(np.sqrt(np.minimum.accumulate(rising[::-1])[::-1] - 2 * COMFORT_BRAKE_MPS2 * path.s))
 
 
-def _wanted_acceleration(
-    path: Path, s: float, v: float, front_m: float, vehicle: Vehicle, style: ExpertStyle, limit: F64, table: _ScriptTable,
-    others: Sequence[Bodies], t: int,
-) -> float:  # fmt: skip
-    params = IdmParams(style.cruise_mps, style.headway_s, 2.5, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2)
-    ahead = float(np.interp(s + 0.4 * v, path.s, limit))
-    wanted = min(1.5 * (ahead - v), MAX_ACCEL_MPS2)
-    half = vehicle.box.width_m / 2
-    moving = concatenate(list(others))
-    for tau in LOOKAHEAD_S:
-        later = concatenate([table.at(t + int(tau * 1e6)), replace(moving, xy=moving.xy + tau * moving.velocity)])
-        leader = _ghost(path, s + front_m, v, half, vehicle.box.length_m, later, float(tau))
-        if leader is not None:
-            gap = max(leader.gap_m, 0.1)
-            wanted = min(wanted, idm_acceleration(v, gap, v - leader.speed_mps, params))
-    return max(wanted, -MAX_BRAKE_MPS2)
+class _Expert:
+    """The ego while it drives."""
 
+    def __init__(self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptTable) -> None:
+        self.path, self.vehicle, self.table = path, vehicle, table
+        self.limit = speed_limits(path, style)
+        self.s, self.a = s0_m, 0.0
+        self.v = min(style.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
+        self.params = IdmParams(style.cruise_mps, style.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2)
+        self.front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+        self.standing = spans(path, 0.0, table.standing, path.length_m + 100.0, window=False)
 
-def _ghost(path: Path, front_s: float, v: float, half: float, length: float, later: Bodies, tau: float) -> Leader | None:
-    """Return the body that will be in the corridor ``tau`` seconds from now, moved back to now at its own speed."""
-    if tau == 0.0:
-        leader = find_leader(path, front_s, half, later, margin_m=0.3)
-        return leader if leader.index >= 0 else None
-    span = spans(path, front_s, later)
-    if span is None:
-        return None
-    inside = (span.low < half + 0.3) & (span.high > -half - 0.3)
-    front_then = front_s + v * tau
-    # Passed before it comes, or still far from it when it is there: no conflict.
-    conflict = inside & (span.rear > front_s) & (span.front > front_then - length - 1.0) & (span.rear < front_then + 4.0 + 0.8 * v)
-    if not conflict.any():
-        return None
-    gaps = span.rear - front_s - span.speed * tau
-    k = int(np.argmin(np.where(conflict, gaps, np.inf)))
-    if gaps[k] < 0.5 and span.speed[k] > 0.5:
-        return None  # it is beside or behind now and comes from behind: it is the one to yield
-    return Leader(float(gaps[k]), float(span.speed[k]), int(span.index[k]))
+    @property
+    def front_s(self) -> float:
+        return self.s + self.front_m
 
+    def bodies(self) -> Bodies:
+        xyz, yaw = self.path.at(self.s)
+        direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
+        return bodies_from(xyz[:2] + self.vehicle.rear_axle_to_centre_m * direction, yaw, [self.vehicle.box], self.v * direction)
 
-def _ego_bodies(path: Path, s: float, v: float, vehicle: Vehicle) -> Bodies:
-    xyz, yaw = path.at(s)
-    direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
-    return bodies_from(xyz[:2] + vehicle.rear_axle_to_centre_m * direction, yaw, [vehicle.box], v * direction)
+    def decide(self, others: Bodies, cars: Sequence[_Car], t_us: int) -> float:
+        """Return the wanted acceleration."""
+        ahead = float(np.interp(self.s + 0.4 * self.v, self.path.s, self.limit))
+        wanted = min(1.5 * (ahead - self.v), MAX_ACCEL_MPS2)
+        half = self.vehicle.box.width_m / 2
+        for leader in (find_leader(self.path, self.front_s, half, others, margin_m=0.3), nearest_ahead(self.standing, self.front_s, half)):
+            if leader.index >= 0:
+                wanted = min(wanted, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params))
+        cap = foresee(self.path, self.front_s, self.v, self.vehicle.box, self.table, [c.foreseen for c in cars], t_us, MIN_GAP_M)
+        return max(min(wanted, cap), -MAX_BRAKE_MPS2)
 
-
-class _ScriptTable:
-    """Poses of all scripted tracks on the decision grid."""
-
-    def __init__(self, scripts: Sequence[Script], end_us: int) -> None:
-        self.times = np.arange(0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + DECISION_US, DECISION_US, dtype=np.int64)
-        self.boxes = [script.box for script in scripts]
-        n = len(self.times)
-        self.xy, self.yaw = np.zeros((n, len(scripts), 2)), np.zeros((n, len(scripts)))
-        self.velocity, self.present = np.zeros((n, len(scripts), 2)), np.zeros((n, len(scripts)), dtype=np.bool_)
-        for j, script in enumerate(scripts):
-            track = script.track
-            t = np.clip(self.times, track.t_us[0], track.t_us[-1])
-            for d in range(2):
-                self.xy[:, j, d] = np.interp(t, track.t_us, track.xyz[:, d])
-            self.yaw[:, j] = np.interp(t, track.t_us, np.unwrap(yaw_from_quat(track.quat)))
-            self.velocity[:, j] = np.gradient(self.xy[:, j], DECISION_US * 1e-6, axis=0)
-            # A track that ends with the scene's time (not by leaving the road) goes on standing in the look-ahead.
-            self.present[:, j] = (self.times >= track.t_us[0]) & ((self.times <= track.t_us[-1]) | (track.t_us[-1] >= end_us))
-
-    def at(self, t: int) -> Bodies:
-        """Return the bodies present at a time on the grid."""
-        if not self.boxes:
-            return NO_BODIES
-        i = min(t // DECISION_US, len(self.times) - 1)
-        keep = np.flatnonzero(self.present[i])
-        return bodies_from(self.xy[i, keep], self.yaw[i, keep], [self.boxes[k] for k in keep], self.velocity[i, keep])
+    def advance(self, wanted: float, dt_s: float) -> None:
+        step = MAX_JERK_MPS3 * dt_s
+        # The brake is released on the way to standstill: v = a^2 / 2 j leaves no jolt at the end.
+        wanted = max(wanted, -float(np.sqrt(2.0 * STOP_JERK_MPS3 * self.v)))
+        self.a = float(np.clip(wanted, self.a - step, self.a + step))
+        if self.v + self.a * dt_s < 0:
+            self.a = -self.v / dt_s  # it stands
+        self.s += self.v * dt_s + 0.5 * self.a * dt_s * dt_s
+        self.v = max(0.0, self.v + self.a * dt_s)
 
 
 class _Car:
     """A follower while it drives."""
 
-    def __init__(self, f: Follower) -> None:
+    def __init__(self, f: Follower, standing: Bodies) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
         self.log_s = [self.s]
+        self.standing = spans(f.path, 0.0, standing, f.path.length_m + 100.0, window=False)
 
     def bodies(self) -> Bodies:
-        if self.s > self.f.path.length_m:
+        return self.foreseen(0.0)
+
+    def foreseen(self, after_s: float) -> Bodies:
+        """Return where the car will be at its present speed, on its own line."""
+        s = self.s + self.v * after_s
+        if s > self.f.path.length_m:
             return NO_BODIES
-        xyz, yaw = self.f.path.at(self.s, self.f.offset_m)
+        xyz, yaw = self.f.path.at(s, self.f.offset_m)
         direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
         return bodies_from(xyz[:2], yaw, [self.f.box], self.v * direction)
 
     def decide(self, others: Bodies) -> None:
-        leader = find_leader(self.f.path, self.s + self.f.box.length_m / 2, self.f.box.width_m / 2, others)
-        self.a = idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.f.params)
+        front, half = self.s + self.f.box.length_m / 2, self.f.box.width_m / 2
+        a = idm_acceleration(self.v, np.inf, 0.0, self.f.params)
+        for leader in (find_leader(self.f.path, front, half, others), nearest_ahead(self.standing, front, half)):
+            if leader.index >= 0:
+                a = min(a, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.f.params))
+        self.a = a
 
     def advance(self, dt_s: float) -> None:
         a = max(self.a, -self.v / dt_s)

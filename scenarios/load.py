@@ -44,7 +44,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     Args:
         path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, Cosmos-Drive-Dreams folder, or a name such as
             ``smoke/straight``.
-        seed: Scene seed; None takes the file's.
+        seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id.
         overrides: ``key=value`` with dotted keys, applied before validation.
 
     Returns:
@@ -56,6 +56,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     path = find(path_or_name)
     document = _document(path)
     document = apply_overrides(document, overrides, DOING)
+    own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
     if seed is not None:
         document = apply_overrides(document, [f"seed={int(seed)}"], DOING)
     spec = validate(ScenarioSpec, document, DOING)
@@ -66,6 +67,8 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     _check_actors(document, spec)
     spec = jitter(spec, scene_id, spec.seed, fixed)
     scenario = _from_log(document, spec, scene_id) if spec.log is not None else _from_road(document, spec, scene_id)
+    if spec.seed != own_seed:
+        scenario = replace(scenario, scene_id=f"{scenario.scene_id}-seed{spec.seed}")
     return _timed(document, spec, scenario)
 
 
@@ -235,7 +238,7 @@ def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None
     matrix = np.eye(4) if spec.background.transform is None else np.array(spec.background.transform)
     if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise document.error(
-            DOING, ("background", "transform"), "a matrix without inverse, or whose last row is not 0 0 0 1", "give rotation, scale and shift"
+            DOING, ("background", "transform"), "no inverse, or a last row other than 0 0 0 1", "give rotation, scale and shift"
         )
     return BackgroundFile(str(path), matrix)
 

@@ -16,7 +16,7 @@ ActorId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", descrip
 class _Actor(Part):
     id: ActorId
     label: Label = Field(default="car", description="Class of road user.")
-    size_m: tuple[Positive, Positive, Positive] | None = Field(default=None, description="Length, width, height; none: usual for the label.")
+    size_m: tuple[Positive, Positive, Positive] | None = Field(default=None, description="Length, width, height; none: as usual.")
 
 
 class _InLane(_Actor):

@@ -93,8 +93,11 @@ class Spans:
     speed: F64  # (m,) along the path, >= 0
 
 
-def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0) -> Spans | None:
-    """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None where there is none."""
+def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True) -> Spans | None:
+    """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None where there is none.
+
+    Without ``window`` the whole path is searched, for bodies that never move and are asked for again and again.
+    """
     if len(bodies.xy) == 0:
         return None
     start, _ = path.at(from_s_m)
@@ -105,7 +108,7 @@ def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0)
     ax = _OUTLINE[:, 0] * bodies.half_length_m[near, None]  # (m, 6)
     ay = _OUTLINE[:, 1] * bodies.half_width_m[near, None]
     outline = np.stack([bodies.xy[near, 0:1] + c * ax - s * ay, bodies.xy[near, 1:2] + s * ax + c * ay], axis=-1)
-    along, across = path.project(outline.reshape(-1, 2), (from_s_m - 15.0, from_s_m + horizon_m))
+    along, across = path.project(outline.reshape(-1, 2), (from_s_m - 15.0, from_s_m + horizon_m) if window else None)
     along, across = along.reshape(-1, 6), across.reshape(-1, 6)
     rear = along.min(axis=1)
     _, yaw = path.at(rear)
@@ -121,7 +124,13 @@ def find_leader(
     A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the path and its rear end is not more than 2 m
     behind the own front bumper, so that touching bodies still count.
     """
-    span = spans(path, front_s_m, bodies, horizon_m)
+    return nearest_ahead(spans(path, front_s_m, bodies, horizon_m), front_s_m, half_width_m, horizon_m, margin_m)
+
+
+def nearest_ahead(
+    span: Spans | None, front_s_m: float, half_width_m: float, horizon_m: float = 120.0, margin_m: float = 0.2
+) -> Leader:
+    """Return the leader among bodies whose place on the path is known (see `find_leader`)."""
     if span is None:
         return NO_LEADER
     reach = half_width_m + margin_m

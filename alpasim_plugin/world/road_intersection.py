@@ -11,7 +11,7 @@ from alpasim_plugin.geometry import wrap_angle
 from alpasim_plugin.types import F64, Lane, Marking
 from alpasim_plugin.world.curves import connect, offset_line, sample_clothoid
 from alpasim_plugin.world.road_elements import Intersection, Profile, Turn
-from alpasim_plugin.world.road_strip import Joint, MapDraft, build_strip
+from alpasim_plugin.world.road_strip import Joint, MapDraft, build_strip, make_lines
 
 _ANGLE = {"left": np.pi / 2, "straight": 0.0, "right": -np.pi / 2}
 CROSSWALK_M = (1.0, 4.0)  # from the junction's border, outwards
@@ -69,8 +69,6 @@ def build_intersection(
         start = (float(at[0]), float(at[1]), float(heading))
         if turn == element.turn:
             exit_pose = start
-            from alpasim_plugin.world.road_strip import make_lines
-
             stub = sample_clothoid(start, 1.0, 0.0, 0.0)
             joint = {key: line[0] for key, line in make_lines(stub, profile).items()}
             arms.append(Arm(turn, heading, profile, joint, (None,) * profile.forward, tuple(f"?{k}" for k in range(profile.backward))))
@@ -173,9 +171,8 @@ def _paint(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list
         stop_m = 1.0
         if element.crosswalks:
             near, far = CROSSWALK_M
-            draft.crosswalks.append(
-                np.stack([right + near * outward, right + far * outward, left + far * outward, left + near * outward, right + near * outward])
-            )
+            corners = (right + near * outward, right + far * outward, left + far * outward, left + near * outward)
+            draft.crosswalks.append(np.stack([*corners, corners[0]]))
             stop_m = far + 1.0
         if arm.into:
             edge = arm.joint[f"b{len(arm.into)}"]

@@ -1,0 +1,129 @@
+"""Suites: a list of scenarios with seeds and overrides, from a file, a folder or a shipped name."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from alpasim_plugin.config import Document, load_yaml, validate
+from alpasim_plugin.errors import InputError
+from scenarios.load import LIBRARY, shipped_names
+from scenarios.schema_base import Part
+from scenarios.sources import SOURCES
+
+DOING = "reading a suite"
+
+
+@dataclass(frozen=True)
+class ScenarioRef:
+    """One scenario to load: ``load_scenario(path, seed, overrides)``."""
+
+    path: str
+    seed: int | None = None  # scene seed; None: the file's own
+    overrides: tuple[str, ...] = ()
+
+
+class SuiteItem(Part):
+    """One entry of a suite."""
+
+    path: str = Field(min_length=1, description="Scenario, suite or folder (relative to this file), or a shipped name.")
+    seeds: tuple[int, ...] = Field(default=(), description="Scene seeds; none: the file's own.")
+    set: dict[str, Any] = Field(default={}, description="Dotted key to value, as --set would.")
+
+
+class SuiteSpec(Part):
+    """A suite file."""
+
+    version: Literal[1] = Field(description="Version of this schema: 1.")
+    description: str = Field(default="", description="One sentence for people.")
+    scenarios: tuple[str | SuiteItem, ...] = Field(min_length=1, description="Entries: a path or name, or {path, seeds, set}.")
+
+
+def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
+    """Return the scenarios of a suite file, of a folder, of a shipped suite (``suites/smoke`` or ``smoke``), or of one scenario.
+
+    A folder gives every scenario file directly inside it, sorted by name; its suite files are left out.
+
+    Raises:
+        InputError: Nothing there, an empty folder, or a bad suite file.
+    """
+    return _expand(str(path_or_name), None, ())
+
+
+def expand(item: str, overrides: Sequence[str] = ()) -> list[ScenarioRef]:
+    """Return what one command-line argument stands for, with overrides on top of the suite's own."""
+    return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
+
+
+def shipped() -> dict[str, str]:
+    """Return every shipped scenario and suite with its one-line description."""
+    names = {**shipped_names(), **suites()}
+    return {name: str(_head(file).get("description", "")) for name, file in names.items()}
+
+
+def suites() -> dict[str, Path]:
+    """Return the shipped suites: ``suites/NAME`` to file."""
+    return {f"suites/{file.stem}": file for file in sorted((LIBRARY / "suites").glob("*.yaml"))}
+
+
+def _expand(text: str, base: Path | None, chain: tuple[Path, ...]) -> list[ScenarioRef]:
+    path = _locate(text, base)
+    if path.is_dir():
+        if any(source.matches(path) for source in SOURCES.values()):
+            return [ScenarioRef(str(path))]
+        files = [f for f in sorted(path.iterdir()) if f.suffix in (".yaml", ".yml") and "scenarios" not in _head(f)]
+        if not files:
+            raise InputError(DOING, str(path), "a folder without scenario files", "give a folder of scenario .yaml files, or a log folder")
+        return [ScenarioRef(str(f)) for f in files]
+    if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):
+        return [ScenarioRef(str(path))]
+    if path.resolve() in chain:
+        raise InputError(DOING, str(path), "a suite that contains itself", "remove the entry")
+    document = load_yaml(path, DOING)
+    spec = validate(SuiteSpec, document, DOING)
+    out: list[ScenarioRef] = []
+    for i, entry in enumerate(spec.scenarios):
+        item = SuiteItem(path=entry) if isinstance(entry, str) else entry
+        try:
+            refs = _expand(item.path, path.resolve().parent, (*chain, path.resolve()))
+        except InputError as e:
+            raise _placed(document, i, e) from e
+        extra = tuple(f"{key}={json.dumps(value)}" for key, value in item.set.items())
+        out += [ScenarioRef(r.path, seed, (*r.overrides, *extra)) for r in refs for seed in (item.seeds or (r.seed,))]
+    return out
+
+
+def _locate(text: str, base: Path | None) -> Path:
+    candidates = [Path(os.path.normpath(base / text))] if base is not None else []
+    candidates.append(Path(text))
+    for path in candidates:
+        if path.exists():
+            return path
+    names = {**shipped_names(), **suites()}
+    name = text.removesuffix(".yaml")
+    for key in (name, f"suites/{name}"):
+        if key in names:
+            return names[key]
+    near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5) or [n for n in names if n.split("/")[-1] == name.split("/")[-1]]
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    raise InputError(
+        DOING, text, "no such file or folder, and no shipped scenario or suite has that name",
+        f"{hint}give a path, or a name that 'simrun list scenarios' shows",
+    )  # fmt: skip
+
+
+def _placed(document: Document, i: int, e: InputError) -> InputError:
+    return InputError(e.doing, f"{document.mark(('scenarios', i))} ({e.with_what})", e.found, e.do_this)
+
+
+def _head(path: Path) -> dict[str, Any]:
+    """Return a file's plain data, or nothing where it is not a mapping."""
+    data = load_yaml(path, DOING).data
+    return data if isinstance(data, dict) else {}
