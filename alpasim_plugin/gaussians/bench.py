@@ -5,12 +5,150 @@ Run ``python -m alpasim_plugin.gaussians.bench``.
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
 import numpy as np
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.output import RasterOutput
+from alpasim_plugin.gaussians.prepared import prepare
+from alpasim_plugin.gaussians.rasterize_cpu import rasterize_prepared
+from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64
+
+Size = tuple[int, int, int]  # Gaussians, width, height
+SIZES: tuple[Size, ...] = ((30_000, 256, 144), (100_000, 256, 144), (100_000, 480, 272), (100_000, 960, 544), (500_000, 960, 544))
+SKY = (0.5, 0.6, 0.8)
+_LSB = 1.0 / 255.0
+_TORCH_LIMIT = 100_000 * 256 * 144  # Gaussians x pixels up to which the torch backend is timed too
+
+
+@dataclass(frozen=True)
+class BenchRow:
+    """Speed of one scene at one size, with the error of the very same image beside it.
+
+    Attributes:
+        n: Gaussians in the scene.
+        width: Pixels.
+        height: Pixels.
+        threads: Threads used.
+        visible: Gaussians that reach the image.
+        pairs: (Gaussian, 16-pixel tile) pairs.
+        ms_p50: Median time of a frame of the prepared scene.
+        ms_p95: 95th percentile of it.
+        first_ms: Preparing the scene and drawing the first frame, kernels compiled or loaded included where they were not before.
+        max_error: Largest difference of a colour from the float64 reference, full scale 1; NaN where it was not asked for.
+        share_above_lsb: Share of the pixels that differ by more than 1/255; NaN likewise.
+        torch_ms: One frame of the torch backend; NaN where it was left out as too large.
+    """
+
+    n: int
+    width: int
+    height: int
+    threads: int
+    visible: int
+    pairs: int
+    ms_p50: float
+    ms_p95: float
+    first_ms: float
+    max_error: float
+    share_above_lsb: float
+    torch_ms: float
+
+
+def bench_raster(
+    sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequence[int] = (1, 2), with_error: bool = True, seed: int = 0
+) -> list[BenchRow]:
+    """Time the CPU rasteriser and compare the images that it made with the reference.
+
+    Args:
+        sizes: ``(Gaussians, width, height)`` of each scene.
+        repeats: Frames timed per row.
+        threads: Thread counts to time.
+        with_error: Also draw the float64 reference, which takes about 75 us a visible Gaussian.
+        seed: Seed of the scene.
+
+    Returns:
+        One row per size and thread count, in that order.
+    """
+    rows = []
+    for n, width, height in sizes:
+        scene, camera = driving_like_scene(n, seed), driving_camera(width, height)
+        want = rasterize_reference(scene, camera, SKY) if with_error else None
+        torch_ms = _torch_ms(scene, camera) if n * width * height <= _TORCH_LIMIT else float("nan")
+        for count in threads:
+            begin = time.perf_counter()
+            nodes = [(prepare(scene), None)]
+            out = rasterize_prepared(nodes, camera, SKY, threads=count)
+            first_ms = (time.perf_counter() - begin) * 1e3
+            times = _times_ms(partial(rasterize_prepared, nodes, camera, SKY, threads=count), repeats)
+            error = np.full(1, np.nan) if want is None else np.abs(out.rgb - want.rgb).max(axis=2)
+            rows.append(
+                BenchRow(
+                    n, width, height, count, out.stats["visible"], out.stats["pairs"],
+                    float(np.median(times)), float(np.percentile(times, 95)), first_ms,
+                    float(error.max()), float(np.mean(error > _LSB)) if want is not None else float("nan"), torch_ms,
+                )
+            )  # fmt: skip
+    return rows
+
+
+def start_times_ms() -> tuple[float, float]:
+    """Return the time from starting Python to the first image: with nothing compiled, and with kernels cached by an earlier process."""
+    code = (
+        "import numpy as np; from alpasim_plugin.gaussians.bench import driving_camera, driving_like_scene;"
+        "from alpasim_plugin.gaussians import rasterize; rasterize(driving_like_scene(1000), driving_camera(64, 36))"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
+        first, second = (
+            _times_ms(lambda: subprocess.run([sys.executable, "-c", code], env=environment, check=True), 1)[0] for _ in range(2)
+        )
+    return first, second
+
+
+def format_rows(rows: Sequence[BenchRow]) -> str:
+    """Return the rows as a Markdown table."""
+    lines = [
+        "| Gaussians | image | threads | visible | tile pairs | ms p50 | ms p95 | first ms | max error, 1/255 | share > 1/255 | torch ms |",
+        "|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for r in rows:
+        torch_ms = "-" if np.isnan(r.torch_ms) else f"{r.torch_ms:.0f}"
+        error = ("-", "-") if np.isnan(r.max_error) else (f"{r.max_error / _LSB:.4f}", f"{r.share_above_lsb:.2g}")
+        lines.append(
+            f"| {r.n} | {r.width}x{r.height} | {r.threads} | {r.visible} | {r.pairs} | {r.ms_p50:.1f} | {r.ms_p95:.1f} | "
+            f"{r.first_ms:.0f} | {error[0]} | {error[1]} | {torch_ms} |"
+        )
+    return "\n".join(lines)
+
+
+def _times_ms(call: Callable[[], object], repeats: int) -> list[float]:
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        times.append((time.perf_counter() - begin) * 1e3)
+    return times
+
+
+def _torch_ms(scene: GaussianCloud, camera: PinholeCamera) -> float:
+    # Imported on use: the table without this column needs no torch.
+    from alpasim_plugin.gaussians.rasterize_torch import rasterize_torch
+
+    def draw() -> RasterOutput:
+        return rasterize_torch(scene, camera, SKY)
+
+    return min(_times_ms(draw, 2))
 
 
 def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianCloud:
@@ -28,7 +166,7 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
     def flat(count: int, length_m: float, thickness_m: float) -> F64:
         scales = length_m * size * np.exp(rng.normal(0.0, 0.4, (count, 3)))
         scales[:, 2] = thickness_m
-        return scales
+        return np.asarray(scales)
 
     # Points are denser near the camera, as reconstructions are.
     def ahead(count: int, reach_m: float) -> F64:
@@ -83,3 +221,9 @@ def driving_camera(width: int, height: int) -> PinholeCamera:
     T_world_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T_world_camera[:3, 3] = [0, 0, 1.6]
     return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)
+
+
+if __name__ == "__main__":
+    print(format_rows(bench_raster()))
+    cold_ms, cached_ms = start_times_ms()
+    print(f"\nstart of a process to its first image: {cold_ms:.0f} ms with nothing compiled, {cached_ms:.0f} ms with cached kernels")

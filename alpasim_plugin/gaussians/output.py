@@ -60,4 +60,5 @@ def background_image(background: Background, camera: PinholeCamera) -> F32:
         )
     if not np.isfinite(value).all():
         raise InputError("reading a background", "its values", "NaN or infinity", "give finite numbers, 0..1 for sRGB")
-    return np.ascontiguousarray(value)
+    # Read-only arrays are another type to compiled code and would be compiled for again.
+    return np.require(value, np.float32, ["C_CONTIGUOUS", "WRITEABLE"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ import numpy.typing as npt
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MIN, EXTENT_MAX_SIGMA
 from alpasim_plugin.gaussians.layout import BUNDLE, GEO_EXTENT, GEO_FACTOR, GEO_PEAK, GEO_REACH, GEO_SIZE, SPHERE_SIZE
+from alpasim_plugin.gaussians.project_kernels import colours_in_lanes
 from alpasim_plugin.types import F64
 
 ShFrame = Literal["object", "world"]
@@ -66,8 +67,10 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     cloud.require_drawable("preparing a Gaussian cloud")
     index = np.flatnonzero(cloud.opacities >= ALPHA_MIN)
     index = index[np.argsort(_morton_codes(cloud.means[index]), kind="stable")]
-    kept = cloud.take(index)
-    n, size = len(kept), kept.sh.shape[1]
+    n, size = len(index), cloud.sh.shape[1]
+    kept = GaussianCloud(cloud.means[index], cloud.quats[index], cloud.scales[index], cloud.opacities[index], np.empty((n, 1, 3)))
+    sh = np.empty((n + (-n % _LANES)) * size * 3, np.float32)
+    colours_in_lanes(cloud.sh.reshape(-1), size * 3, index, sh)
     opacity = kept.opacities.astype(np.float64)
     geometry = np.zeros((n, GEO_SIZE), np.float32)
     geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = (kept.rotations() * kept.scales.astype(np.float64)[:, None, :]).reshape(n, 9)
@@ -82,15 +85,15 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
         sh_frame,
         size,
         _in_lanes(means, np.nan),
-        _in_lanes(geometry, 0.0),
-        _in_lanes(kept.sh.reshape(n, size * 3).astype(np.float32), 0.0),
+        np.asarray(_in_lanes(geometry, 0.0), np.float32),
+        sh,
         np.concatenate([index, np.zeros(-n % _LANES, np.int64)]).astype(np.int64),
         _bounding_spheres(means, reach, BUNDLE),
         _bounding_spheres(means, reach, max(n, 1)) if n else np.zeros(SPHERE_SIZE),
     )
 
 
-def _in_lanes(columns: npt.NDArray[np.floating], fill: float) -> npt.NDArray[np.floating]:
+def _in_lanes(columns: npt.NDArray[np.floating], fill: float) -> npt.NDArray[Any]:
     """Turn ``(N, C)`` into groups of C x 16 lanes, flat."""
     n, width = columns.shape
     padded = np.full((n + (-n % _LANES), width), fill, columns.dtype)

@@ -77,6 +77,26 @@ def bundle_is_out_of_view(sphere, at, pose, camera):
 
 
 @njit(cache=True, nogil=True)
+def colours_in_lanes(coefficients, width, index, out):
+    """Copy rows of ``width`` coefficients chosen by ``index`` into groups of ``width`` x 16 lanes; lanes left over are zero.
+
+    The colours are most of a cloud's bytes: this passes over them once, where array expressions would pass four times.
+    """
+    n_groups = out.shape[0] // (width * 16)
+    for group in range(n_groups):
+        for lane in range(16):
+            rank = group * 16 + lane
+            at = group * width * 16 + lane
+            if rank < index.shape[0]:
+                source = index[rank] * width
+                for k in range(width):
+                    out[at + k * 16] = coefficients[source + k]
+            else:
+                for k in range(width):
+                    out[at + k * 16] = np.float32(0.0)
+
+
+@njit(cache=True, nogil=True)
 def nodes_in_view(spheres, poses, camera):
     """Return the positions of the nodes that may touch a pixel."""
     kept = np.empty(spheres.shape[0], np.int64)

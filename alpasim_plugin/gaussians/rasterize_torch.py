@@ -18,7 +18,7 @@ from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, EPS2D_PX2, 
 from alpasim_plugin.gaussians.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
 
-_TILE_PX = 32
+_TILE_PX = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,19 +85,24 @@ def rasterize_tensors(
         T_camera_world: ``(4, 4)`` float64 pose that replaces the camera's, for gradients of the pose.
 
     Returns:
-        The image tensors; memory grows with the number of (splat, 32-pixel tile) pairs while gradients are recorded.
+        The image tensors; memory grows with the number of (splat, tile) pairs while gradients are recorded.
     """
     splats = _project(gaussians, camera, near_m, lod_px, T_camera_world)
     dtype, device = gaussians.sh.dtype, gaussians.sh.device
     behind = torch.zeros(3, dtype=dtype, device=device) if background is None else background.to(device, dtype)
     behind = behind.expand(camera.height, camera.width, 3)
+    # Boxes grown by a pixel, in the order of depth; each tile takes its part of its row's part.
+    low, high = splats.uv.detach() - splats.radii - 1.0, splats.uv.detach() + splats.radii + 1.0
     rows = []
     for top in range(0, camera.height, _TILE_PX):
         bottom = min(top + _TILE_PX, camera.height)
-        tiles = [
-            _composite(splats, (left, min(left + _TILE_PX, camera.width)), (top, bottom), behind)
-            for left in range(0, camera.width, _TILE_PX)
-        ]
+        row = torch.nonzero((high[:, 1] >= top) & (low[:, 1] <= bottom))[:, 0]
+        row_low, row_high = low[row, 0], high[row, 0]
+        tiles = []
+        for left in range(0, camera.width, _TILE_PX):
+            right = min(left + _TILE_PX, camera.width)
+            index = row[(row_high >= left) & (row_low <= right)]
+            tiles.append(_composite(splats, index, (left, right), (top, bottom), behind))
         rows.append(torch.cat(tiles, dim=1))
     image = torch.cat(rows, dim=0)
     alpha = image[..., 4]
@@ -137,12 +142,9 @@ def _project(g: GaussianTensors, camera: PinholeCamera, near_m: float, lod_px: f
     return _Splats(uv[order], cov[order], det[order], radii[order], opacity[order], features[order])
 
 
-def _composite(splats: _Splats, columns: tuple[int, int], rows: tuple[int, int], behind: Tensor) -> Tensor:
-    """Return a tile ``(h, w, 5)``: colour with background, depth sum, alpha."""
-    uv, radii = splats.uv.detach(), splats.radii + 1.0
-    low = torch.tensor([columns[0], rows[0]], dtype=uv.dtype, device=uv.device)
-    high = torch.tensor([columns[1], rows[1]], dtype=uv.dtype, device=uv.device)
-    i = torch.nonzero(((uv + radii >= low) & (uv - radii <= high)).all(dim=1))[:, 0]
+def _composite(splats: _Splats, i: Tensor, columns: tuple[int, int], rows: tuple[int, int], behind: Tensor) -> Tensor:
+    """Return a tile ``(h, w, 5)`` of the splats at ``i``: colour with background, depth sum, alpha."""
+    uv = splats.uv
     x = torch.arange(*columns, dtype=uv.dtype, device=uv.device) + 0.5
     y = torch.arange(*rows, dtype=uv.dtype, device=uv.device) + 0.5
     dx = (x[None, None, :] - splats.uv[i, 0, None, None]).expand(-1, len(y), -1)

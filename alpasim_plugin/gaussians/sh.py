@@ -53,7 +53,7 @@ def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
 def sh_colours(sh: npt.NDArray[np.floating], directions: npt.ArrayLike) -> F64:
     """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` seen along unit directions ``(N, 3)``: clamped at 0 below, not above."""
     basis = sh_basis(directions, sh.shape[1])
-    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, sh.astype(np.float64)), 0.0)
+    return np.asarray(np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, sh.astype(np.float64)), 0.0))
 
 
 def dc_from_rgb(rgb: npt.ArrayLike) -> F64:
@@ -70,7 +70,7 @@ def _sample_directions() -> tuple[F64, tuple[F64, ...]]:
     r = np.sqrt(1 - z * z)
     directions = np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
     basis = sh_basis(directions)
-    return directions, tuple(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2]) for d in range(4))
+    return directions, tuple(np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2]), np.float64) for d in range(4))
 
 
 def sh_rotation(rotation: F64, degree: int) -> F64:

@@ -161,6 +161,19 @@ def test_a_forked_process_renders_after_its_parent_used_threads():
     assert child.exitcode == 0
 
 
+def test_read_only_and_strided_inputs_meet_the_kernels_that_are_already_compiled():
+    image = np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (64, 96, 3))
+    cloud = random_cloud(50)
+    rasterize(cloud, camera())
+    compiled = len(raster_tiles.signatures)
+    for array in (cloud.means, cloud.sh, cloud.quats, cloud.scales, cloud.opacities):
+        array.flags.writeable = False
+    locked = GaussianCloud(cloud.means[::2], cloud.quats[::2], cloud.scales[::2], cloud.opacities[::2], cloud.sh[::2])
+    assert_same_image(rasterize(locked, camera(), image), rasterize_reference(locked, camera(), image))
+    assert_same_image(rasterize(locked, camera(), np.asfortranarray(image)), rasterize_reference(locked, camera(), image))
+    assert len(raster_tiles.signatures) == compiled
+
+
 def test_fewer_than_one_thread_is_an_error():
     with pytest.raises(InputError, match="threads=0"):
         rasterize_prepared([], camera(), threads=0)
