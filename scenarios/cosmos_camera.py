@@ -56,11 +56,12 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
         if values.shape != (11,) or not np.isfinite(values).all() or values[2] < 1 or values[3] < 1 or values[10] not in (0.0, 1.0):
             found = f"an array of shape {values.shape} that is no f-theta lens"
             raise files.fail(where, found, "give cx, cy, width, height, 6 coefficients, flag")
-        lenses[name.rsplit(".", 2)[-2]] = _lens(values)
+        lenses[name.rsplit(".", 2)[-2]] = lens_of(values)
     return lenses
 
 
-def _lens(values: F64) -> RecordedLens:
+def lens_of(values: F64) -> RecordedLens:
+    """Make a lens of the 11 numbers ``(11,)`` of `read_lenses`; the direction that is not given is fitted over the image's reach."""
     cx, cy, width, height = values[:4]
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) - (cx, cy)
     reach_px = float(np.linalg.norm(corners, axis=1).max())

@@ -119,10 +119,10 @@ class SourceFiles:
         return array
 
     def read_tar(self, path: Path) -> dict[str, bytes]:
-        """Read the regular files of an uncompressed or compressed tar, in memory, by member name."""
+        """Read the regular files of an uncompressed tar, in memory, by member name."""
         data = self.read_bytes(path)
         try:
-            with tarfile.open(fileobj=io.BytesIO(data)) as archive:
+            with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
                 members: dict[str, bytes] = {}
                 for info in archive:
                     handle = archive.extractfile(info) if info.isfile() else None
@@ -133,6 +133,9 @@ class SourceFiles:
                         members[info.name] = content
         except (tarfile.TarError, EOFError, OSError) as error:
             raise self.fail(path, f"a damaged tar: {error}", "fetch the file again; it may be truncated") from error
+        # A cut between two members leaves a readable tar: only the two empty blocks at its end tell that it is whole.
+        if any(data[-2 * tarfile.BLOCKSIZE :]):
+            raise self.fail(path, "a damaged tar: no end-of-archive blocks", "fetch the file again; it may be truncated")
         if not members:
             raise self.fail(path, "a tar without files", "fetch the file again")
         return members
