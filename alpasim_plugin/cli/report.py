@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from alpasim_plugin.runtime.store import read_json
 from evaluators.report import render_table, write_junit, write_report, write_summary_md
@@ -28,5 +29,5 @@ def report(
     if as_json:
         print(json.dumps({"report": str(page), "summary": summary}))
     else:
-        print(render_table(summary))
+        Console().print(render_table(summary))
         print(f"report  {page}")

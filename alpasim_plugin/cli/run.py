@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from rich.console import Console
 
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.errors import InputError
@@ -140,7 +141,7 @@ def _print_result(result: RunResult, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
-    print(render_table(result.summary))
+    Console().print(render_table(result.summary, headline_only=True))
     for cell in result.summary["failures"]["cells"][:5]:
         print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
     if result.n_failed:
