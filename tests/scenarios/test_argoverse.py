@@ -31,7 +31,7 @@ from tests.scenarios.make_argoverse import (
     vector_map,
     write_argoverse,
 )
-from tests.scenarios.real_drive import boxes_at, footprint
+from tests.scenarios.real_drive import boxes_at, footprint, ruling
 
 # --- small logs made by hand ------------------------------------------------------------------------------------------
 
@@ -433,6 +433,20 @@ def test_real_vehicle_is_the_annotated_one(real):
     box = log.vehicle.box
     assert (box.length_m, box.width_m, log.vehicle.rear_axle_to_centre_m) == (4.877, 2.0, 1.422)
     assert log.vehicle.wheelbase_m == Vehicle().wheelbase_m
+
+
+# Frames at 10 Hz by the paper's rule: held by one lane, held by the union of nearby lanes, held by neither, off-road.
+RULINGS = {"7fab2350": (62, 88, 10, 0), "adcf7d18": (135, 25, 0, 0), "3bffdcff": (125, 35, 0, 0)}
+
+
+def test_rule_of_the_paper_calls_no_frame_off_road(real):
+    """On leaving its junction 7fab2350 cuts a corner that the turning lanes do not cover: there the road edges, 1.4 m away, decide."""
+    _, folder, _, log = real
+    times = np.arange(log.ego_log.t_us[0], log.ego_log.t_us[-1], 100_000)
+    parts = ruling(log, times)
+    assert tuple(map(len, parts)) == RULINGS[folder.name]
+    if folder.name == "7fab2350":
+        assert parts[2] == list(range(150, 160))
 
 
 def test_real_calibration(shared_data):
