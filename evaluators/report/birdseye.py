@@ -127,12 +127,14 @@ def path_data(units: F64, closed: bool = False, tolerance: float = 1.5) -> str:
     """
     if len(units) < 2:
         return ""
-    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(units), tolerance, preserve_topology=False))
-    whole = np.rint(kept).astype(int)
-    steps = np.diff(whole, axis=0)
-    steps = steps[np.any(steps != 0, axis=1)]
-    body = "".join(f"{dx}{dy:+d}".replace("+", " ") + " " for dx, dy in steps)
-    return f"M{whole[0, 0]} {whole[0, 1]}l{body}".strip() + ("z" if closed else "") if len(steps) else ""
+    whole = np.rint(units)
+    whole = whole[np.concatenate([[True], np.any(np.diff(whole, axis=0) != 0, axis=1)])]
+    if len(whole) < 2:
+        return ""
+    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(whole), tolerance, preserve_topology=False)).astype(int)
+    steps = np.diff(kept, axis=0)
+    body = " ".join(f"{dx} {dy}" for dx, dy in steps)
+    return f"M{kept[0, 0]} {kept[0, 1]}l{body}" + ("z" if closed else "")
 
 
 def scene_view(

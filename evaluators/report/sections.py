@@ -287,15 +287,15 @@ class LedgerRow:
     bounds: tuple[Cell, ...]  # in the order of the rates shown
 
 
-LEDGER_COLUMNS = (
-    ("rollouts", "rollouts planned"),
-    ("failed", "could not be run"),
-    ("dropped", "dropped by a rule"),
-    ("steps_total", "steps driven"),
-    ("steps_warmup", "in the warm-up"),
-    ("steps_after_event", "after the first event"),
-    ("steps_after_drift", "after leaving the log"),
-    ("steps_scored", "steps scored"),
+LEDGER_COLUMNS = (  # key, head, what it means
+    ("rollouts", "planned", "rollouts planned"),
+    ("failed", "failed", "rollouts that could not be run or scored"),
+    ("dropped", "dropped", "rollouts that a rule removed"),
+    ("steps_total", "steps", "steps driven"),
+    ("steps_warmup", "warm-up", "steps before the policy drives"),
+    ("steps_after_event", "after event", "steps after the first collision or off-road event"),
+    ("steps_after_drift", "after drift", "steps after leaving the logged path too far"),
+    ("steps_scored", "scored", "steps that enter the metrics"),
 )
 
 
@@ -310,7 +310,7 @@ def ledger(run: Run, rates: tuple[str, ...]) -> list[LedgerRow]:
         if not isinstance(entry, Mapping) or "rollouts" not in entry:
             continue
         bounds = entry.get("bounds") or {}
-        rows.append(LedgerRow(renderer, tuple(_tally(entry.get(key)) for key, _ in LEDGER_COLUMNS), tuple(_bound(bounds.get(r)) for r in rates)))
+        rows.append(LedgerRow(renderer, tuple(_tally(entry.get(key)) for key, _, _ in LEDGER_COLUMNS), tuple(_bound(bounds.get(r)) for r in rates)))
     return rows
 
 

@@ -12,8 +12,7 @@ from rich.text import Text
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.tables import metric_rows
 
-NO_BREAK = "\u00a0"
-MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 % interval with scenes as clusters"
+MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 %, scenes as clusters"
 
 
 def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Table:
@@ -38,7 +37,8 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Tab
         table.add_column(head, justify="right", overflow="fold")
     for row in rows:
         label = Text(row.name, style="bold" if row.is_headline else "")
-        label.append(f" {row.unit}" if row.unit else "", style="dim").append(f" {row.arrow}" if row.arrow else "", style="dim")
+        facts = " ".join(part for part in (row.unit, row.arrow) if part)
+        label.append(f" {facts}" if facts else "", style="not bold dim")
         table.add_row(label, *(_cell(cell) for cell in row.cells))
     return table
 
@@ -47,6 +47,6 @@ def _cell(cell: Cell) -> Text:
     if cell.missing:
         return Text(cell.text, style="dim")
     half, _, bounds = cell.detail.partition(" \u00b7 ")
-    text = Text(cell.text, style="bold").append(f" {half.replace(NO_BREAK, '')}", style="not bold dim")
-    text.append(f" ({cell.count})" if cell.count else "", style="not bold")
-    return text.append(f"\n{bounds.replace(' ', NO_BREAK)}", style="not bold dim")
+    lines = [half.replace("\u00a0", ""), bounds, cell.count]
+    text = Text(cell.text, style="bold").append(f" {lines[0]}", style="not bold dim")
+    return text.append("".join(f"\n{line}" for line in lines[1:] if line), style="not bold dim")

@@ -1,0 +1,30 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.report.make_run import Plan, make_run
+
+HOSTILE = "<img src=x onerror=alert(1)>\"'&|{{7*7}}"
+
+
+@pytest.fixture(scope="session")
+def usual_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make three renderers x two policies x four scenes x three seeds, two failures, one metric invalid in one scene."""
+    fail = [("3dgs", "urban/left-turn", 1), ("onefixer", "USA_US101-3_3_T-1", 2)]
+    return make_run(tmp_path_factory.mktemp("usual"), Plan(policies=("lane-camera", "pure-pursuit"), fail=fail))
+
+
+@pytest.fixture(scope="session")
+def hostile_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a run whose every name is markup."""
+    plan = Plan(
+        renderers=("clean", f"nre://{HOSTILE}:50051"),
+        policies=("javascript:alert(1)",),
+        scenes=(HOSTILE, "../../etc/passwd", "x" * 200, "plain"),
+        seeds=(0, 2**40),
+        steps=30,
+        fail=[("clean", HOSTILE, 0)],
+        failure=f"</script><script>alert(1)</script>\n{HOSTILE}\x00\x1b[31m",
+    )
+    return make_run(tmp_path_factory.mktemp("hostile"), plan)

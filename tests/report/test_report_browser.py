@@ -1,0 +1,98 @@
+"""The report in a real browser, opened from disk. Slow: needs an installed Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from evaluators.report import write_report
+from tests.report.browser import Browser, find_chromium
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    executable = find_chromium()
+    if executable is None:
+        pytest.skip("no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)")
+    with Browser(executable) as opened:
+        yield opened
+
+
+def column(browser: Browser, table: str, index: int) -> list[str]:
+    rows = f"[...document.getElementById('{table}').tBodies[0].rows]"
+    return list(browser.evaluate(f"{rows}.filter(r => !r.hidden).map(r => r.children[{index}].textContent.trim())"))
+
+
+@pytest.mark.parametrize("name", ["usual_run", "hostile_run"])
+@pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True)])
+def test_no_complaint_and_no_outside_request(browser: Browser, request: pytest.FixtureRequest, name: str, width: int, dark: bool) -> None:
+    report = write_report(request.getfixturevalue(name))
+    browser.requests.clear()
+    browser.complaints.clear()
+    browser.open(report, width=width, dark=dark)
+    browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    for _ in range(2):
+        browser.evaluate("document.querySelectorAll('button').forEach(b => b.click())")
+    assert browser.complaints == []
+    assert all(address == report.resolve().as_uri() or address.startswith("data:") for address in browser.requests)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width  # tables scroll, the page does not
+
+
+def test_clicking_a_head_sorts_by_value_and_again_turns_it_round(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run))
+    click = "document.querySelectorAll('#table-scenes th .sort')[{}].click()"
+    distance = 6
+    browser.evaluate(click.format(distance - 1))  # the head "Seeds" does not sort
+    rising = [float(text.split()[0]) for text in column(browser, "table-scenes", distance)]
+    assert rising == sorted(rising)
+    assert len(set(rising)) > 5
+    browser.evaluate(click.format(distance - 1))
+    assert [float(text.split()[0]) for text in column(browser, "table-scenes", distance)] == rising[::-1]
+    assert browser.evaluate("document.querySelectorAll('#table-scenes th[aria-sort]').length") == 1
+
+
+def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run))
+    browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    for _ in range(2):
+        browser.evaluate("document.querySelectorAll('#table-more th .sort')[1].click()")
+        assert column(browser, "table-more", 1)[-1] == "\u2014"
+
+
+def test_filter_keeps_rows_with_every_word(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run))
+    browser.evaluate("const i = document.querySelector('input[type=search]'); i.value = '3DGS urban'; i.dispatchEvent(new Event('input')); 0")
+    assert column(browser, "table-scenes", 0) == ["urban/left-turn"] * 2
+    assert {text.strip() for text in column(browser, "table-scenes", 1)} == {"3dgs"}
+
+
+def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run: Path) -> None:
+    shade = "getComputedStyle(document.body).backgroundColor"
+    report = write_report(usual_run)
+    browser.open(report, dark=False)
+    browser.evaluate("localStorage.clear()")
+    browser.open(report, dark=False)
+    light = browser.evaluate(shade)
+    browser.open(report, dark=True)
+    dark = browser.evaluate(shade)
+    assert light != dark
+    browser.open(report, dark=False)
+    browser.evaluate("document.getElementById('theme').click()")
+    assert browser.evaluate(shade) == dark
+    browser.evaluate("document.getElementById('theme').click()")
+    assert browser.evaluate(shade) == light
+    browser.evaluate("localStorage.clear()")
+
+
+def test_legend_hides_one_renderer_in_every_map(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run))
+    shown = "[...document.querySelectorAll('#views .track.arm-1')].filter(p => getComputedStyle(p).display !== 'none').length"
+    assert browser.evaluate(shown) > 0
+    browser.evaluate("document.querySelector('button[data-arm=\"1\"]').click()")
+    assert browser.evaluate(shown) == 0
+    browser.evaluate("document.querySelector('button[data-arm=\"1\"]').click()")
+    assert browser.evaluate(shown) > 0

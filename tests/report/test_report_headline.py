@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.report.make_run import Plan, make_run
+
+from evaluators.report.headline import find, tone_of
+from evaluators.report.run_folder import Run, read_run
+
+
+def stats(mean: float | None, n: int = 12, unit: str = "", direction: str = "lower") -> dict[str, Any]:
+    return {"mean": mean, "ci95": 0.1, "ci95_clustered": None, "n_rollouts": n, "n_scenes": 4, "unit": unit, "direction": direction}
+
+
+def pair(diff: float | None, low: float, high: float, verdict: str) -> dict[str, Any]:
+    return {"baseline": "clean", "diff": diff, "ci95": [low, high], "p_value": 0.01, "verdict": verdict}
+
+
+def with_summary(folder: Path, **summary: Any) -> Run:
+    return dataclasses.replace(read_run(folder), summary=summary)
+
+
+def test_worse_metric_is_named_with_counts_and_interval(usual_run: Path) -> None:
+    metrics = {"clean": {"offroad": stats(0 / 12)}, "3dgs": {"offroad": stats(3 / 12)}}
+    finding = find(with_summary(usual_run, metrics=metrics, paired={"3dgs": {"offroad": pair(0.25, 0.1, 0.4, "worse")}}))
+    assert finding.tone == "worse"
+    assert finding.title == "3dgs drives worse than clean in off-road rollouts"
+    assert finding.points[0].text == "off-road rollouts: 3 of 12 against 0 of 12 (+25.0\u00a0points, 95\u00a0% interval +10.0 to +40.0)"
+
+
+def test_undecided_is_never_called_equal(usual_run: Path) -> None:
+    metrics = {"clean": {"offroad": stats(0.0)}, "3dgs": {"offroad": stats(0.25)}}
+    finding = find(with_summary(usual_run, metrics=metrics, paired={"3dgs": {"offroad": pair(0.25, -0.1, 0.6, "undecided")}}))
+    assert finding.tone == "unclear"
+    assert finding.title == "No difference shown between 3dgs and clean"
+    assert "3 of 12 against 0 of 12" in finding.points[0].text
+
+
+def test_worse_in_one_and_better_in_another_is_mixed(usual_run: Path) -> None:
+    metrics = {name: {"offroad": stats(0.25), "route_distance_m": stats(0.4, unit="m")} for name in ("clean", "3dgs")}
+    pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse"), "route_distance_m": pair(-0.2, -0.3, -0.1, "better")}}
+    finding = find(with_summary(usual_run, metrics=metrics, paired=pairs))
+    assert finding.tone == "mixed"
+    assert "worse than clean in off-road rollouts and better in distance to the logged path" in finding.title
+
+
+def test_a_worse_renderer_is_not_hidden_by_a_better_one(usual_run: Path) -> None:
+    metrics = {name: {"offroad": stats(0.25)} for name in ("clean", "3dgs", "onefixer")}
+    pairs = {"onefixer": {"offroad": pair(-0.2, -0.3, -0.1, "better")}, "3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse")}}
+    finding = find(with_summary(usual_run, metrics=metrics, paired=pairs))
+    assert finding.tone == "worse"
+    assert "onefixer drives better than clean" in finding.title
+    assert "3dgs drives worse than clean" in finding.title
+
+
+def test_one_renderer_has_numbers_and_no_comparison(tmp_path: Path) -> None:
+    finding = find(read_run(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("only",), seeds=(5,), steps=20))))
+    assert finding.tone == "neutral"
+    assert finding.title.startswith("3dgs \u2013 collisions: ")
+    assert "of 1" in finding.title
+    assert any("One scene only" in caution for caution in finding.cautions)
+
+
+def test_empty_run_says_so(tmp_path: Path) -> None:
+    finding = find(read_run(make_run(tmp_path, Plan(renderers=(), scenes=()))))
+    assert finding.tone == "broken"
+    assert "no rollouts" in finding.title
+
+
+def test_all_failed_says_so_and_names_the_cause(tmp_path: Path) -> None:
+    plan = Plan(renderers=("3dgs",), scenes=("a",), seeds=(0, 1), steps=10, fail=[("3dgs", "a", 0), ("3dgs", "a", 1)])
+    finding = find(read_run(make_run(tmp_path, plan)))
+    assert finding.title == "Nothing could be scored: all 2\u00a0rollouts failed"
+    assert "renderer 2" in finding.cautions[0]
+
+
+def test_failed_rollouts_are_a_caution_beside_a_result(usual_run: Path) -> None:
+    assert any(text.startswith("4 of 72\u00a0rollouts could not be run (renderer 4)") for text in find(read_run(usual_run)).cautions)
+
+
+@pytest.mark.parametrize(
+    ("entry", "direction", "tone"),
+    [
+        ({"diff": 0.2, "ci95": [0.1, 0.3], "verdict": "undecided"}, "lower", "unclear"),  # the stated verdict wins
+        ({"diff": 0.2, "ci95": [0.1, 0.3]}, "lower", "worse"),
+        ({"diff": 0.2, "ci95": [0.1, 0.3]}, "higher", "better"),
+        ({"diff": 0.2, "ci95": [0.0, 0.4]}, "lower", "unclear"),
+        ({"diff": 0.2, "ci95": 0.1}, "lower", "worse"),  # a half-width
+        ({"diff": 0.2, "ci95": None}, "lower", "unclear"),
+        ({"diff": None, "ci95": None}, "lower", "unclear"),
+        ({"diff": 0.2, "ci95": [0.1, 0.3]}, "none", "neutral"),
+        ({"verdict": "non-inferior"}, "lower", "neutral"),
+    ],
+)
+def test_tone_of_a_difference(entry: dict[str, Any], direction: str, tone: str) -> None:
+    assert tone_of(entry, direction) == tone
+
+
+def test_finding_needs_nothing_but_the_folder(usual_run: Path, tmp_path: Path) -> None:
+    for name in ("run.json", "summary.json"):
+        assert json.loads((usual_run / name).read_text())
+    assert find(read_run(usual_run)) == find(read_run(usual_run))

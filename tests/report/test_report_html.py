@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+import evaluators.report.html as html
+from alpasim_plugin.errors import InfrastructureError
+from evaluators.report import write_report
+from evaluators.report.charts import Curve, line_chart
+from tests.report.make_run import Plan, make_run
+
+VOID = {"meta", "link", "img", "input", "br", "wbr"}
+LOCAL = re.compile(r"^(#|data:|rollouts/|scenes/)")
+
+
+class Page(HTMLParser):
+    """Checks nesting and collects tags, addresses, ids and handlers."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.ids: list[str] = []
+        self.handlers: list[str] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name in ("href", "src", "xlink:href", "poster", "action", "data"):
+                self.addresses.append(value or "")
+            if name == "id":
+                self.ids.append(value or "")
+            if name.startswith("on"):
+                self.handlers.append(name)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag, f"</{tag}> at {self.getpos()}"
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] not in ("style", "script"):
+            self.text += data
+
+
+def page_of(folder: Path) -> Page:
+    page = Page(write_report(folder).read_text(encoding="utf-8"))
+    assert page.open == []
+    return page
+
+
+def test_report_is_one_well_formed_file_without_outside_addresses(usual_run: Path) -> None:
+    page = page_of(usual_run)
+    assert all(LOCAL.match(address) for address in page.addresses)
+    assert len(page.ids) == len(set(page.ids))
+    assert not page.handlers
+    text = (usual_run / "report.html").read_text()
+    assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
+    assert "url(http" not in text
+    assert "@import" not in text
+
+
+def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path) -> None:
+    page = page_of(usual_run)
+    for address in page.addresses:
+        if address.startswith("#"):
+            assert address[1:] in page.ids
+        elif not address.startswith("data:"):
+            assert (usual_run / unquote(address)).exists(), address
+
+
+def test_verdict_comes_first(usual_run: Path) -> None:
+    page = page_of(usual_run)
+    heads = ["Results", "Paired differences", "Over time", "What the camera saw", "From above", "Scene by scene", "Speed", "Failures"]
+    assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == [*heads, "Not in the numbers", "Provenance"]
+    assert page.text.index("3dgs drives worse than clean") < page.text.index("One value per rollout")
+    assert page.tags.index("h1") < page.tags.index("table")
+
+
+def test_hostile_names_stay_text(hostile_run: Path) -> None:
+    page = page_of(hostile_run)
+    assert not page.handlers
+    assert page.tags.count("script") == 1
+    assert all(LOCAL.match(address) for address in page.addresses)
+    assert "{{7*7}}" in page.text
+    assert "49" not in re.findall(r"onerror=alert\(1\)>\"'&\|(\S+)", page.text)
+    for address in page.addresses:
+        if not address.startswith(("#", "data:")):
+            assert (hostile_run / unquote(address)).resolve().is_relative_to(hostile_run.resolve())
+
+
+def test_numbers_that_are_missing_are_dashes_with_a_reason(usual_run: Path) -> None:
+    text = write_report(usual_run).read_text()
+    reasons = re.findall(r'<span class="missing" title="([^"]*)"[^>]*>([^<]*)</span>', text)
+    assert reasons
+    assert all(reason and dash == "\u2014" for reason, dash in reasons)
+    assert ("the policy gives no plan of 1.0 s", "\u2014") in reasons
+
+
+def test_run_without_rollouts_has_a_report(tmp_path: Path) -> None:
+    page = page_of(make_run(tmp_path, Plan(renderers=(), scenes=())))
+    assert "Nothing was run" in page.text
+    assert "There is no metric" in page.text
+
+
+def test_run_of_one_rollout_has_a_report(tmp_path: Path) -> None:
+    page = page_of(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=3)))
+    assert "One scene only" in page.text
+    assert "of 1" in page.text
+
+
+def test_run_whose_every_rollout_failed_has_a_report(tmp_path: Path) -> None:
+    page = page_of(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=3, fail=[("3dgs", "a", 0)])))
+    assert "Nothing could be scored" in page.text
+    assert "1204 NaN pixels <b>&" in page.text
+
+
+def test_bare_tables_are_enough(usual_run: Path, tmp_path: Path) -> None:
+    """Without steps, scenes, pictures and clips the tables are still reported."""
+    for name in ("run.json", "summary.json", "rollouts.parquet"):
+        shutil.copy(usual_run / name, tmp_path / name)
+    page = page_of(tmp_path)
+    assert "Results" in page.text
+    assert "From above" not in page.text
+    assert "What the camera saw" not in page.text
+    assert not [a for a in page.addresses if a.startswith("rollouts/") and a != "rollouts/"]
+
+
+def test_many_scenes_are_capped_and_the_rest_is_named(tmp_path: Path) -> None:
+    scenes = tuple(f"city/block-{k:03d}" for k in range(40))
+    folder = make_run(tmp_path, Plan(renderers=("clean", "3dgs"), scenes=scenes, seeds=(0,), steps=30, picture_px=(64, 36), clips=False))
+    text = write_report(folder).read_text()
+    assert text.count('<article class="card pad view') == html.MAX_SCENE_PLOTS
+    assert "16 more scenes not drawn here" in text
+    assert text.count('<img src="data:') == 2 * html.MAX_STRIP_SCENES
+    assert "32 more scenes with strips not shown here" in text
+    assert len(text.encode()) < 1_000_000
+    drawn = set(re.findall(r"<h3>(city/block-\d+)</h3>", text))
+    left_out = re.search(r"not drawn here.*?<p[^>]*>([^<]*)</p>", text, re.DOTALL)
+    assert left_out is not None
+    assert drawn | set(left_out[1].split(", ")) == set(scenes)
+
+
+def test_large_strips_are_made_smaller(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=5, picture_px=(960, 544)))
+    (data,) = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)" width="(\d+)" height="(\d+)"', write_report(folder).read_text())
+    assert (int(data[1]), int(data[2])) == (1600, 227)
+    assert len(data[0]) < 150_000
+
+
+def test_unreadable_strip_is_left_out_and_said(usual_run: Path, tmp_path: Path) -> None:
+    folder = make_run(tmp_path, Plan(renderers=("clean", "3dgs"), scenes=("a",), seeds=(0,), steps=5))
+    (folder / "rollouts/3dgs/lane-camera/a/0/strip.jpg").write_bytes(b"not a picture")
+    assert "No frames from 3dgs in this cell." in page_of(folder).text
+
+
+def test_same_folder_gives_the_same_bytes(usual_run: Path) -> None:
+    assert write_report(usual_run).read_bytes() == write_report(usual_run).read_bytes()
+
+
+def test_charts_take_their_colours_from_the_page() -> None:
+    import numpy as np
+
+    x = np.linspace(0, 1, 5)
+    first, second = (line_chart([Curve("<a>", i, 0, x, x, x, x + i)], "s", "m & more") for i in (0, 1))
+    assert "var(--arm-0)" in first
+    assert "var(--arm-1)" in second
+    assert not re.search(r"#0[12][0-9a-f]{2}a1", first + second)
+    assert "m &amp; more" in first
+    ids = re.findall(r'id="([^"]+)"', first + second)
+    assert len(ids) == len(set(ids))
+    for target in re.findall(r'url\(#([^)]+)\)|href="#([^"]+)"', first):
+        assert "".join(target) in ids
+
+
+def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
+    before = write_report(folder).read_bytes()
+
+    def refuse(self: Path, *args: object, **more: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    with pytest.raises(InfrastructureError) as caught:
+        write_report(folder)
+    assert caught.value.doing == "writing a report"
+    assert caught.value.found == "No space left on device"
+    assert (folder / "report.html").read_bytes() == before
+    assert not list(folder.glob(".*.tmp"))

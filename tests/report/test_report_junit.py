@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluators.report import write_junit
+from evaluators.report.junit import clean
+from tests.report.make_run import Plan, make_run
+
+
+def test_one_case_per_rollout_and_an_error_per_failure(usual_run: Path) -> None:
+    suite = ET.parse(write_junit(usual_run)).getroot().find("testsuite")
+    assert suite is not None
+    cases = suite.findall("testcase")
+    assert len(cases) == int(suite.attrib["tests"]) == 72
+    assert len({(c.attrib["classname"], c.attrib["name"]) for c in cases}) == 72
+    assert sum(c.find("error") is not None for c in cases) == int(suite.attrib["errors"]) == 4
+    assert suite.attrib["failures"] == "0"
+    case = next(c for c in cases if (c.attrib["classname"], c.attrib["name"]) == ("urban/left-turn", "3dgs/lane-camera/1"))
+    error = case.find("error")
+    assert error is not None
+    assert error.attrib["type"] == "renderer"
+    assert error.attrib["message"] == "1204 NaN pixels <b>&"
+
+
+def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run: Path) -> None:
+    root = ET.parse(write_junit(usual_run)).getroot()
+    case = next(c for c in root.iter("testcase") if c.attrib["classname"] == "smoke/straight" and c.find("error") is None)
+    values = {p.attrib["name"]: p.attrib["value"] for p in case.iter("property")}
+    assert values["min_distance_to_obstacle_m"] == "invalid"
+    assert float(values["route_distance_m"]) > 0
+    assert values["path"].startswith("rollouts/")
+
+
+def test_collision_is_not_a_failure_by_itself(usual_run: Path) -> None:
+    root = ET.parse(write_junit(usual_run)).getroot()
+    collided = [c for c in root.iter("testcase") if any(p.attrib == {"name": "collision_any", "value": "1.0"} for p in c.iter("property"))]
+    assert collided
+    assert all(c.find("failure") is None and c.find("error") is None for c in collided)
+
+
+def test_hostile_names_and_control_characters_give_readable_xml(hostile_run: Path) -> None:
+    root = ET.parse(write_junit(hostile_run)).getroot()
+    error = next(root.iter("error"))
+    assert error.attrib["message"] == "</script><script>alert(1)</script>"
+    assert "\ufffd\ufffd[31m" in (error.text or "")
+
+
+def test_empty_run_is_an_empty_suite(tmp_path: Path) -> None:
+    suite = ET.parse(write_junit(make_run(tmp_path / "empty-run", Plan(renderers=(), scenes=())))).getroot().find("testsuite")
+    assert suite is not None
+    assert (suite.attrib["name"], suite.attrib["tests"]) == ("empty-run", "0")
+
+
+@given(st.text(st.characters(codec="utf-8")))
+def test_any_text_survives_a_round_trip_through_xml(text: str) -> None:
+    element = ET.Element("a", {"b": clean(text)})
+    assert ET.fromstring(ET.tostring(element, encoding="unicode")).attrib["b"] == clean(text)

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.errors import InputError
+from evaluators.report.run_folder import read_run, series_by_cell
+
+
+def test_reads_every_rollout_with_its_key(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    assert len(run.rollouts) == len({r.cell for r in run.rollouts}) == 3 * 2 * 4 * 3
+    assert run.renderers == ["clean", "3dgs", "onefixer"]
+    assert sum(not r.ok for r in run.rollouts) == 4  # both policies of two cells
+
+
+def test_invalid_metric_is_none_even_where_a_number_stands(usual_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
+    table = pq.read_table(usual_run / "rollouts.parquet")
+    zeros, no = pa.array(np.zeros(table.num_rows)), pa.array(np.zeros(table.num_rows, bool))
+    table = table.set_column(table.column_names.index("offroad"), "offroad", zeros)
+    table = table.set_column(table.column_names.index("offroad_valid"), "offroad_valid", no)
+    pq.write_table(table, tmp_path / "run" / "rollouts.parquet")
+    assert all(r.metrics["offroad"] is None for r in read_run(tmp_path / "run").rollouts)
+
+
+def test_summary_key_with_policy_stands_for_that_policy_only(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    assert len(run.rollouts_of("3dgs")) == 24
+    assert {r.policy for r in run.rollouts_of("3dgs/lane-camera")} == {"lane-camera"}
+    assert len(run.rollouts_of("3dgs | lane-camera")) == 0  # an unknown way of joining matches nothing rather than something
+
+
+def test_scene_file_is_found_by_the_id_inside_it(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    content = run.scene_data("hard/narrow-gap-with-parked-cars")
+    assert content is not None
+    assert content["scene_id"] == "hard/narrow-gap-with-parked-cars"
+    assert run.scene_data("no such scene") is None
+
+
+@pytest.mark.parametrize("path", ["../outside", "/etc", "rollouts/../../outside", ""])
+def test_paths_that_leave_the_run_folder_are_not_followed(tmp_path: Path, usual_run: Path, path: str) -> None:
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "strip.jpg").write_bytes(b"secret")
+    shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
+    (tmp_path / "run" / "rollouts").mkdir()
+    table = pq.read_table(usual_run / "rollouts.parquet")
+    table = table.set_column(table.column_names.index("path"), "path", pa.array([path] * table.num_rows))
+    pq.write_table(table, tmp_path / "run" / "rollouts.parquet")
+    run = read_run(tmp_path / "run")
+    assert run.file_of(run.rollouts[0], "strip.jpg") is None
+    assert run.href(run.rollouts[0]) is None
+
+
+@pytest.mark.parametrize(
+    ("break_it", "found"),
+    [
+        (lambda run: (run / "run.json").unlink(), "no such file"),
+        (lambda run: (run / "summary.json").write_text('{"metrics": '), "not JSON"),
+        (lambda run: (run / "summary.json").write_text("[1]"), "a list, not an object"),
+        (lambda run: (run / "rollouts.parquet").unlink(), "no such file"),
+        (lambda run: (run / "rollouts.parquet").write_bytes(b"PAR1"), "not a parquet file"),
+        (lambda run: pq.write_table(pa.table({"renderer": ["a"]}), run / "rollouts.parquet"), "no column policy, scene, seed, status"),
+    ],
+)
+def test_broken_folder_is_a_four_part_error(tmp_path: Path, usual_run: Path, break_it, found: str) -> None:  # type: ignore[no-untyped-def]
+    shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
+    break_it(tmp_path / "run")
+    with pytest.raises(InputError) as caught:
+        read_run(tmp_path / "run")
+    assert caught.value.doing == "reading a run folder"
+    assert found in caught.value.found
+    assert str(tmp_path) in caught.value.with_what
+    assert caught.value.do_this
+
+
+def test_run_without_steps_has_no_series(tmp_path: Path, usual_run: Path) -> None:
+    shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
+    (tmp_path / "run" / "steps.parquet").unlink()
+    assert series_by_cell(read_run(tmp_path / "run").steps(["ego_x_m"])) == {}
+
+
+def test_reasons_come_from_the_steps_where_the_summary_has_no_ledger(tmp_path: Path, usual_run: Path) -> None:
+    shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
+    summary = json.loads((usual_run / "summary.json").read_text())
+    (tmp_path / "run" / "summary.json").write_text(json.dumps(summary | {"censoring": {}}))
+    expected = "no other road user within 50 m"
+    for folder in (usual_run, tmp_path / "run"):
+        assert read_run(folder).invalid_reasons["clean", "min_distance_to_obstacle_m"] == expected
+
+
+rows = st.lists(
+    st.fixed_dictionaries(
+        {
+            "renderer": st.sampled_from("ab"),
+            "policy": st.sampled_from(["p", "p/q"]),
+            "scene": st.sampled_from(["s", "t", "s/t"]),
+            "seed": st.sampled_from([0, 1, -3, 2**60]),
+            "metric": st.sampled_from("mn"),
+            "t_us": st.integers(-(10**15), 10**15),
+            "value": st.floats(-1e9, 1e9),
+            "valid": st.booleans(),
+        }
+    ),
+    max_size=40,
+    unique_by=lambda row: (row["renderer"], row["policy"], row["scene"], row["seed"], row["metric"], row["t_us"]),
+)
+
+
+@given(rows, st.booleans())
+@settings(deadline=None)
+def test_series_agree_with_a_plain_loop(made: list[dict], coded: bool) -> None:  # type: ignore[type-arg]
+    slow: dict = {}  # type: ignore[type-arg]
+    for row in sorted(made, key=lambda r: r["t_us"]):
+        if row["valid"]:
+            cell = (row["renderer"], row["policy"], row["scene"], row["seed"])
+            slow.setdefault(cell, {}).setdefault(row["metric"], []).append((row["t_us"], row["value"]))
+    names = ["renderer", "policy", "scene", "seed", "metric", "t_us", "value", "valid"]
+    types = [pa.string()] * 3 + [pa.int64(), pa.string(), pa.int64(), pa.float64(), pa.bool_()]
+    table = pa.Table.from_pylist(made, schema=pa.schema(list(zip(names, types, strict=True))))
+    if coded:
+        for name in ("renderer", "policy", "scene", "metric"):
+            table = table.set_column(table.column_names.index(name), name, table[name].dictionary_encode())
+    fast = {
+        cell: {metric: list(zip(t.tolist(), v.tolist(), strict=True)) for metric, (t, v) in series.items()}
+        for cell, series in series_by_cell(table).items()
+    }
+    assert fast == slow

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evaluators.report import write_summary_md
+from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, escape, table
+from tests.report.make_run import Plan, make_run
+
+
+def test_summary_has_finding_tables_failures_and_command(usual_run: Path) -> None:
+    text = write_summary_md(usual_run).read_text(encoding="utf-8")
+    assert text.startswith("## 3dgs drives worse than clean")
+    for part in ("### Results, preset paper", "### Paired differences from clean", "### Speed", "### Failures", "simrun run --renderer"):
+        assert part in text
+    assert "\u2014 (the policy gives no plan of 1.0 s)" in text
+
+
+def test_every_table_row_has_as_many_cells_as_its_head(hostile_run: Path) -> None:
+    lines = write_summary_md(hostile_run).read_text(encoding="utf-8").splitlines()
+    widths: list[int] = []
+    for before, line in zip(["", *lines], lines, strict=False):
+        if line.startswith("|"):
+            cells = line.replace("\\|", "").count("|")
+            if not before.startswith("|"):
+                widths.append(cells)
+            assert cells == widths[-1], line
+    assert len(widths) >= 3
+    assert not any("<img" in line or "<script" in line for line in lines if not line.startswith("simrun"))
+
+
+def test_table_escapes_columns_and_new_lines() -> None:
+    assert table(["a|b"], [["one\ntwo"], ["<i>"]]) == "| a\\|b |\n| --- |\n| one two |\n| &lt;i&gt; |\n"
+    assert escape("*x*_y_`z`") == "\\*x\\*\\_y\\_\\`z\\`"
+
+
+@given(st.text(st.characters(codec="utf-8"), min_size=200, max_size=2000), st.integers(150, 1000))
+def test_cut_keeps_within_the_limit_and_stays_text(text: str, limit: int) -> None:
+    done = cut(text, limit)
+    assert len(done.encode()) <= max(limit, len(CUT_NOTE.encode()))
+    if len(text.encode()) <= limit:
+        assert done == text
+    else:
+        assert done.endswith(CUT_NOTE)
+        assert text.startswith(done.removesuffix(CUT_NOTE))
+
+
+def test_huge_summary_is_cut_with_a_note(usual_run: Path, tmp_path: Path) -> None:
+    folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
+    summary = json.loads((folder / "summary.json").read_text())
+    entry = summary["metrics"]["clean"]["offroad"]
+    summary["metrics"]["clean"] |= {f"metric_{k:06d}": entry for k in range(24_000)}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    data = write_summary_md(folder).read_bytes()
+    assert MAX_BYTES - 2000 < len(data) <= MAX_BYTES
+    assert data.decode().endswith(CUT_NOTE)
+
+
+def test_empty_run_has_a_summary(tmp_path: Path) -> None:
+    assert write_summary_md(make_run(tmp_path, Plan(renderers=(), scenes=()))).read_text().startswith("## Nothing was run")

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.report.make_run import Plan, make_run
+from rich.console import Console
+
+from evaluators.report import render_table
+from evaluators.report.numbers import DASH
+from evaluators.report.run_folder import read_run
+from evaluators.report.sections import failure_rows, ledger, scene_rows, speed
+from evaluators.report.tables import columns, metric_rows, pair_rows
+
+
+def entry(mean: float | None, **more: Any) -> dict[str, Any]:
+    base = {"mean": mean, "ci95": 0.0192, "ci95_clustered": [0.01, 0.05], "n_rollouts": 300, "n_scenes": 60, "unit": "", "direction": "lower"}
+    return base | more
+
+
+def test_rate_is_percent_with_counts_and_both_intervals() -> None:
+    (row,) = metric_rows({"metrics": {"3dgs": {"offroad": entry(7 / 300)}}})
+    (cell,) = row.cells
+    assert (cell.text, row.unit, row.arrow) == ("2.3", "%", "\u2193")
+    assert cell.count == "7 of 300"
+    assert cell.detail == "\u00b1\u00a01.9 \u00b7 1.0 to 5.0"
+    assert "300\u00a0rollouts, 60\u00a0scenes" in cell.note
+
+
+def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
+    summary = {"metrics": {"a": {"offroad": entry(None, reason="valid in none of 4 rollouts")}, "b": {"route_distance_m": entry(0.0, unit="m")}}}
+    offroad, distance = metric_rows(summary, {("a", "offroad"): "the map has no edges"})
+    assert offroad.cells[0].text == DASH
+    assert offroad.cells[0].note == "the map has no edges"
+    assert offroad.cells[1].text == DASH
+    assert offroad.cells[1].note == "not computed for this renderer"
+    assert distance.cells[0].missing
+    assert distance.cells[1].text == "0.000"
+    assert offroad.spans == (None, None)
+
+
+def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
+    one = entry(0.4, unit="m", ci95=None, ci95_clustered=None, n_rollouts=1, n_scenes=1, ci95_reason="one rollout has no spread")
+    (row,) = metric_rows({"metrics": {"a": {"route_distance_m": one}}})
+    assert row.cells[0].text == "0.400"
+    assert row.cells[0].detail == "\u00b1\u00a0\u2014 \u00b7 \u2014"
+    assert "no \u00b1: one rollout has no spread" in row.cells[0].note
+    assert "no interval over scenes" in row.cells[0].note
+
+
+def test_metric_of_a_third_party_is_shown_without_help() -> None:
+    (row,) = metric_rows({"metrics": {"a": {"my_metric": entry(3.25, unit="jerk", direction="none")}}})
+    assert (row.name, row.unit, row.arrow, row.meaning) == ("my_metric", "jerk", "", "")
+    assert row.cells[0].text == "3.250"
+    assert not row.cells[0].count
+
+
+@pytest.mark.parametrize("mean", [0.0, 1e-7, 5e6])
+def test_bars_stay_on_their_axis(mean: float) -> None:
+    rows = metric_rows({"metrics": {"a": {"route_distance_m": entry(mean, unit="m", ci95_clustered=[-1.0, 3.0])}}})
+    (span,) = rows[0].spans
+    assert span is not None
+    for value in (span.centre, span.low, span.high, span.inner_low, span.inner_high, span.zero):
+        assert value is not None
+        assert 0.0 <= value <= 100.0
+
+
+def test_pair_without_shared_cells_keeps_its_reason() -> None:
+    pair = {"baseline": "clean", "diff": None, "ci95": None, "p_value": None, "verdict": "undecided", "reason": "no shared cell", "n_missing": 3}
+    (row,) = pair_rows({"metrics": {}, "paired": {"3dgs": {"offroad": pair}}})
+    assert row.diff.missing
+    assert row.p_value.note == "no shared cell"
+    assert row.verdict == "undecided"
+    assert row.span is None
+
+
+def test_paired_zero_lies_in_the_middle() -> None:
+    pair = {"baseline": "clean", "diff": -0.2, "ci95": [-0.3, 0.1], "p_value": 0.0004, "verdict": "undecided", "unit": "m", "direction": "lower"}
+    (row,) = pair_rows({"paired": {"3dgs": {"route_distance_m": pair}}})
+    assert row.span is not None
+    assert row.span.zero == 50.0
+    assert row.span.low == pytest.approx(4.0)  # the farthest end reaches the rim
+    assert row.p_value.text == "< 0.001"
+    assert row.diff.text == "\u22120.200\u00a0m"
+
+
+def test_columns_count_done_and_failed(usual_run: Path) -> None:
+    assert [(c.n_rollouts, c.n_failed, c.n_scenes) for c in columns(read_run(usual_run))] == [(24, 0, 4), (22, 2, 4), (22, 2, 4)]
+
+
+def test_scene_rows_count_only_what_ran(usual_run: Path) -> None:
+    rows, more = scene_rows(read_run(usual_run))
+    assert more == 0
+    assert len(rows) == 4 * 3 * 2
+    row = next(r for r in rows if (r.scene, r.renderer, r.policy) == ("urban/left-turn", "3dgs", "lane-camera"))
+    assert [chip.state for chip in row.chips][1] == "failed"
+    assert row.collisions.text.endswith("of 2")
+    assert row.chips[0].clip == "rollouts/3dgs/lane-camera/urban-left-turn/0/front.mp4"
+    assert row.chips[1].clip is None
+
+
+def test_scene_without_a_finished_rollout_has_dashes(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Plan(renderers=("3dgs",), scenes=("a",), seeds=(0,), steps=10, fail=[("3dgs", "a", 0)])))
+    (row,), _ = scene_rows(run)
+    assert row.collisions.missing
+    assert row.values[0].note == "no rollout finished"
+
+
+def test_failures_carry_four_parts(usual_run: Path) -> None:
+    rows, more = failure_rows(read_run(usual_run))
+    assert (len(rows), more) == (4, 0)
+    assert [label for label, _ in rows[0].parts] == ["doing", "with", "found", "do"]
+
+
+def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    table = speed(run)
+    assert table.stages == ("render", "policy", "log", "control", "actors")
+    assert sum(segment.width for segment in table.rows[-1].bar) == pytest.approx(100.0, abs=0.1)
+    assert table.pool.startswith("2\u00a0workers with 1\u00a0thread each, 41.2 camera frames/s in total")
+
+
+def test_renderer_without_frames_has_no_speed() -> None:
+    from evaluators.report.run_folder import Run
+
+    speeds = {"a": {"ms_per_frame_p50": None, "ms_per_frame_p95": None, "frames_per_s": None, "first_frame_ms": None, "stages": {}}}
+    table = speed(Run(Path(), {}, {"speed": speeds}, (), ()))
+    assert all(cell.missing for cell in table.rows[0].cells)
+    assert table.rows[0].bar == ()
+    assert table.rows[0].sum_text == DASH
+
+
+def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:
+    rows = {row.renderer: row for row in ledger(read_run(usual_run), ("offroad",))}
+    assert rows["clean"].bounds[0].text == "0.0\u00a0%"
+    assert rows["onefixer"].bounds[0].text == "0.0 to 8.3\u00a0%"
+    assert rows["3dgs"].counts[1].note == "renderer: 2"
+
+
+def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> None:
+    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(render_table(json.loads((usual_run / "summary.json").read_text())))
+    text = console.export_text()
+    for part in ("offroad % \u2193", "24 rollouts", "4 scenes", "of 22", "route_distance_m m \u2193", "preset paper", "\u00b1", DASH):
+        assert part.replace("\u00a0", " ") in text.replace("\u00a0", " ")
+
+
+def test_terminal_table_can_be_short(usual_run: Path) -> None:
+    summary = json.loads((usual_run / "summary.json").read_text())
+    assert render_table(summary, headline_only=True).row_count == 5
+    assert render_table(summary).row_count == 13
+    assert render_table({"metrics": {}}, headline_only=True).row_count == 0
