@@ -90,37 +90,43 @@ def _order_ties(count, pairs, ids):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _tile_rows(records, at, tiles_y):
-    """Return the first and one past the last tile row that a splat's ellipse can touch."""
-    centre, radius = records[at + V], records[at + RADIUS_Y]
-    # Clamped as floats: a far off-screen centre does not fit an integer.
-    top = min(max((centre - radius - np.float32(0.5)) / TILE, 0.0), np.float64(tiles_y))
-    bottom = min(max((centre + radius - np.float32(0.5)) / TILE, -1.0), np.float64(tiles_y - 1))
-    return int(top), int(np.floor(bottom)) + 1
+def _tile_span(low, high, n_tiles):
+    """Return the first and one past the last tile whose pixel centres can lie between two coordinates."""
+    # Clamped as floats, since far off-screen bounds do not fit an integer; truncation is rounding down, as nothing is negative.
+    half, per_tile, zero = np.float32(0.5), np.float32(1.0 / TILE), np.float32(0.0)
+    limit = np.float32(n_tiles)
+    first = min(max((low - half) * per_tile, zero), limit)
+    last = min(max((high - half) * per_tile + np.float32(1.0), zero), limit)
+    return np.int32(first), np.int32(last)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _tile_columns(records, at, row, tiles_x):
+def _ellipse_columns(records, at, row, tiles_x):
     """Return the first and one past the last tile of a tile row that a splat's ellipse can touch."""
     centre, radius_y = records[at + V], records[at + RADIUS_Y]
     low = max(np.float32(row * TILE + 0.5) - centre, -radius_y)
     high = min(np.float32(row * TILE + TILE - 0.5) - centre, radius_y)
     left = right = records[at + RADIUS_X]
     top_y, slope, half_width = records[at + TOP_Y], records[at + SLOPE], records[at + HALF_WIDTH]
-    one, zero = np.float32(1.0), np.float32(0.0)
+    one, zero, slack = np.float32(1.0), np.float32(0.0), np.float32(0.02)
     # The rightmost point lies at dy = top_y and the leftmost at -top_y; outside of the band the nearer end of the band counts.
     if top_y < low or top_y > high:
         end = low if top_y < low else high
         share = end / radius_y
-        right = min(right, slope * end + half_width * np.sqrt(max(zero, one - share * share)) + np.float32(0.02))
+        right = min(right, slope * end + half_width * np.sqrt(max(zero, one - share * share)) + slack)
     if -top_y < low or -top_y > high:
         end = low if -top_y < low else high
         share = end / radius_y
-        left = min(left, half_width * np.sqrt(max(zero, one - share * share)) - slope * end + np.float32(0.02))
-    u = records[at + U]
-    first = min(max((u - left - np.float32(0.5)) / TILE, 0.0), np.float64(tiles_x))
-    last = min(max((u + right - np.float32(0.5)) / TILE, -1.0), np.float64(tiles_x - 1))
-    return int(first), int(np.floor(last)) + 1
+        left = min(left, half_width * np.sqrt(max(zero, one - share * share)) - slope * end + slack)
+    return _tile_span(records[at + U] - left, records[at + U] + right, tiles_x)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _tile_box(records, at, tiles_x, tiles_y):
+    """Return the tiles of a splat's box: first and one past the last column, the same for rows."""
+    left, right = _tile_span(records[at + U] - records[at + RADIUS_X], records[at + U] + records[at + RADIUS_X], tiles_x)
+    top, bottom = _tile_span(records[at + V] - records[at + RADIUS_Y], records[at + V] + records[at + RADIUS_Y], tiles_y)
+    return left, right, top, bottom
 
 
 @njit(cache=True, nogil=True)
@@ -134,13 +140,16 @@ def gather_and_count(cursor, count, order, records, tiles_x, tiles_y, ordered, h
         counts = histogram[chunk]
         counts[:] = 0
         for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+            v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
             source, at = (order[rank] & _LOW) * RECORD, rank * RECORD
-            for field in range(RECORD):
-                ordered[at + field] = records[source + field]
-            first, last = _tile_rows(ordered, at, tiles_y)
-            for row in range(first, last):
-                left, right = _tile_columns(ordered, at, row, tiles_x)
-                for tile in range(row * tiles_x + left, row * tiles_x + right):
+            v.store(ordered, at, v.load(records, source))
+            left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
+            for row in range(top, bottom):
+                if bottom - top > 1 and right - left > 1:
+                    left_here, right_here = _ellipse_columns(ordered, at, row, tiles_x)
+                else:
+                    left_here, right_here = left, right
+                for tile in range(row * tiles_x + left_here, row * tiles_x + right_here):
                     counts[tile] += 1
 
 
@@ -170,9 +179,12 @@ def fill_tiles(cursor, count, ordered, tiles_x, tiles_y, histogram, lists):
         position = histogram[chunk]
         for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
             at = rank * RECORD
-            first, last = _tile_rows(ordered, at, tiles_y)
-            for row in range(first, last):
-                left, right = _tile_columns(ordered, at, row, tiles_x)
-                for tile in range(row * tiles_x + left, row * tiles_x + right):
+            left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
+            for row in range(top, bottom):
+                if bottom - top > 1 and right - left > 1:
+                    left_here, right_here = _ellipse_columns(ordered, at, row, tiles_x)
+                else:
+                    left_here, right_here = left, right
+                for tile in range(row * tiles_x + left_here, row * tiles_x + right_here):
                     lists[position[tile]] = rank
                     position[tile] += 1

@@ -55,6 +55,7 @@ def _composite_tile(lists, start, end, records, x0, y0, state, live):
     block_x = v.lane_pattern(four, nil)
     block_y = v.lane_pattern(nil, four)
     for i in range(start, end):
+        v.prefetch(records, np.int64(lists[min(i + 8, end - 1)]) * RECORD)
         at = np.int64(lists[i]) * RECORD
         dx, dy = x0 - records[at + U], y0 - records[at + V]
         l11, l12, l22 = records[at + L11], records[at + L12], records[at + L22]
