@@ -72,7 +72,7 @@ def _video() -> str:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "test.mp4"
         write_mp4(path, frames, 10)
-        return f"H.264: {len(list(read_mp4(path)))} frames written and read back"
+        return f"H.264: {len(read_mp4(path).frames)} frames written and read back"
 
 
 def _wire() -> str:

@@ -11,10 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.runtime.execute import Threads
-from alpasim_plugin.runtime.store import STEPS_SCHEMA, rollouts_schema, write_bytes, write_json, write_table
+from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, rollouts_schema, write_bytes, write_json, write_table
 from evaluators import aggregate, censoring, paired
-
-LOOP_STAGES = ("actors", "render", "policy", "control", "log")
 
 
 def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -56,7 +54,7 @@ def write_tables(
         "censoring": censoring(manifests),
         "failures": _failures(manifests),
         "speed": {name: speed([m for m in manifests if m["renderer"] == name and m["status"] == "ok"]) for name in renderers},
-        "pool": _pool(manifests, threads, wall_s),
+        "pool": _pool(root, manifests, threads, wall_s),
     }
     write_json(root / "summary.json", summary)
     return summary
@@ -99,8 +97,14 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _pool(manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float) -> dict[str, Any]:
-    frames = sum(int(m.get("frames") or 0) for m in manifests if not m.get("reused"))
+def _pool(root: Path, manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float) -> dict[str, Any]:
+    """Return the throughput of all workers together, start-up included; a run that only reused rollouts keeps the figures it had."""
+    fresh = [m for m in manifests if not m.get("reused")]
+    before = root / "summary.json"
+    if not fresh and before.exists():
+        kept: dict[str, Any] = read_json(before).get("pool", {})
+        return kept
+    frames = sum(int(m.get("frames") or 0) for m in fresh)
     return {
         "workers": threads.workers,
         "threads_per_worker": threads.per_worker,

@@ -1,0 +1,163 @@
+"""Whole runs: workers, resume, failures, exit codes. Real parts throughout, on the shortest scenes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.cell import MANIFEST
+from alpasim_plugin.runtime.execute import Threads, thread_budget
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug
+from alpasim_plugin.runtime.run import RunResult, execute_run
+from scenarios.suite import expand
+
+SHORT = ("timing.duration_us=1200000",)
+
+
+class Heard:
+    """Remembers what a run announced."""
+
+    def __init__(self) -> None:
+        self.fates: list[tuple[str, bool]] = []
+
+    def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
+        self.threads = threads
+
+    def rollout_done(self, manifest: dict, reused: bool) -> None:
+        self.fates.append((manifest["status"], reused))
+
+
+def plan_of(policies: tuple[str, ...] = ("lane-camera",), preset: str = "paper", seeds: tuple[int, ...] = (0, 1)) -> RunPlan:
+    refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
+    return make_plan(refs, ("clean", "3dgs"), policies, seeds, RunOptions(preset=preset))
+
+
+def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Heard]:
+    heard = Heard()
+    return execute_run(plan, root, workers, ["simrun"], heard, resume), heard
+
+
+def comparable(root: Path) -> dict[str, object]:
+    """Return everything of a run that must not depend on how it was run."""
+    rows = pq.read_table(root / "rollouts.parquet").drop_columns(["wall_s"]).to_pylist()
+    logs = {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("rollout.asl"))}
+    steps = pq.read_table(root / "steps.parquet").to_pylist()
+    summary = {k: v for k, v in json.loads((root / "summary.json").read_text()).items() if k not in ("speed", "pool")}
+    return {"rows": repr(rows), "logs": logs, "steps": repr(steps), "summary": summary}
+
+
+def test_one_and_two_workers_give_the_same_run(tmp_path: Path) -> None:
+    _, one = run(plan_of(), tmp_path / "one", workers=1)
+    _, two = run(plan_of(), tmp_path / "two", workers=2)
+    assert one.fates.count(("ok", False)) == two.fates.count(("ok", False)) == 8
+    assert comparable(tmp_path / "one") == comparable(tmp_path / "two")
+
+
+def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_path: Path) -> None:
+    plan = plan_of(seeds=(0,))
+    run(plan, tmp_path)
+    before = comparable(tmp_path)
+    lost = tmp_path / plan.cells[1].folder / MANIFEST
+    lost.unlink()  # as after a kill: the log is there, the completion marker is not
+    _, heard = run(plan, tmp_path)
+    assert sorted(heard.fates) == [("ok", False), ("ok", True), ("ok", True), ("ok", True)]
+    assert comparable(tmp_path) == before
+
+
+def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
+    run(plan_of(seeds=(0,)), tmp_path)
+    with pytest.raises(InputError, match="it holds another run") as caught:
+        run(plan_of(seeds=(0, 1)), tmp_path)
+    assert "--resume" in caught.value.do_this
+    result, heard = run(plan_of(seeds=(0, 1)), tmp_path, resume=True)
+    assert heard.fates.count(("ok", True)) == 4
+    assert result.n_rollouts == 8
+
+
+def test_a_failing_policy_is_a_failed_rollout_and_exit_code_4(tmp_path: Path) -> None:
+    broken = "tests.runtime.broken_policies:Raises"
+    result, _ = run(plan_of(policies=("constant-velocity", broken), seeds=(0,)), tmp_path)
+    assert (result.n_rollouts, result.n_failed, result.exit_code) == (8, 4, 4)
+    assert result.summary["failures"]["by_class"] == {"policy": 4}
+    rows = pq.read_table(tmp_path / "rollouts.parquet").to_pylist()
+    assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
+    assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)
+    _, heard = run(plan_of(policies=("constant-velocity", broken), seeds=(0,)), tmp_path)
+    assert heard.fates.count(("ok", True)) == 4  # failed rollouts run again, finished ones do not
+
+
+def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path) -> None:
+    refs = expand("smoke/straight", SHORT)
+    killer = "tests.runtime.broken_policies:KillsItsProcess"
+    plan = make_plan(refs, ("clean",), ("constant-velocity", killer, "pure-pursuit"), (0, 1), RunOptions())
+    result, _ = run(plan, tmp_path, workers=2)
+    assert result.n_failed == 2
+    assert {cell["policy"] for cell in result.summary["failures"]["cells"]} == {killer}
+    assert result.exit_code == 4
+
+
+def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", "clean", "--policy", "lane-camera", "--seeds", "6"]
+    command += ["--set", SHORT[0], "--workers", "1", "--out", str(tmp_path), "smoke/straight"]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
+    give_up = time.monotonic() + 90
+    while len(list(tmp_path.rglob(MANIFEST))) < 2 and time.monotonic() < give_up and process.poll() is None:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    done = {path: path.stat().st_mtime_ns for path in tmp_path.rglob(MANIFEST)}
+    assert 2 <= len(done) < 6
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert again.stderr.count("(reused)") == len(done)
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    assert len(list(tmp_path.rglob(MANIFEST))) == 6
+
+
+def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Path) -> None:
+    """A file-size limit stands in for a full disk: the system refuses the same writes with an error of the same kind."""
+    code = (
+        "import resource, sys\n"
+        "from alpasim_plugin.cli.main import run_command\n"
+        "limit = int(sys.argv[1])\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))\n"
+        "sys.exit(run_command(sys.argv[2:]))\n"
+    )
+    common = ["--renderer", "clean", "--policy", "lane-camera", "--workers", "1", "--set", SHORT[0], "--resume", "--out", str(tmp_path)]
+    base = [sys.executable, "-c", code]
+    fine = subprocess.run([*base, str(10**9), "--seeds", "0,1", *common, "smoke/straight"], capture_output=True, text=True)
+    assert fine.returncode == 0, fine.stderr
+    kept = {p: p.read_bytes() for p in tmp_path.rglob("rollout.asl")}
+    full = subprocess.run([*base, "20000", "--seeds", "0,1,2", *common, "smoke/straight"], capture_output=True, text=True)
+    assert full.returncode == 4, full.stderr
+    assert "free disk space" in full.stderr or "File too large" in full.stderr
+    assert {p: p.read_bytes() for p in kept} == kept
+
+
+def test_workers_times_threads_never_exceed_the_cores() -> None:
+    cores = len(os.sched_getaffinity(0))
+    for wanted in (None, 1, 2, 3, 64):
+        for cells in (0, 1, 2, 1000):
+            budget = thread_budget(wanted, cells)
+            assert budget.workers >= 1
+            assert budget.per_worker >= 1
+            assert wanted is not None or budget.workers * budget.per_worker <= max(cores, 1)
+
+
+def test_two_scenarios_with_one_id_are_refused() -> None:
+    refs = expand("smoke/straight") * 2
+    with pytest.raises(InputError, match="both have the scene id"):
+        make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
+
+
+def test_names_become_safe_folders() -> None:
+    assert slug("nre://host:50051") == "nre-host-50051"
+    assert slug("../../etc") == "etc"
