@@ -87,8 +87,11 @@ class Loft:
             add([ring[1], ring[0], ring[3], ring[2]], body, 0.12)
             if t - belt > 0.05:
                 r = self._roof_half(i, w)
-                add([[x, -sign * w, belt], [x, sign * w, belt], [x, sign * r, t], [x, -sign * r, t]], *((glass, 0.25) if sign > 0 or self.rear_glass else (body, 0.12)))
-            bumper = [[x, -sign * w * 0.95, 0.6 * low], [x, sign * w * 0.95, 0.6 * low], [x, sign * w, low * 1.6], [x, -sign * w, low * 1.6]]
+                glazed = sign > 0 or self.rear_glass
+                upper = [[x, -sign * w, belt], [x, sign * w, belt], [x, sign * r, t], [x, -sign * r, t]]
+                add(upper, glass if glazed else body, 0.25 if glazed else 0.12)
+            b, high = 0.95 * w, 1.6 * low
+            bumper = [[x, -sign * b, 0.6 * low], [x, sign * b, 0.6 * low], [x, sign * w, high], [x, -sign * w, high]]
             add(bumper, 0.30 * body + 0.04, 0.0)
         return np.stack(faces), np.stack(colours), np.array(gloss)
 

@@ -10,23 +10,36 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from alpasim_plugin.gaussians.actor_shapes import STATIONS, Loft
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.nodes import Level, SceneNode
+from alpasim_plugin.gaussians.sh import C0
 from alpasim_plugin.gaussians.surfels import cloud_of, quad_surfels, rods, with_sheen
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, Actor, Box, Scenario
+from alpasim_plugin.types import F32, F64, Actor, Box, Scenario
 
 CELLS_M = (0.09, 0.22, 0.6)
 BODY_RGB = np.array(
-    [[0.78, 0.78, 0.78], [0.16, 0.16, 0.17], [0.55, 0.56, 0.58], [0.90, 0.90, 0.88], [0.50, 0.10, 0.10], [0.13, 0.23, 0.45], [0.32, 0.34, 0.36], [0.20, 0.30, 0.24], [0.62, 0.55, 0.42]]
+    [
+        *([0.78, 0.78, 0.78], [0.16, 0.16, 0.17], [0.55, 0.56, 0.58], [0.90, 0.90, 0.88], [0.50, 0.10, 0.10]),
+        *([0.13, 0.23, 0.45], [0.32, 0.34, 0.36], [0.20, 0.30, 0.24], [0.62, 0.55, 0.42]),
+    ]
 )
-CLOTHES_RGB = np.array([[0.15, 0.17, 0.25], [0.45, 0.12, 0.12], [0.20, 0.36, 0.24], [0.60, 0.58, 0.52], [0.10, 0.10, 0.11], [0.70, 0.52, 0.16], [0.26, 0.40, 0.62]])
+TRUCK_RGB = np.array([[0.85, 0.85, 0.83], [0.70, 0.45, 0.18], [0.35, 0.45, 0.55]])
+BUS_RGB = np.array([[0.72, 0.16, 0.13], [0.20, 0.36, 0.60], [0.82, 0.80, 0.74]])
+CLOTHES_RGB = np.array(
+    [
+        *([0.15, 0.17, 0.25], [0.45, 0.12, 0.12], [0.20, 0.36, 0.24], [0.60, 0.58, 0.52]),
+        *([0.10, 0.10, 0.11], [0.70, 0.52, 0.16], [0.26, 0.40, 0.62]),
+    ]
+)
 SKIN_RGB = np.array([[0.80, 0.62, 0.50], [0.55, 0.38, 0.28], [0.36, 0.25, 0.19]])
 SKY_RGB = (0.72, 0.82, 0.92)
 GLASS_RGB = np.array([0.10, 0.12, 0.14])
 TYRE_RGB = np.array([0.07, 0.07, 0.075])
+HUB_RGB = np.array([0.50, 0.51, 0.53])
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -43,7 +56,7 @@ def build_actor(actor: Actor, scene_id: str, seed: int) -> SceneNode:
     levels = []
     coarser = float(np.clip(actor.box.length_m / 5.0, 1.0, 2.0))
     for cell_m in np.array(CELLS_M) * coarser:
-        cloud = GaussianCloud.concatenate([shape(actor.box, draw, noise, cell_m), _shadow(actor.box, actor.label)])
+        cloud = GaussianCloud.concatenate([shape(actor.box, draw, noise, float(cell_m)), _shadow(actor.box, actor.label)])
         levels.append(Level(float(cell_m), cloud))
     return SceneNode(actor.actor_id, "actor", tuple(levels))
 
@@ -72,9 +85,8 @@ def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F6
     return GaussianCloud.concatenate(parts)
 
 
-def _shaded(sh: np.ndarray, shade: F64) -> np.ndarray:  # type: ignore[type-arg]
-    c0 = 0.28209479177387814
-    return np.asarray(((sh * c0 + 0.5) * shade[:, None, None] - 0.5) / c0, dtype=np.float32)
+def _shaded(sh: npt.NDArray[np.floating], shade: F64) -> F32:
+    return np.asarray(((sh * C0 + 0.5) * shade[:, None, None] - 0.5) / C0, dtype=np.float32)
 
 
 def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
@@ -87,17 +99,21 @@ def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
         x, y, z = np.append(x, [loft.axles[2] * box.length_m] * 2), np.append(y, y[:2]), np.append(z, z[:2])
     n = len(x)
     centre = np.column_stack([x, y, z])
-    disc = cloud_of(centre, np.tile(IDENTITY, (n, 1)), np.tile([0.52 * radius, 0.05, 0.52 * radius], (n, 1)), np.tile(TYRE_RGB, (n, 1)))
+    disc = _blobs(centre, (0.52 * radius, 0.05, 0.52 * radius), TYRE_RGB)
     if cell_m > 0.3:
         return disc
     angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
     rim = np.stack([np.cos(angle), np.zeros(10), np.sin(angle)], axis=1) * 0.74 * radius
-    rims = (centre[:, None] + rim[None]).reshape(-1, 3)
-    m = len(rims)
-    tyre = cloud_of(rims, np.tile(IDENTITY, (m, 1)), np.tile([0.19 * radius, 0.05, 0.19 * radius], (m, 1)), np.tile(TYRE_RGB, (m, 1)))
+    tyre = _blobs((centre[:, None] + rim[None]).reshape(-1, 3), (0.19 * radius, 0.05, 0.19 * radius), TYRE_RGB)
     outward = np.column_stack([np.zeros(n), 0.05 * np.sign(y), np.zeros(n)])
-    hub = cloud_of(centre + outward, np.tile(IDENTITY, (n, 1)), np.tile([0.26 * radius, 0.02, 0.26 * radius], (n, 1)), np.tile([0.50, 0.51, 0.53], (n, 1)))
+    hub = _blobs(centre + outward, (0.26 * radius, 0.02, 0.26 * radius), HUB_RGB)
     return GaussianCloud.concatenate([disc, tyre, hub])
+
+
+def _blobs(means: F64, scales: tuple[float, float, float], rgb: F64) -> GaussianCloud:
+    """Return Gaussians of one size, colour and orientation along the box's axes."""
+    n = len(means)
+    return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.tile(scales, (n, 1)), np.tile(rgb, (n, 1)))
 
 
 def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
@@ -105,13 +121,14 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     half, z = box.length_m / 2, loft.lamp_z * box.height_m - box.height_m / 2
     y = 0.36 * box.width_m
     plate_z = loft.lamp_z * 0.62 * box.height_m - box.height_m / 2
-    means = np.array(
-        [[half + 0.02, y, z], [half + 0.02, -y, z], [-half - 0.02, y, z], [-half - 0.02, -y, z], [-half - 0.02, 0, plate_z], [half + 0.02, 0, plate_z * 1.05]]
-    )
-    rgb = np.array([[0.96, 0.96, 0.88], [0.96, 0.96, 0.88], [0.80, 0.06, 0.05], [0.80, 0.06, 0.05], [0.88, 0.88, 0.86], [0.88, 0.88, 0.86]])
-    scales = np.array([[0.02, 0.10, 0.055]] * 2 + [[0.02, 0.11, 0.065]] * 2 + [[0.02, 0.14, 0.045]] * 2)
-    keep = slice(None) if cell_m < 0.3 else slice(0, 4)
-    return cloud_of(means[keep], np.tile(IDENTITY, (len(means[keep]), 1)), scales[keep], rgb[keep])
+    end = half + 0.02
+    parts = [
+        _blobs(np.array([[end, y, z], [end, -y, z]]), (0.02, 0.10, 0.055), np.array([0.96, 0.96, 0.88])),
+        _blobs(np.array([[-end, y, z], [-end, -y, z]]), (0.02, 0.11, 0.065), np.array([0.80, 0.06, 0.05])),
+    ]
+    if cell_m < 0.3:
+        parts.append(_blobs(np.array([[-end, 0, plate_z], [end, 0, 1.05 * plate_z]]), (0.02, 0.14, 0.045), np.array([0.88, 0.88, 0.86])))
+    return GaussianCloud.concatenate(parts)
 
 
 def _car(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
@@ -122,15 +139,15 @@ def _car(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
 def _truck(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     if box.length_m < 6.0 and box.height_m < 2.3:
         return _lofted(box, draw, noise, cell_m, STATIONS["pickup"], BODY_RGB[int(draw[0] * len(BODY_RGB))])
-    return _lofted(box, draw, noise, cell_m, STATIONS["truck"], np.array([[0.85, 0.85, 0.83], [0.70, 0.45, 0.18], [0.35, 0.45, 0.55]])[int(draw[0] * 3)])
+    return _lofted(box, draw, noise, cell_m, STATIONS["truck"], TRUCK_RGB[int(draw[0] * 3)])
 
 
 def _bus(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    return _lofted(box, draw, noise, cell_m, STATIONS["bus"], np.array([[0.72, 0.16, 0.13], [0.20, 0.36, 0.60], [0.82, 0.80, 0.74]])[int(draw[0] * 3)])
+    return _lofted(box, draw, noise, cell_m, STATIONS["bus"], BUS_RGB[int(draw[0] * 3)])
 
 
-def _person(height_m: float, width_m: float, draw: F64, cell_m: float, stride: float, z0: float, x0: float = 0.0, lean: float = 0.0) -> GaussianCloud:
-    """Return a standing or riding figure whose feet are at ``z0`` above the box's bottom of ``-height/2``."""
+def _person(height_m: float, width_m: float, draw: F64, stride: float, z0: float, x0: float = 0.0, lean: float = 0.0) -> GaussianCloud:
+    """Return a standing or riding figure with its feet at ``(x0, 0, z0)``; ``lean`` and ``stride`` are shares of its height."""
     h, w = height_m, min(max(width_m, 0.45), 0.75)
     coat = CLOTHES_RGB[int(draw[2] * len(CLOTHES_RGB))]
     legs = CLOTHES_RGB[int(draw[3] * len(CLOTHES_RGB))] * 0.8
@@ -159,7 +176,7 @@ def _person(height_m: float, width_m: float, draw: F64, cell_m: float, stride: f
 
 
 def _pedestrian(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    return _person(box.height_m, box.width_m, draw, cell_m, 0.05 + 0.06 * draw[5], -box.height_m / 2)
+    return _person(box.height_m, box.width_m, draw, 0.05 + 0.06 * draw[5], -box.height_m / 2)
 
 
 def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) -> GaussianCloud:
@@ -173,14 +190,15 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     centres = np.array([[x, 0.0, bottom + radius] for x in wheel_x])
     at = (centres[:, None] + ring[None]).reshape(-1, 3)
     thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
-    tyres = cloud_of(at, np.tile(IDENTITY, (len(at), 1)), np.tile([2.2 * thick, 1.2 * thick, 2.2 * thick], (len(at), 1)), np.tile(TYRE_RGB, (len(at), 1)))
+    tyres = _blobs(at, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
     body = BODY_RGB[int(draw[0] * len(BODY_RGB))]
     seat, bar = np.array([-0.12 * length, 0, bottom + 0.52 * height]), np.array([0.26 * length, 0, bottom + 0.60 * height])
     pedal = np.array([-0.02 * length, 0, bottom + radius])
-    pairs = [(seat, centres[1]), (seat, pedal), (bar, pedal), (bar, centres[0]), (seat, bar), (bar + [0, 0.25, 0.02], bar + [0, -0.25, 0.02])]
+    grip = np.array([0.0, 0.25, 0.0])
+    pairs = [(seat, centres[1]), (seat, pedal), (bar, pedal), (bar, centres[0]), (seat, bar), (bar + grip, bar - grip)]
     start, end = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
     frame = rods(start, end, 0.10 if heavy else 0.03, np.tile(body, (len(pairs), 1)), max(cell_m, 0.12))
-    rider = _person(0.80 * height, 0.55, draw, cell_m, 0.06, bottom + 0.22 * height, -0.06 * length, 0.30)
+    rider = _person(0.80 * height, 0.55, draw, 0.06, bottom + 0.22 * height, -0.06 * length, 0.30)
     return GaussianCloud.concatenate([tyres, frame, rider])
 
 
@@ -198,20 +216,24 @@ def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
     if max(length, width) < 1.0:
         n = 8 if cell_m < 0.3 else 4
         z = (np.arange(n) + 0.5) / n
-        spread = 0.30 * min(length, width) * (1.05 - 0.8 * z)
+        radius = 0.30 * min(length, width) * (1.05 - 0.8 * z)
         rgb = np.where(((z > 0.4) & (z < 0.62))[:, None], [0.92, 0.92, 0.90], [0.90, 0.36, 0.08])
         means = np.column_stack([np.zeros(n), np.zeros(n), (z - 0.5) * height])
-        return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.column_stack([spread, spread, np.full(n, 0.55 * height / n)]), rgb)
-    x, y, z = length / 2, width / 2, height / 2
+        return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb)
+    return _crate(length / 2, width / 2, height / 2, noise, cell_m)
+
+
+def _crate(x: float, y: float, z: float, noise: F64, cell_m: float) -> GaussianCloud:
+    """Return a striped box of half sizes x, y, z."""
     faces, rgb_rows = [], []
     for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
         for k in range(4):
-            low, high = -z + 2 * z * k / 4, -z + 2 * z * (k + 1) / 4
-            side = np.array([-sy, sx, 0.0]) * [x, y, 1]
+            low, high = np.array([0, 0, -z + z * k / 2]), np.array([0, 0, -z + z * (k + 1) / 2])
+            side = np.array([-sy * x, sx * y, 0.0])
             middle = np.array([sx * x, sy * y, 0.0])
-            faces.append([middle - side + [0, 0, low], middle + side + [0, 0, low], middle + side + [0, 0, high], middle - side + [0, 0, high]])
+            faces.append([middle - side + low, middle + side + low, middle + side + high, middle - side + high])
             rgb_rows.append([0.86, 0.84, 0.80] if k % 2 else [0.80, 0.42, 0.14])
-    faces.append([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
+    faces.append([np.array(corner) for corner in ((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))])
     rgb_rows.append([0.80, 0.60, 0.40])
     return quad_surfels(np.array(faces), np.array(rgb_rows), cell_m, noise)[0]
 

@@ -6,10 +6,11 @@ are cells, not holes: what a picture shows of a facade at street distances is co
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.contours import contours
@@ -17,7 +18,7 @@ from alpasim_plugin.gaussians.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.site import CELL_M, SHIFT_BITS, Site, to_pixels
 from alpasim_plugin.gaussians.surfels import SPREAD, cloud_of, grid_cells, quats_along
 from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.types import F64, I64, U8, Bool
 
 SETBACK_M = {False: 5.5, True: 24.0}  # by highway or not
 WITHIN_M = 75.0
@@ -28,7 +29,10 @@ CLEAR_M = 2.8  # no wall stands nearer to the road
 CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))  # cells per bay, and the cell size at which the level is chosen
 
 WALLS = np.array(
-    [[0.55, 0.30, 0.24], [0.63, 0.42, 0.33], [0.74, 0.68, 0.57], [0.80, 0.77, 0.72], [0.58, 0.58, 0.58], [0.66, 0.60, 0.50], [0.47, 0.50, 0.54], [0.70, 0.52, 0.36]]
+    [
+        *([0.55, 0.30, 0.24], [0.63, 0.42, 0.33], [0.74, 0.68, 0.57], [0.80, 0.77, 0.72]),
+        *([0.58, 0.58, 0.58], [0.66, 0.60, 0.50], [0.47, 0.50, 0.54], [0.70, 0.52, 0.36]),
+    ]
 )
 GLASS = np.array([[0.16, 0.20, 0.26], [0.24, 0.31, 0.38], [0.36, 0.45, 0.52], [0.58, 0.55, 0.42]])
 AWNINGS = np.array([[0.60, 0.14, 0.12], [0.12, 0.32, 0.22], [0.13, 0.22, 0.45], [0.72, 0.60, 0.20], [0.30, 0.28, 0.28]])
@@ -40,6 +44,17 @@ class Houses(NamedTuple):
     front: F64  # (M, 2, 2) plan: the wall's two ends, seen from the road right then left
     away: F64  # (M, 2) unit, plan
     height_m: F64  # (M,)
+
+
+class _Walls(NamedTuple):
+    """Walls of all houses, plan coordinates."""
+
+    start: F64  # (W, 2)
+    end: F64  # (W, 2); outward is to the right of start to end
+    base: F64  # (W,) height of the foot, world
+    height_m: F64  # (W,)
+    house: I64  # (W,)
+    is_front: Bool  # (W,)
 
 
 def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
@@ -64,10 +79,11 @@ def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
     is_front = np.arange(4 * m) < m
     base = np.minimum(site.world(starts)[:, 2], site.world(ends)[:, 2])
     top = (base[:m] + houses.height_m)[owner]  # on a slope the walls differ in height, the roof is level
-    seeds = rng.integers(1 << 30, size=3)
+    seed = int(rng.integers(1 << 30))
+    walls = _Walls(starts, ends, base, top - base, owner, is_front)
     levels = []
     for cells, cell_m in CELLS:
-        cloud, wall = _walls(site, starts, ends, base, top - base, owner, is_front, style, cells, seeds)
+        cloud, wall = _walls(site, walls, style, cells, seed)
         roof, house = _roofs(site, houses, style["wall"], base[:m], 1.0 if cells > 3 else 3.0)
         levels.append((cell_m, GaussianCloud.concatenate([cloud, roof]), np.concatenate([owner[wall], house])))
     return nodes_by_tile("house", levels), houses
@@ -105,7 +121,7 @@ def place_houses(site: Site) -> Houses:
     return Houses(np.stack(fronts), np.stack(aways), np.array(heights))
 
 
-def _claim(free: np.ndarray, ring: F64, site: Site) -> bool:  # type: ignore[type-arg]
+def _claim(free: U8, ring: F64, site: Site) -> bool:
     """Take the ground of a house if all of it is free."""
     centre = ring.mean(axis=0)
     inner = to_pixels(centre + 0.96 * (ring - centre), site.low, CELL_M)
@@ -124,10 +140,9 @@ def _claim(free: np.ndarray, ring: F64, site: Site) -> bool:  # type: ignore[typ
     return True
 
 
-def _walls(
-    site: Site, starts: F64, ends: F64, base: F64, height: F64, owner: I64, is_front: np.ndarray, style: dict[str, np.ndarray], cells: int, seeds: I64  # type: ignore[type-arg]
-) -> tuple[GaussianCloud, I64]:
+def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells: int, seed: int) -> tuple[GaussianCloud, I64]:
     """Cover walls with ``cells x cells`` Gaussians per bay and floor; returns the cloud and each Gaussian's wall."""
+    starts, ends, base, height, owner, is_front = walls
     length = np.linalg.norm(ends - starts, axis=1)
     bays = np.maximum(np.round(length / BAY_M), 1).astype(np.int64)
     floors = np.maximum(np.round(height / FLOOR_M), 1).astype(np.int64)
@@ -137,7 +152,7 @@ def _walls(
     bay, floor, cu, cv = iu // cells, iv // cells, iu % cells, iv % cells
     house = owner[wall]
     # One number per window, the same at every level of detail.
-    key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seeds[0]) % 2_147_483_647
+    key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seed) % 2_147_483_647
     pick = (key * 48_271 % 2_147_483_647) / 2_147_483_647
     glass = GLASS[np.minimum((pick * pick * 4).astype(np.int64), 3)]
     wide = style["wide"][house]

@@ -10,6 +10,7 @@ line in front of all ground within ``LIFT_M * distance / camera height``, which 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.nodes import SceneNode, nodes_by_tile
@@ -115,20 +116,21 @@ def _leaves(level: I64, floor: int) -> list[Bool | None]:
     return leaves
 
 
-def _flat(site: Site, plan: F64, size_m: F64, rgb: F32, above_m: F64) -> GaussianCloud:
+def _flat(site: Site, plan: F64, size_m: F64, rgb: npt.NDArray[np.floating], above_m: F64) -> GaussianCloud:
     """Lay flat Gaussians on the ground."""
     means, normals = _on_ground(site, plan, above_m)
     quats = upright_quats(normals, site.frame.yaw_rad)
     s = SPREAD * size_m
-    return cloud_of(means, quats, np.stack([s, s, THICKNESS * size_m], axis=1), rgb)
+    return cloud_of(means, quats, np.stack([s, s, THICKNESS * size_m], axis=1), rgb.astype(np.float64))
 
 
 def _on_ground(site: Site, plan: F64, above_m: F64 | float) -> tuple[F64, F64]:
     """Return world points ``(N, 3)`` above the ground and the ground's normals ``(N, 3)``, slopes taken over 2 m."""
     xy = site.frame.to_world(plan)
     z = site.height_at(xy)
-    dx = site.height_at(xy + [1.0, 0.0]) - site.height_at(xy - [1.0, 0.0])
-    dy = site.height_at(xy + [0.0, 1.0]) - site.height_at(xy - [0.0, 1.0])
+    east, north = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    dx = site.height_at(xy + east) - site.height_at(xy - east)
+    dy = site.height_at(xy + north) - site.height_at(xy - north)
     normals = np.stack([-dx / 2, -dy / 2, np.ones_like(z)], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return np.column_stack([xy, z + above_m]), normals
@@ -175,6 +177,6 @@ def _surroundings(site: Site) -> list[SceneNode]:
     outside = np.any((plan < site.low - 0.3 * cell) | (plan > site.low + size + 0.3 * cell), axis=1)
     plan = plan[outside]
     rgb = np.array([0.36, 0.40, 0.26]) * (1 + 0.08 * site.rng("far-field").standard_normal((len(plan), 1)))
-    cloud = _flat(site, plan, np.full(len(plan), cell), rgb.astype(np.float32), np.zeros(len(plan)))
+    cloud = _flat(site, plan, np.full(len(plan), cell), rgb, np.zeros(len(plan)))
     tile = np.floor(plan / 120.0).astype(np.int64)
     return nodes_by_tile("surroundings", [(cell, cloud, tile[:, 1] * 100_000 + tile[:, 0])])

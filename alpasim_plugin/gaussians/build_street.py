@@ -10,7 +10,7 @@ from alpasim_plugin.gaussians.contours import contours, places
 from alpasim_plugin.gaussians.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.site import CELL_M, Site
 from alpasim_plugin.gaussians.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
-from alpasim_plugin.geometry import arc_lengths
+from alpasim_plugin.geometry import arc_lengths, resample
 from alpasim_plugin.types import F64, I64, Bool
 
 KERB_M = 0.12
@@ -82,7 +82,7 @@ def _rails(site: Site) -> list[Item]:
             at.append(xy)
         posts = xy[:: max(1, round(4.0 / step))]
         foot = site.world(posts, 0.0)
-        clouds.append(rods(foot, foot + [0, 0, 0.62], 0.06, np.tile([0.45, 0.46, 0.47], (len(posts), 1)), 0.7))
+        clouds.append(rods(foot, foot + np.array([0, 0, 0.62]), 0.06, np.tile([0.45, 0.46, 0.47], (len(posts), 1)), 0.7))
         at.append(posts)
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(at)))
     return items
@@ -100,8 +100,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
         n = int(arc_lengths(line)[-1] / mean)
         s = (np.arange(n) + rng.uniform(0.1, 0.9, n)) * mean
         if n:
-            at = places(line, 0.5)
-            spots.append(at.xy[np.minimum((s / 0.5).astype(np.int64), len(at.xy) - 1)])
+            spots.append(resample(line, s))
     street = np.concatenate(spots) if spots else np.zeros((0, 2))
     street = street[_free(site, houses, street, 0.6 if not site.highway else 3.0)]
     h, w = site.road.shape
@@ -121,7 +120,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
         crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
         top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
         trunks = rods(foot, top, 0.13, np.tile([0.30, 0.24, 0.19], (m, 1)), 0.5 if count > 100 else 4.0)
-        trunk_owner = np.repeat(np.arange(m), len(trunks) // m) if len(trunks) % m == 0 else _nearest(trunks.means, foot)
+        trunk_owner = _nearest(trunks.means.astype(np.float64), foot)
         items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), at[np.concatenate([owner, trunk_owner])]))
     return items
 
@@ -182,7 +181,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
         return []
     arm = np.concatenate(arms) if arms else at
     foot = site.world(at)
-    top = foot + [0, 0, 6.8]
+    top = foot + np.array([0, 0, 6.8])
     tip = site.world(at + 1.7 * arm)
     tip[:, 2] = top[:, 2] + 0.35
     starts = [foot, top, *[p[:-1] for p in mapped]]
@@ -194,7 +193,9 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
         length = np.linalg.norm(end - start, axis=1)
         poles = rods(start, end, 0.085, np.tile([0.36, 0.38, 0.38], (len(start), 1)), step)
         piece, _, _ = grid_cells(np.maximum(np.round(length / step), 1).astype(np.int64), np.ones(len(start), dtype=np.int64))
-        lamp = cloud_of(tip, np.tile([1.0, 0, 0, 0], (len(tip), 1)), np.tile([0.22, 0.22, 0.07], (len(tip), 1)), np.tile([0.85, 0.85, 0.80], (len(tip), 1)))
+        lamps = len(tip)
+        lamp_scales = np.tile([0.22, 0.22, 0.07], (lamps, 1))
+        lamp = cloud_of(tip, np.tile([1.0, 0, 0, 0], (lamps, 1)), lamp_scales, np.tile([0.85, 0.85, 0.80], (lamps, 1)))
         items.append((cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at])))
     return items
 
@@ -232,6 +233,6 @@ def _signs(site: Site) -> list[Item]:
         if feet:
             posts = rods(np.stack(feet), np.stack(tops), 0.04, np.tile([0.45, 0.46, 0.47], (len(feet), 1)), 3.0)
             clouds.append(posts)
-            where.append(site.frame.to_plan(posts.means))
+            where.append(site.frame.to_plan(posts.means.astype(np.float64)))
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(where)))
     return items

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from alpasim_plugin.gaussians.build_actors import build_actors
@@ -11,7 +9,7 @@ from alpasim_plugin.gaussians.build_facades import build_facades
 from alpasim_plugin.gaussians.build_road import build_road
 from alpasim_plugin.gaussians.build_street import build_street
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.nodes import Level, SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.nodes import nodes_by_tile
 from alpasim_plugin.gaussians.paint import paint_strokes
 from alpasim_plugin.gaussians.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.site import HeightAt, make_site
@@ -61,11 +59,3 @@ def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
     rigid[:3, :3] /= scale
     scaled = GaussianCloud(cloud.means * scale, cloud.quats, cloud.scales * scale, cloud.opacities, cloud.sh)
     return scaled.transformed(rigid)
-
-
-def map_nodes(nodes: tuple[SceneNode, ...], change: Callable[[SceneNode, int, GaussianCloud], GaussianCloud]) -> list[SceneNode]:
-    """Return nodes whose every cloud went through ``change(node, level index, cloud)``."""
-    return [
-        SceneNode(node.name, node.kind, tuple(Level(level.cell_m, change(node, i, level.cloud)) for i, level in enumerate(node.levels)), node.far_m)
-        for node in nodes
-    ]

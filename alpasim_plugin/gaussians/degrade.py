@@ -18,6 +18,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
@@ -85,7 +86,7 @@ class Surrogate:
         length = float(arc_lengths(path)[-1])
         camera = scenario.cameras[0].T_rig_camera[:3, 3] if scenario.cameras else np.array([1.5, 0.0, 1.5])
         self._line = resample(path, np.linspace(0.0, length, max(2, int(length) + 1))) if length > 0 else np.repeat(path[:1], 2, axis=0)
-        self._eyes = self._line + [0.0, 0.0, camera[2]]
+        self._eyes = self._line + np.array([0.0, 0.0, camera[2]])
         self._tree = KDTree(self._line[:, :2])
         self._reach = extended(path, scenario.ego_log.quat[0])
         self._recipes: dict[tuple[str, int], _Recipe] = {}
@@ -120,7 +121,7 @@ class Surrogate:
         rng = stream(self.scenario.scene_id, self.scenario.seed, f"degrade/{node.name}/{level}")
         draw, normal = rng.random((n, 5), dtype=np.float32), rng.standard_normal((n, 3), dtype=np.float32)
         # Depth errors: an own part per Gaussian, a part shared by a neighbourhood, and a few that slide far and become floaters.
-        ray, place = self._rays(cloud.means)
+        ray, place = self._rays(cloud.means.astype(np.float64))
         smooth = _wave(place, self.scenario, "degrade/depth-field")
         own = 0.35 * normal[:, 0] + np.where(draw[:, 0] < 0.12, normal[:, 1], 0.0)
         floater = draw[:, 1] < 0.02 * min(s, 2.0)
@@ -186,7 +187,7 @@ class Surrogate:
         """Return the factors ``(3,)`` of this frame's exposure and white balance."""
         s = self.amount.severity
         off = wander(self.scenario.scene_id, seed, "degrade/exposure", t_us, 4)
-        return np.exp(s * ((0.02 + 0.07 * w) * off[0] + (0.006 + 0.022 * w) * off[1:])).astype(np.float32)
+        return np.asarray(np.exp(s * ((0.02 + 0.07 * w) * off[0] + (0.006 + 0.022 * w) * off[1:])), dtype=np.float32)
 
     def _rays(self, means: F64) -> tuple[F64, F64]:
         """Return, per Gaussian, the vector from its log camera ``(N, 3)`` and its plan position in metres ``(N, 2)``."""
@@ -204,18 +205,18 @@ class Surrogate:
             rest = np.flatnonzero(~seen)
             if len(rest) == 0:
                 break
-            seen[rest] = view.sees(cloud.means[rest], size[rest])
+            seen[rest] = view.sees(cloud.means[rest].astype(np.float64), size[rest])
         return seen
 
 
-def flattened(sh: F32) -> F32:
+def flattened(sh: npt.NDArray[np.floating]) -> F32:
     """Return colours ``(N, 1, 3)`` without view dependence: the mean over the views from outside.
 
     A sheen that grows away from the normal n is ``add * (1 + d . n)``; over the hemisphere of views, weighted by the area seen, ``d . n``
     averages -2/3.
     """
     if sh.shape[1] == 1:
-        return sh
+        return sh.astype(np.float32)
     add = C1 * np.linalg.norm(sh[:, 1:4], axis=1)
     return np.asarray(sh[:, :1] - (2.0 / 3.0) * (add / C0)[:, None, :], dtype=np.float32)
 

@@ -55,10 +55,9 @@ def paint_strokes(site: Site) -> Strokes:
     """Return all paint near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
-    lines = [(line, paint) for line, paint in _painted_edges(site) if np.all(line.max(axis=0) > site.low) and np.all(line.min(axis=0) < high)]
+    lines = [edge for edge in _painted_edges(site) if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)]
     pieces = [_line_strokes(line, paint, phase) for line, paint, phase in _with_phase(lines)]
-    for ring in lane_map.crosswalks:
-        pieces.append(_zebra(site.frame.to_plan(ring)))
+    pieces += [_zebra(site.frame.to_plan(ring)) for ring in lane_map.crosswalks]
     for stop in lane_map.stop_lines:
         line = site.frame.to_plan(stop)
         if len(line) > 1:
@@ -66,9 +65,10 @@ def paint_strokes(site: Site) -> Strokes:
     pieces = [p for p in pieces if len(p.start)]
     if not pieces:
         return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
-    joined = Strokes(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
-    inside = np.all((joined.start > site.low) & (joined.start < high), axis=1)
-    return Strokes(*(column[inside] for column in joined))
+    start, end = np.concatenate([p.start for p in pieces]), np.concatenate([p.end for p in pieces])
+    width_m, colour = np.concatenate([p.width_m for p in pieces]), np.concatenate([p.colour for p in pieces])
+    inside = np.all((start > site.low) & (start < high), axis=1)
+    return Strokes(start[inside], end[inside], width_m[inside], colour[inside])
 
 
 def _painted_edges(site: Site) -> list[tuple[F64, Paint]]:
@@ -103,7 +103,8 @@ def _painted_edges(site: Site) -> list[tuple[F64, Paint]]:
         if edge.paint != "unknown":
             chosen.append((edge.line, edge.paint))
         else:
-            chosen.append(_guess(edge, [(edges[owner[j]], headings[k] @ headings[j]) for k in mine for j in near[k] if owner[j] != i], len(mine)))
+            beside = [(edges[owner[j]], float(headings[k] @ headings[j])) for k in mine for j in near[k] if owner[j] != i]
+            chosen.append(_guess(edge, beside, len(mine)))
     return chosen
 
 
@@ -127,7 +128,7 @@ def _sample(edges: list[_Edge]) -> tuple[I64, F64, F64]:
 
 
 def _guess(edge: _Edge, neighbours: list[tuple[_Edge, float]], n: int) -> tuple[F64, Paint]:
-    """Choose the paint of an edge from the edges that lie on it; ``neighbours`` holds (edge, cosine of the headings) per matching sample."""
+    """Choose the paint of an edge with n samples from the edges on it: (edge, cosine of the two headings) per matching sample."""
     shared = sum(other.side == -edge.side and cosine > 0.8 for other, cosine in neighbours)
     opposing = sum(other.side == edge.side and cosine < -0.8 for other, cosine in neighbours)
     if max(shared, opposing) < 0.4 * n:
@@ -208,4 +209,5 @@ def _zebra(ring: F64) -> Strokes:
 
 def _strokes(start: F64, end: F64, width_m: float, colour: int) -> Strokes:
     n = len(start)
-    return Strokes(np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64), np.full(n, width_m), np.full(n, colour, dtype=np.int64))
+    ends = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    return Strokes(*ends, np.full(n, width_m), np.full(n, colour, dtype=np.int64))

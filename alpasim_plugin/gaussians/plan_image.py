@@ -9,7 +9,7 @@ import numpy as np
 
 from alpasim_plugin.gaussians.paint import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.site import CELL_M, SHIFT_BITS, Site, to_pixels
-from alpasim_plugin.types import F32, F64, I64
+from alpasim_plugin.types import F32, F64, I64, U8
 
 PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
 ASPHALT = (0.335, 0.335, 0.345)
@@ -62,8 +62,8 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
 
     rgb = np.empty((rows, columns, 3), dtype=np.float32)
     rgb[:] = _verge(site, off, grain, texture)
-    asphalt = np.array(ASPHALT, dtype=np.float32) * (1 + texture * (0.10 * grain[..., None] - _wear(site, low, cell_m, (rows, columns))[..., None]))
-    rgb[road] = asphalt[road]
+    tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
+    rgb[road] = (np.array(ASPHALT, dtype=np.float32) * tone[..., None])[road]
     covers = [_coverage(strokes, colour, low, cell_m, (rows, columns)) for colour in (WHITE, YELLOW)]
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
         if cell_m < CELL_M:
@@ -73,9 +73,13 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
         rgb += worn[..., None] * (np.array(PAINT_IMAGE_RGB[colour], dtype=np.float32) - rgb)
 
     painted = (covers[0] + covers[1]) > 0.04
-    near_paint = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * cell_m if painted.any() else np.full_like(off, 1e3)
-    feature = np.minimum(near_paint, edge)
-    cap = np.where(road, np.where(path < 2.5, 0.125, np.where(path < 6.0, 0.25, 0.5)), 0.5) if cell_m < CELL_M else np.clip(0.06 * path, 0.5, 4.0)
+    feature = edge
+    if painted.any():
+        feature = np.minimum(edge, cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * cell_m)
+    if cell_m < CELL_M:
+        cap = np.where(road & (path < 2.5), 0.125, np.where(road & (path < 6.0), 0.25, 0.5))
+    else:
+        cap = np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
     return PlanImage(cell_m, low, np.clip(rgb, 0, 1), (~road).astype(np.float32), level)
@@ -131,13 +135,13 @@ def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
             points = to_pixels(line + side * left, low, cell_m)
             cv2.polylines(dark, [points], False, 26, max(1, round(0.6 / cell_m)), cv2.LINE_8, SHIFT_BITS)
         cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, 14, max(1, round(0.4 / cell_m)), cv2.LINE_8, SHIFT_BITS)
-    dark = cv2.GaussianBlur(dark, (0, 0), max(0.2 / cell_m, 0.5))
+    soft: U8 = cv2.GaussianBlur(dark, (0, 0), max(0.2 / cell_m, 0.5))
     if cell_m < CELL_M:
-        _patches_and_cracks(site, dark, low, cell_m)
-    return dark.astype(np.float32) / 255.0
+        _patches_and_cracks(site, soft, low, cell_m)
+    return np.asarray(soft.astype(np.float32) / 255.0)
 
 
-def _patches_and_cracks(site: Site, dark: np.ndarray, low: F64, cell_m: float) -> None:  # type: ignore[type-arg]
+def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
     rng = site.rng("cracks")
     path = site.path
     for _ in range(max(2, len(path) // 12)):
@@ -169,4 +173,4 @@ def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tup
     gain = np.minimum(1.0, width / cell_m)
     for ring, share in zip(to_pixels(rings.reshape(-1, 2), low, cell_m).reshape(-1, 4, 2), gain, strict=True):
         cv2.fillConvexPoly(mask, ring, int(255 * share), cv2.LINE_AA if share == 1.0 else cv2.LINE_8, SHIFT_BITS)
-    return mask.astype(np.float32) / 255.0
+    return np.asarray(mask.astype(np.float32) / 255.0)

@@ -111,7 +111,7 @@ class Site:
         h, w = raster.shape
         return raster[np.clip(ij[:, 1], 0, h - 1), np.clip(ij[:, 0], 0, w - 1)]
 
-    def world(self, plan: F64, above_m: npt.ArrayLike = 0.0) -> F64:
+    def world(self, plan: F64, above_m: float | F64 = 0.0) -> F64:
         """Return world points ``(N, 3)`` standing ``above_m`` over the ground at plan points ``(N, 2)``."""
         xy = self.frame.to_world(plan)
         return np.column_stack([xy, self.height_at(xy) + above_m])
@@ -154,9 +154,8 @@ def make_site(scenario: Scenario, height_at: HeightAt) -> Site:
     # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
     junction = _fill(shape, low, frame, _lane_rings([lane for lane in near if lane.is_intersection]))
-    return Site(
-        scenario, height_at, frame, low, path, road.astype(bool), junction.astype(bool), _taken(scenario, frame, low, shape), _is_highway(scenario, near)
-    )
+    taken = _taken(scenario, frame, low, shape)
+    return Site(scenario, height_at, frame, low, path, road.astype(bool), junction.astype(bool), taken, _is_highway(scenario, near))
 
 
 def _path(scenario: Scenario) -> F64:
@@ -171,7 +170,6 @@ def _path(scenario: Scenario) -> F64:
         line = np.concatenate([log, route[(s > s[end] + 0.5) & (s < s[end] + 40.0)]])
         length = float(arc_lengths(line)[-1])
     if length < 1.0:
-        forward = np.array([np.cos(0.0), 0.0, 0.0])
         q = scenario.ego_log.quat[0]
         forward = np.array([1 - 2 * (q[2] ** 2 + q[3] ** 2), 2 * (q[1] * q[2] + q[0] * q[3]), 0.0])
         line, length = np.stack([log[0], log[0] + 2.0 * forward]), 2.0
@@ -185,9 +183,8 @@ def _touches(plan: F64, low: F64, high: F64) -> bool:
 def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
     rings: list[F64] = []
     for lane in lanes:
-        for part in shapely.get_parts(lane_polygon(lane)):
-            if shapely.get_dimensions(part) == 2 and not shapely.is_empty(part):
-                rings.append(shapely.get_coordinates(shapely.get_exterior_ring(part)))
+        areas = [p for p in shapely.get_parts(lane_polygon(lane)) if shapely.get_dimensions(p) == 2 and not shapely.is_empty(p)]
+        rings += [shapely.get_coordinates(shapely.get_exterior_ring(area)) for area in areas]
     return rings
 
 

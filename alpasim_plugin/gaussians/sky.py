@@ -72,11 +72,11 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     elevation = np.linspace(HIGH_RAD, LOW_RAD, HEIGHT)
     up = np.clip(elevation / HIGH_RAD, 0, 1)
     t = np.clip(up / 0.35, 0, 1)[:, None]
-    column = np.where(up[:, None] < 0.35, horizon * (1 - t) + middle * t, middle + (zenith - middle) * np.clip((up[:, None] - 0.35) / 0.65, 0, 1))
+    high = np.clip((up - 0.35) / 0.65, 0, 1)[:, None]
+    column = np.where(up[:, None] < 0.35, horizon * (1 - t) + middle * t, middle + (zenith - middle) * high)
     image = np.repeat(column[:, None, :], WIDTH, axis=1)
-    noise = sum(
-        weight * _periodic_noise(rng, rows, columns) for rows, columns, weight in ((4, 12, 0.5), (9, 26, 0.3), (20, 60, 0.15), (44, 130, 0.08))
-    )
+    octaves = ((4, 12, 0.5), (9, 26, 0.3), (20, 60, 0.15), (44, 130, 0.08))
+    noise = np.sum([weight * _periodic_noise(rng, rows, columns) for rows, columns, weight in octaves], axis=0)
     # Clouds are seen flatter towards the horizon and vanish in its haze.
     threshold = np.quantile(noise, 1 - _CLOUD_SHARE[kind])
     cover = np.clip((noise - threshold) / 0.45, 0, 1) * np.clip((up[:, None] - 0.05) / 0.15, 0, 1)

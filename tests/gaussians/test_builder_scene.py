@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.gaussians.build_actors import build_actor
+from alpasim_plugin.gaussians.builder import build_scene, placed_cloud, with_background
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.contours import contours
+from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.site import make_site
+from alpasim_plugin.geometry import quat_from_yaw, se3
+from alpasim_plugin.types import Environment, LaneMap, Route, Scenario, Trajectory
+from alpasim_plugin.world.ground import height_at
+from tests.gaussians.scene_maps import STREET_ACTORS, camera_spec, crossing, curve, line, make_scenario, road_lanes, straight
+
+
+def built(scenario: Scenario) -> SceneGraph:
+    return build_scene(scenario, partial(height_at, scenario.ground))
+
+
+def view(scenario: Scenario, index: int, left_m: float = 0.0, width: int = 256, height: int = 144) -> PinholeCamera:
+    T = se3(scenario.ego_log.xyz[index], scenario.ego_log.quat[index])
+    T[:3, 3] += left_m * T[:3, 1]
+    spec = camera_spec(width, height)
+    return PinholeCamera.from_pose(width, height, spec.K, T @ spec.T_rig_camera)
+
+
+def digest(graph: SceneGraph) -> bytes:
+    nodes = (*graph.background, *graph.actors.values())
+    return b"".join(a.tobytes() for n in nodes for lv in n.levels for a in (lv.cloud.means, lv.cloud.quats, lv.cloud.scales, lv.cloud.sh))
+
+
+@pytest.fixture(scope="module")
+def street() -> tuple[Scenario, SceneGraph]:
+    scenario = straight()
+    return scenario, built(scenario)
+
+
+def test_same_scenario_builds_bit_identical_gaussians(street: tuple[Scenario, SceneGraph]) -> None:
+    assert digest(street[1]) == digest(built(straight()))
+
+
+def test_another_scene_seed_builds_another_scene(street: tuple[Scenario, SceneGraph]) -> None:
+    assert digest(street[1]) != digest(built(straight(seed=1)))
+
+
+def test_every_gaussian_can_be_drawn(street: tuple[Scenario, SceneGraph]) -> None:
+    for node in (*street[1].background, *street[1].actors.values()):
+        for level in node.levels:
+            level.cloud.require_drawable(node.name)
+
+
+@lru_cache(maxsize=3)
+def empty_street(make: Callable[..., Scenario]) -> tuple[Scenario, SceneGraph]:
+    scenario = make(actors=())
+    return scenario, built(scenario)
+
+
+@pytest.mark.parametrize("make", [straight, curve, crossing])
+@pytest.mark.parametrize("left_m", [0.0, 3.0])
+def test_ground_has_no_holes_from_the_path_or_three_metres_aside(make: Callable[..., Scenario], left_m: float) -> None:
+    scenario, graph = empty_street(make)
+    n = len(scenario.ego_log)
+    for index in (0, n // 2, n - 1):
+        alpha = graph.render(view(scenario, index, left_m), {}).alpha[90:]
+        assert alpha.min() > 0.8
+        assert np.mean(alpha < 0.93) < 0.01
+
+
+def test_lane_lines_are_brighter_than_the_asphalt_beside_them(street: tuple[Scenario, SceneGraph]) -> None:
+    scenario, graph = street
+    camera = view(scenario, 2, width=480, height=272)
+    image = graph.render(camera, {}).rgb
+    eye = camera.centre_world
+
+    def seen(y_m: float, ahead_m: float) -> np.ndarray:
+        p = camera.T_camera_world[:3, :3] @ np.array([eye[0] + ahead_m, y_m, 0.0]) + camera.T_camera_world[:3, 3]
+        return np.asarray(image[int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)])
+
+    for ahead in (10.0, 13.0, 17.0):
+        edge, lane, centre = seen(-7.0, ahead), seen(-1.8, ahead), seen(0.14, ahead)
+        assert edge.min() > lane.max() + 0.15  # the white line at the right edge
+        assert centre[0] > centre[2] + 0.15  # the yellow line between the directions
+        assert np.ptp(lane) < 0.06
+
+
+def test_coarser_levels_of_the_road_look_like_the_finer_ones(street: tuple[Scenario, SceneGraph]) -> None:
+    scenario, graph = street
+    camera = view(scenario, 2)
+    fine = SceneGraph(graph.background, [], graph.sky, cell_px=1.0).render(camera, {}).rgb
+    usual = graph.render(camera, {}).rgb
+    assert np.sqrt(np.mean((fine - usual) ** 2)) < 0.05
+
+
+def test_houses_leave_road_actors_and_each_other_alone() -> None:
+    scenario = straight(environment=Environment(buildings=1.0))
+    site = make_site(scenario, partial(height_at, scenario.ground))
+    graph = built(scenario)
+    walls = [n for n in graph.background if n.name.startswith("house")]
+    assert len(walls) > 8
+    for node in walls:
+        plan = site.frame.to_plan(node.levels[0].cloud.means)
+        assert site.look_up(site.off_road_m, plan).min() > 1.5
+        assert not site.look_up(site.taken, plan).any()
+
+
+def test_environment_without_houses_trees_and_poles_builds_none() -> None:
+    scenario = straight(environment=Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0))
+    kinds = {n.name.split("/")[0] for n in built(scenario).background}
+    assert kinds == {"ground", "far-ground", "paint", "surroundings", "kerb"}
+
+
+def test_everything_follows_a_sloping_ground() -> None:
+    scenario = curve()
+    for node in built(scenario).background:
+        if node.name.startswith(("ground/", "paint/")):
+            means = node.levels[0].cloud.means
+            above = means[:, 2] - height_at(scenario.ground, means)
+            assert above.min() > -0.01
+            assert above.max() < 0.14
+
+
+def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
+    shift = np.array([4.0e5, -3.0e5, 0.0])
+    near = straight(actors=())
+    lanes = {}
+    for k, v in near.lane_map.lanes.items():
+        assert v.left is not None
+        assert v.right is not None
+        lanes[k] = replace(v, centre=v.centre + shift, left=v.left + shift, right=v.right + shift)
+    moved = {name: tuple(c + shift for c in getattr(near.lane_map, name)) for name in ("crosswalks", "stop_lines")}
+    far = replace(
+        near,
+        lane_map=LaneMap(lanes, **moved),
+        ego_log=replace(near.ego_log, xyz=near.ego_log.xyz + shift),
+        route=Route(near.route.xyz + shift),
+    )
+    a, b = built(near).render(view(near, 5), {}), built(far).render(view(far, 5), {})
+    assert np.abs(a.rgb - b.rgb).mean() < 1e-3
+
+
+def test_parked_log_of_one_pose_still_gives_a_scene() -> None:
+    base = straight(actors=())
+    log = Trajectory(np.array([0]), base.ego_log.xyz[:1], base.ego_log.quat[:1])
+    scenario = replace(base, ego_log=log, route=Route(base.ego_log.xyz[:1]), end_us=0)
+    assert built(scenario).render(view(scenario, 0), {}).alpha[100:].min() > 0.8
+
+
+def test_map_without_edges_gets_a_road_around_its_centres() -> None:
+    lanes = {k: replace(v, left=None, right=None) for k, v in road_lanes(line((-20, 0), (120, 0)), "r", 1).items()}
+    scenario = make_scenario(LaneMap(lanes), line((0, -1.8), (60, -1.8)))
+    site = make_site(scenario, partial(height_at, scenario.ground))
+    on = site.look_up(site.road, site.frame.to_plan(np.array([[20.0, -1.8], [20.0, 1.8], [20.0, 12.0]])))
+    assert on.tolist() == [True, True, False]
+    assert built(scenario).render(view(scenario, 3), {}).alpha[100:].min() > 0.8
+
+
+def test_empty_map_gives_a_road_under_the_logged_path() -> None:
+    scenario = make_scenario(LaneMap({}), line((0, 0), (50, 0)))
+    site = make_site(scenario, partial(height_at, scenario.ground))
+    assert site.look_up(site.road, site.path).all()
+    assert built(scenario).render(view(scenario, 3), {}).stats["visible"] > 1000
+
+
+def test_roadside_lines_have_the_road_on_their_left() -> None:
+    site = make_site(straight(), lambda xy: np.zeros(len(xy)))
+    for c in contours(site, 2.0, 40.0):
+        d = np.gradient(c, axis=0)
+        left = np.stack([-d[:, 1], d[:, 0]], axis=1) / np.linalg.norm(d, axis=1, keepdims=True)
+        assert site.look_up(site.off_road_m, c + left).mean() < site.look_up(site.off_road_m, c - left).mean()
+
+
+def test_actor_fills_its_box_and_stays_inside(street: tuple[Scenario, SceneGraph]) -> None:
+    for actor in STREET_ACTORS:
+        cloud = street[1].actors[actor.actor_id].levels[0].cloud
+        half = np.array([actor.box.length_m, actor.box.width_m, actor.box.height_m]) / 2
+        low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+        assert np.all(low > -half - np.array([0.1, 0.15, 0.05]))
+        assert np.all(high < half + np.array([0.1, 0.15, 0.05]))
+        assert high[2] - low[2] > 1.4 * half[2]
+
+
+def test_actors_of_one_scene_differ_in_colour_and_keep_it(street: tuple[Scenario, SceneGraph]) -> None:
+    models = {seed: [build_actor(a, "test", seed) for a in STREET_ACTORS[:2]] for seed in range(5)}
+    colours = {tuple(np.median(m.levels[0].cloud.sh[:, 0], axis=0).round(3)) for pair in models.values() for m in pair}
+    assert len(colours) >= 4
+    again = build_actor(STREET_ACTORS[0], "test", 0)
+    np.testing.assert_array_equal(again.levels[0].cloud.sh, street[1].actors["car-1"].levels[0].cloud.sh)
+
+
+def test_file_background_is_scaled_turned_and_cut_into_blocks(street: tuple[Scenario, SceneGraph]) -> None:
+    cloud = street[1].actors["bus-1"].levels[0].cloud
+    T = np.eye(4)
+    T[:3, :3] = 2.0 * se3([0, 0, 0], quat_from_yaw(0.5))[:3, :3]
+    T[:3, 3] = (30.0, 5.0, 3.0)
+    placed = placed_cloud(cloud, T)
+    np.testing.assert_allclose(placed.means, cloud.means @ T[:3, :3].T + T[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(placed.scales, 2.0 * cloud.scales, rtol=1e-6)
+    graph = with_background(street[1], cloud, T)
+    assert sum(len(n.levels[0].cloud) for n in graph.background) == len(cloud)
+    assert len(graph.background) > 1
+    assert set(graph.actors) == set(street[1].actors)
+
+

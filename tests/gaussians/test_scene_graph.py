@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.errors import RendererError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.nodes import Level, SceneNode, split_by_tile
+from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.scene_graph import SceneGraph, in_view
+from alpasim_plugin.gaussians.sh import dc_from_rgb
+from alpasim_plugin.gaussians.sky import make_sky
+from alpasim_plugin.geometry import quat_from_yaw, se2, se3
+from alpasim_plugin.seeding import stream
+from tests.gaussians.scene_maps import camera_spec, straight
+
+SKY = make_sky("clear", stream("t", 0, "sky"))
+
+
+def camera(width: int = 64, height: int = 48, T_world_rig: np.ndarray | None = None) -> PinholeCamera:
+    spec = camera_spec(width, height)
+    return PinholeCamera.from_pose(width, height, spec.K, (np.eye(4) if T_world_rig is None else T_world_rig) @ spec.T_rig_camera)
+
+
+def blobs(centre: tuple[float, float, float], n: int = 40, seed: int = 0, sheen: bool = False) -> GaussianCloud:
+    rng = np.random.default_rng(seed)
+    sh = np.zeros((n, 4, 3)) if sheen else np.zeros((n, 1, 3))
+    sh[:, 0] = dc_from_rgb(rng.random((n, 3)))
+    if sheen:
+        sh[:, 1:] = rng.normal(0, 0.3, (n, 3, 3))
+    means, quats = np.array(centre) + rng.normal(0, 0.8, (n, 3)), rng.normal(size=(n, 4))
+    return GaussianCloud(means, quats, 0.3 * rng.random((n, 3)), np.full(n, 0.8), sh)
+
+
+def node(name: str, cloud: GaussianCloud, kind: str = "background", far_m: float = 1e9) -> SceneNode:
+    return SceneNode(name, kind, (Level(0.1, cloud),), far_m)
+
+
+def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud() -> None:
+    background = [node(f"b{i}", blobs((8 + 4 * i, 3 - 2 * i, 1.0), n=12, seed=i)) for i in range(4)]
+    graph = SceneGraph(background, [node("car", blobs((0, 0, 0), n=12, seed=9, sheen=True), "actor")], SKY)
+    poses = {"car": se2(9.0, -0.5, 0.7, 1.2)}
+    view = camera()
+    fast = graph.render(view, poses)
+    slow = rasterize_reference(graph.cloud_for(view, poses), view, SKY.image(view))
+    assert np.abs(fast.rgb - slow.rgb).max() <= 1.5 / 255
+    assert np.abs(fast.alpha - slow.alpha).max() < 5e-3
+
+
+def test_actor_at_identity_equals_the_same_gaussians_in_the_background() -> None:
+    cloud = blobs((9, 0, 1.3), sheen=True)
+    view = camera()
+    as_actor = SceneGraph([], [node("a", cloud, "actor")], SKY).render(view, {"a": np.eye(4)})
+    as_background = SceneGraph([node("a", cloud)], [], SKY).render(view, {})
+    np.testing.assert_allclose(as_actor.rgb, as_background.rgb, atol=1e-6)
+
+
+def test_camera_and_actor_turned_together_see_the_same_image() -> None:
+    cloud = blobs((0, 0, 0.5), sheen=True)
+    graph = SceneGraph([], [node("a", cloud, "actor")], SKY)
+    move = se3([300.0, -70.0, 4.0], quat_from_yaw(2.3))
+    still = graph.render(camera(), {"a": se2(8, 0, 0.3)})
+    moved = graph.render(camera(T_world_rig=move), {"a": move @ se2(8, 0, 0.3)})
+    covered = still.alpha > 0.98  # the sky behind does not turn
+    assert covered.any()
+    np.testing.assert_allclose(still.alpha, moved.alpha, atol=2e-4)
+    np.testing.assert_allclose(still.rgb[covered], moved.rgb[covered], atol=0.02)
+
+
+def test_world_frame_colours_stay_while_the_actor_turns() -> None:
+    sheen = blobs((0, 0, 0.5), sheen=True)
+    turned = {"a": se2(8, 0, np.pi)}
+    in_object = SceneGraph([], [node("a", sheen, "actor")], SKY, "object").render(camera(), turned).rgb
+    in_world = SceneGraph([], [node("a", sheen, "actor")], SKY, "world").render(camera(), turned).rgb
+    assert np.abs(in_object - in_world).max() > 0.05
+
+
+def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image() -> None:
+    ahead, behind = node("ahead", blobs((10, 0, 1))), node("behind", blobs((-30, 0, 1), seed=3))
+    both, one = SceneGraph([ahead, behind], [], SKY).render(camera(), {}), SceneGraph([ahead], [], SKY).render(camera(), {})
+    np.testing.assert_array_equal(both.rgb, one.rgb)
+    assert both.stats["nodes"] == 1
+    assert both.stats["nodes_total"] == 2
+
+
+def test_node_beyond_its_far_limit_is_not_drawn() -> None:
+    graph = SceneGraph([node("paint", blobs((60, 0, 1)), far_m=20.0)], [], SKY)
+    assert graph.render(camera(), {}).stats["nodes"] == 0
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.tuples(*[st.floats(-30, 30)] * 3), st.floats(0.0, 5.0), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(-np.pi, np.pi))
+def test_sphere_with_a_visible_point_is_always_in_view(
+    centre: tuple[float, float, float], radius: float, inside: tuple[float, float, float], yaw: float
+) -> None:
+    view = camera(T_world_rig=se2(1.0, -2.0, yaw))
+    point = np.array(centre) + radius * np.array(inside) / max(1.0, float(np.linalg.norm(inside)))
+    x, y, z = view.T_camera_world[:3, :3] @ point + view.T_camera_world[:3, 3]
+    visible = z > 0.1 and 0 <= view.fx * x / z + view.cx <= view.width and 0 <= view.fy * y / z + view.cy <= view.height
+    assert not visible or bool(in_view(view, np.array([centre]), np.array([radius]))[0])
+
+
+def test_farther_nodes_use_coarser_levels() -> None:
+    levels = tuple(Level(cell, blobs((0, 0, 0.5), n=n)) for cell, n in ((0.1, 64), (0.4, 16), (1.6, 4)))
+    graph = SceneGraph([], [SceneNode("a", "actor", levels)], SKY)
+    drawn = [graph.render(camera(), {"a": se2(x, 0, 0)}).stats["gaussians"] for x in (6.0, 20.0, 400.0)]
+    assert drawn == [64, 16, 4]
+
+
+def test_pose_of_an_actor_without_a_model_is_an_error() -> None:
+    graph = SceneGraph([], [node("a", blobs((0, 0, 0)), "actor")], SKY)
+    with pytest.raises(RendererError, match="actor 'b' has no model") as caught:
+        graph.render(camera(), {"b": np.eye(4)})
+    assert "scenario's own actors" in str(caught.value)
+
+
+def test_sky_is_not_in_alpha_unless_asked_for() -> None:
+    graph = SceneGraph([], [], SKY)
+    out = graph.render(camera(), {})
+    assert out.alpha.max() == 0
+    assert out.rgb.min() > 0.1
+    assert graph.render(camera(), {}, sky_in_alpha=True).alpha.min() == 1
+
+
+def test_sky_has_no_seam_where_the_azimuth_wraps() -> None:
+    for yaw in (0.0, np.pi):  # the panorama's first column, and the jump of arctan2, lie at the image's centre
+        step = np.abs(np.diff(SKY.image(camera(256, 96, se2(0, 0, yaw))), axis=1)).max(axis=(0, 2))
+        assert step[124:131].max() < 1.5 * np.delete(step, slice(124, 131)).max() + 0.01
+
+
+def test_same_sky_seen_while_turning_moves_across_the_image() -> None:
+    a, b = SKY.image(camera(256, 96)), SKY.image(camera(256, 96, se2(0, 0, 0.2)))
+    assert np.abs(a - b).max() > 0.02  # clouds and hills moved
+    np.testing.assert_array_equal(SKY.image(camera(256, 96, se2(50, 9, 0.2))), b)  # and do not depend on where one stands
+
+
+def test_splitting_by_tile_loses_nothing() -> None:
+    cloud = blobs((0, 0, 0), n=101)
+    tile = np.floor(cloud.means[:, 0]).astype(np.int64)
+    parts = split_by_tile(cloud, tile)
+    assert sum(len(p) for p in parts.values()) == 101
+    for i, part in parts.items():
+        assert np.all(np.floor(part.means[:, 0]) == i)
+
+
+def test_visible_count_of_a_street_stays_within_budget() -> None:
+    from alpasim_plugin.gaussians.builder import build_scene
+
+    scenario = straight()
+    graph = build_scene(scenario, lambda xy: np.zeros(len(xy)))
+    poses = {a.actor_id: se3(a.track.xyz[0], a.track.quat[0]) for a in scenario.actors}
+    small = graph.render(camera(256, 144, se2(10, -1.8, 0)), poses).stats["visible"]
+    large = graph.render(camera(480, 272, se2(10, -1.8, 0)), poses).stats["visible"]
+    assert 15_000 < small < large < 130_000
