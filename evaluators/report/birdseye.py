@@ -20,6 +20,7 @@ from evaluators.report.numbers import fixed
 from evaluators.report.run_folder import Rollout, Series
 
 F64 = npt.NDArray[np.float64]
+Arms = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
 STRAY_M = 40.0  # how far from the log's bounds the view follows a rollout
@@ -142,7 +143,7 @@ def scene_view(
     content: Mapping[str, Any],
     rollouts: Sequence[Rollout],
     series: Series,
-    arm_of: Mapping[tuple[str, str], tuple[int, int]],
+    arm_of: Arms,
 ) -> SceneView | None:
     """Lay out one scene.
 
@@ -229,7 +230,7 @@ def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
     return "".join(drawn)
 
 
-def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], arm_of: Mapping[tuple[str, str], tuple[int, int]], label: str) -> Mark:
+def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], arm_of: Arms, label: str) -> Mark:
     arm = arm_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
     when = f"at {fixed(event.t_s, 1)}\u00a0s" if event.t_s is not None else "at a time that no step shows"
     if event.x_m is None or event.y_m is None:
@@ -248,7 +249,7 @@ def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], arm_of: Mappi
     return Mark(arm, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint)
 
 
-def _offset_chart(rollouts: Sequence[Rollout], series: Series, arm_of: Mapping[tuple[str, str], tuple[int, int]], label: Any) -> OffsetChart | None:
+def _offset_chart(rollouts: Sequence[Rollout], series: Series, arm_of: Arms, label: Any) -> OffsetChart | None:
     own = {r.cell: series[r.cell]["lateral_offset_m"] for r in rollouts if "lateral_offset_m" in series.get(r.cell, {})}
     if not own:
         return None

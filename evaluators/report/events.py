@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from evaluators.report.run_folder import Rollout, Run, Series, series_by_cell
+from evaluators.report.run_folder import Own, Rollout, Run, Series, series_by_cell
 
 COLLISION = ("collision_any", "collision_at_fault", "collision_front", "collision_lateral", "collision_rear")
 SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}
@@ -60,18 +60,18 @@ def events_of(rollout: Rollout, series: Series) -> list[Event]:
     return found
 
 
-def _event(kind: Literal["collision", "offroad"], rollout: Rollout, own: dict, metrics: list[str]) -> Event:  # type: ignore[type-arg]
+def _event(kind: Literal["collision", "offroad"], rollout: Rollout, own: Own, metrics: list[str]) -> Event:
     firsts = {m: t for m in metrics if (t := _first(own, m)) is not None}
     side = next((SIDES[m] for m in metrics if m in SIDES), "")
     if not firsts:
         return Event(kind, rollout, side=side)
     t_us = min(firsts.values())
     zero_us = min(int(t[0]) for t, _ in own.values())
-    pose = [_at(own, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad")]
-    return Event(kind, rollout, (t_us - zero_us) * 1e-6, *pose, side=side)
+    x_m, y_m, yaw_rad = (_at(own, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad"))
+    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side)
 
 
-def _first(own: dict, metric: str) -> int | None:  # type: ignore[type-arg]
+def _first(own: Own, metric: str) -> int | None:
     if metric not in own:
         return None
     t_us, value = own[metric]
@@ -82,7 +82,7 @@ def _first(own: dict, metric: str) -> int | None:  # type: ignore[type-arg]
     return int(t_us[int(np.argmax(hit))]) if hit.any() else None
 
 
-def _at(own: dict, name: str, t_us: int) -> float | None:  # type: ignore[type-arg]
+def _at(own: Own, name: str, t_us: int) -> float | None:
     if name not in own or not own[name][0].size:
         return None
     times, values = own[name]

@@ -20,7 +20,10 @@ def write_whole(path: Path, text: str) -> None:
         temporary.replace(path)
     except OSError as error:
         raise InfrastructureError(
-            "writing a report", str(path), error.strerror or str(error), "free disk space or make the folder writable, then run simrun report"
+            "writing a report",
+            str(path),
+            error.strerror or str(error),
+            "free disk space or make the folder writable, then run simrun report",
         ) from error
     finally:
         temporary.unlink(missing_ok=True)

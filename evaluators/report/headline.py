@@ -64,7 +64,11 @@ def find(run: Run) -> Finding:
         tone = next(t for t in order if t in tones)
         return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, _cautions(run))
     alone = tuple(Point(arm, "neutral", _alone(run, arm)) for arm in run.arms)
-    title = f"{alone[0].name} \u2013 {alone[0].text}" if len(alone) == 1 else f"{plural(len(alone), 'renderer')} driven, none compared with another"
+    title = (
+        f"{alone[0].name} \u2013 {alone[0].text}"
+        if len(alone) == 1
+        else f"{plural(len(alone), 'renderer')} driven, none compared with another"
+    )
     return Finding(title, "neutral", alone if len(alone) > 1 else (), _cautions(run))
 
 

@@ -12,15 +12,19 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from evaluators.report import sections, tables
+from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.charts import drift_charts
 from evaluators.report.events import events_of, read_series
+from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.files import write_whole
 from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
+from evaluators.report.provenance import provenance
 from evaluators.report.run_folder import Run, Series, read_run
+from evaluators.report.scene_table import SCENE_METRICS, scene_rows
+from evaluators.report.speed import speed
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
@@ -69,8 +73,8 @@ def context(run: Run) -> dict[str, Any]:
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     pairs = tables.pair_rows(run.summary)
-    scene_rows, more_scene_rows = sections.scene_rows(run)
-    failures, more_failures = sections.failure_rows(run)
+    by_scene, more_scene_rows = scene_rows(run)
+    failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
     return {
         "run": run,
@@ -92,16 +96,16 @@ def context(run: Run) -> dict[str, Any]:
         "views_left_out": no_view,
         "strips": strips,
         "strips_left_out": no_strip,
-        "speed": sections.speed(run),
-        "scene_rows": scene_rows,
+        "speed": speed(run),
+        "scene_rows": by_scene,
         "more_scene_rows": more_scene_rows,
-        "scene_metrics": sections.SCENE_METRICS,
+        "scene_metrics": SCENE_METRICS,
         "failures": failures,
         "more_failures": more_failures,
-        "ledger": sections.ledger(run, LEDGER_RATES),
-        "ledger_columns": sections.LEDGER_COLUMNS,
+        "ledger": ledger(run, LEDGER_RATES),
+        "ledger_columns": LEDGER_COLUMNS,
         "ledger_rates": LEDGER_RATES,
-        "provenance": sections.provenance(run),
+        "provenance": provenance(run),
     }
 
 

@@ -67,7 +67,9 @@ def _suite_name(run: Run) -> str:
 
 def _case(suite: ET.Element, rollout: Rollout) -> None:
     name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
-    case = ET.SubElement(suite, "testcase", {"classname": clean(rollout.scene), "name": clean(name), "time": f"{rollout.wall_s or 0.0:.3f}"})
+    case = ET.SubElement(
+        suite, "testcase", {"classname": clean(rollout.scene), "name": clean(name), "time": f"{rollout.wall_s or 0.0:.3f}"}
+    )
     values = {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()} if rollout.ok else {}
     _properties(case, {"path": rollout.path, **values} if rollout.path else values)
     if not rollout.ok:

@@ -187,7 +187,8 @@ class Run:
         return {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
 
 
-Series = dict[tuple[str, str, str, int], dict[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]]
+Own = dict[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]  # metric -> (t_us (T,), value (T,)) of one rollout
+Series = dict[tuple[str, str, str, int], Own]
 
 
 def series_by_cell(table: pa.Table) -> Series:

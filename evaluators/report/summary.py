@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from evaluators.report import sections, tables
+from evaluators.report import tables
+from evaluators.report.failures import failure_rows
 from evaluators.report.files import write_whole
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell
-from evaluators.report.run_folder import Run, read_run
+from evaluators.report.provenance import provenance
+from evaluators.report.run_folder import Rollout, Run, read_run
+from evaluators.report.speed import speed
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
 CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
@@ -44,20 +47,17 @@ def summary_md(run: Run) -> str:
         head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
         body = [[p.arm, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs]
         parts.append(f"\n### Paired differences from {escape(pairs[0].baseline)}\n\n{table(head, body)}")
-    speed = sections.speed(run)
-    if speed.rows:
-        head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *speed.stages]
-        body = [[r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)] for r in speed.rows]
-        parts.append(f"\n### Speed\n\n{table(head, body)}" + (f"{escape(speed.pool)}\n" if speed.pool else ""))
-    failures, more = sections.failure_rows(run)
+    times = speed(run)
+    if times.rows:
+        head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *times.stages]
+        body = [[r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)] for r in times.rows]
+        parts.append(f"\n### Speed\n\n{table(head, body)}" + (f"{escape(times.pool)}\n" if times.pool else ""))
+    failures, more = failure_rows(run)
     if failures:
         head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
-        body = [
-            [f.rollout.failure_class, f.rollout.renderer, f.rollout.policy, f.rollout.scene, str(f.rollout.seed), "; ".join(f"{k}: {v}" for k, v in f.parts)]
-            for f in failures
-        ]
+        body = [[*_key(f.rollout), "; ".join(f"{label}: {text}" for label, text in f.parts)] for f in failures]
         parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
-    command = sections.provenance(run).command
+    command = provenance(run).command
     parts.append(f"\n### Made with\n\n```\n{command.replace('```', '')}\n```\n")
     return "".join(parts)
 
@@ -82,6 +82,10 @@ def cut(text: str, limit: int = MAX_BYTES) -> str:
         return text
     kept = data[: limit - len(CUT_NOTE.encode())]
     return kept[: kept.rfind(b"\n") + 1].decode() + CUT_NOTE
+
+
+def _key(rollout: Rollout) -> list[str]:
+    return [rollout.failure_class, rollout.renderer, rollout.policy, rollout.scene, str(rollout.seed)]
 
 
 def _label(name: str, unit: str, arrow: str) -> str:

@@ -193,7 +193,8 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
     tail = f"\u00a0{unit}" if unit else ""
     note = _pair_note(entry)
     reason = str(entry.get("reason") or "")
-    diff_cell, bounds_cell = missing(reason or "no pair has this metric valid on both sides"), missing(reason or "it needs at least two scenes")
+    diff_cell = missing(reason or "no pair has this metric valid on both sides")
+    bounds_cell = missing(reason or "it needs at least two scenes")
     span = None
     if diff is not None:
         ends = bounds or ()
@@ -203,7 +204,8 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
             low, high = (fixed(v * scale, places, sign=True) for v in bounds)
             bounds_cell = Cell(f"{low} to {high}", note, sort=bounds[1] - bounds[0])
             reach = max(abs(bounds[0]), abs(bounds[1]), abs(diff)) or 1.0
-            span = Span(*(round(50 + 46 * v / reach, 2) for v in (diff, *bounds)), zero=50.0)
+            at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds)]
+            span = Span(at[0], at[1], at[2], zero=50.0)
     p = finite(entry.get("p_value"))
     p_cell = missing(reason or "no test was made") if p is None else Cell(_p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)

@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -29,6 +30,11 @@ FLAGS = (
     "--remote-debugging-pipe",
 )
 PATIENCE_S = 60.0
+# The browser reads commands from descriptor 3 and answers on 4; the pipes may themselves have those numbers, so they move up first.
+LAUNCH = (
+    "import fcntl, os, sys; r, w = (fcntl.fcntl(int(a), fcntl.F_DUPFD, 10) for a in sys.argv[1:3]); "
+    "os.dup2(r, 3); os.dup2(w, 4); os.execv(sys.argv[3], sys.argv[3:])"
+)
 
 
 def find_chromium() -> str | None:
@@ -44,15 +50,10 @@ class Browser:
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
 
-        def give_pipes() -> None:  # the browser reads commands from 3 and answers on 4
-            command, answer = os.dup(to_browser), os.dup(from_browser)
-            os.dup2(command, 3)
-            os.dup2(answer, 4)
-
+        command = [executable, *FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"]
         self._process = subprocess.Popen(
-            [executable, *FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"],
-            preexec_fn=give_pipes,
-            close_fds=False,
+            [sys.executable, "-c", LAUNCH, str(to_browser), str(from_browser), *command],
+            pass_fds=(to_browser, from_browser),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

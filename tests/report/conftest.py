@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from tests.report.make_run import Plan, make_run
 
 HOSTILE = "<img src=x onerror=alert(1)>\"'&|{{7*7}}"

@@ -95,7 +95,7 @@ def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
     bend = (0.0, 0.014, -0.006, 0.003)[index % 4]
     yaw = bend * np.clip(s - 30, 0, 90)
     ds = np.diff(s, prepend=s[0])
-    centre = np.stack([np.cumsum(np.cos(yaw) * ds), np.cumsum(np.sin(yaw) * ds)], 1) + [1000.0 * index, -400.0]
+    centre = np.stack([np.cumsum(np.cos(yaw) * ds) + 1000.0 * index, np.cumsum(np.sin(yaw) * ds) - 400.0], 1)
     normal = np.stack([-np.sin(yaw), np.cos(yaw)], 1)
     lanes = []
     for lane in range(3):
@@ -113,7 +113,8 @@ def _scene(scene: str, index: int, plan: Plan) -> dict[str, Any]:
     mid = np.array(lanes[0]["centre"])
     edges = [np.round(mid - normal * 2.1, 2).tolist(), np.round(mid + normal * 9.4, 2).tolist()]
     at = mid[60]
-    ring = [(at + normal[60] * a + np.array([math.cos(yaw[60]), math.sin(yaw[60])]) * b).tolist() for a, b in ((-2, 0), (9, 0), (9, 3), (-2, 3))]
+    ahead = np.array([math.cos(yaw[60]), math.sin(yaw[60])])
+    ring = [(at + normal[60] * a + ahead * b).tolist() for a, b in ((-2, 0), (9, 0), (9, 3), (-2, 3))]
     drive = np.stack([np.interp(np.linspace(0, length_m, plan.steps), s, mid[:, k]) for k in (0, 1)], 1)
     return {
         "scene_id": scene,
@@ -264,10 +265,9 @@ def _write_rows(folder: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def _write_steps(folder: Path, steps: list[dict[str, Any]]) -> None:
-    schema = pa.schema(
-        [("renderer", pa.string()), ("policy", pa.string()), ("scene", pa.string()), ("seed", pa.int64()), ("t_us", pa.int64())]
-        + [("metric", pa.string()), ("value", pa.float64()), ("valid", pa.bool_()), ("reason", pa.string())]
-    )
+    fields = [("renderer", pa.string()), ("policy", pa.string()), ("scene", pa.string()), ("seed", pa.int64()), ("t_us", pa.int64())]
+    fields += [("metric", pa.string()), ("value", pa.float64()), ("valid", pa.bool_()), ("reason", pa.string())]
+    schema = pa.schema(fields)
     pq.write_table(pa.Table.from_pylist(steps, schema=schema), folder / "steps.parquet", compression="zstd")
 
 
@@ -296,7 +296,12 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         "metrics": aggregate(rows),
         "paired": paired(rows, baseline) if len(ran) > 1 else {},
         "censoring": censoring(rows),
-        "failures": {"n_failed": len(failed), "n_rollouts": len(rows), "by_class": {"renderer": len(failed)}, "cells": [_failed(r) for r in failed]},
+        "failures": {
+            "n_failed": len(failed),
+            "n_rollouts": len(rows),
+            "by_class": {"renderer": len(failed)},
+            "cells": [_failed(r) for r in failed],
+        },
         "speed": speed,
         "pool": {"workers": 2, "threads_per_worker": 1, "frames_per_s_total": 41.2, "wall_s": sum(r["wall_s"] for r in rows) / 2},
     }
@@ -310,7 +315,17 @@ def _failed(row: dict[str, Any]) -> dict[str, Any]:
 def _run_json(plan: Plan, maps: dict[str, Any]) -> dict[str, Any]:
     return {
         "schema_version": 1,
-        "command": ["simrun", "run", "--renderer", ",".join(plan.renderers), "--policy", ",".join(plan.policies), "--seeds", "3", "smoke.yaml"],
+        "command": [
+            "simrun",
+            "run",
+            "--renderer",
+            ",".join(plan.renderers),
+            "--policy",
+            ",".join(plan.policies),
+            "--seeds",
+            "3",
+            "smoke.yaml",
+        ],
         "version": "0.1.0",
         "started_at": "2025-03-04T09:12:44+00:00",
         "preset": "paper",

@@ -9,11 +9,11 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.report.make_run import Plan, make_run
 
 from evaluators.report.birdseye import path_data, scene_view
 from evaluators.report.events import events_of, read_series
 from evaluators.report.run_folder import Rollout, Run, read_run
+from tests.report.make_run import Plan, make_run
 
 ARMS = {("a", "p"): (0, 0)}
 
@@ -71,7 +71,7 @@ def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
     assert abs(log[-1, 1] - log[0, 1]) <= 2
     assert np.all(track[:, 1] < log[0, 1])
     assert (log[0, 1] - track[0, 1]) == pytest.approx(2.0 * view.unit_per_m, abs=2)
-    assert (0 <= log).all()
+    assert (log >= 0).all()
     assert (log[:, 0] <= view.width).all()
     assert (log[:, 1] <= view.height).all()
 

@@ -65,7 +65,8 @@ def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -
 
 def test_filter_keeps_rows_with_every_word(browser: Browser, usual_run: Path) -> None:
     browser.open(write_report(usual_run))
-    browser.evaluate("const i = document.querySelector('input[type=search]'); i.value = '3DGS urban'; i.dispatchEvent(new Event('input')); 0")
+    browser.evaluate("document.querySelector('input[type=search]').value = '3DGS urban'")
+    browser.evaluate("document.querySelector('input[type=search]').dispatchEvent(new Event('input'))")
     assert column(browser, "table-scenes", 0) == ["urban/left-turn"] * 2
     assert {text.strip() for text in column(browser, "table-scenes", 1)} == {"3dgs"}
 

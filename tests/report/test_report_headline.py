@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.report.make_run import Plan, make_run
 
 from evaluators.report.headline import find, tone_of
 from evaluators.report.run_folder import Run, read_run
+from tests.report.make_run import Plan, make_run
 
 
 def stats(mean: float | None, n: int = 12, unit: str = "", direction: str = "lower") -> dict[str, Any]:

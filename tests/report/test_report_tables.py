@@ -5,19 +5,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.report.make_run import Plan, make_run
 from rich.console import Console
 
 from evaluators.report import render_table
+from evaluators.report.failures import failure_rows, ledger
 from evaluators.report.numbers import DASH
 from evaluators.report.run_folder import read_run
-from evaluators.report.sections import failure_rows, ledger, scene_rows, speed
+from evaluators.report.scene_table import scene_rows
+from evaluators.report.speed import speed
 from evaluators.report.tables import columns, metric_rows, pair_rows
+from tests.report.make_run import Plan, make_run
 
 
 def entry(mean: float | None, **more: Any) -> dict[str, Any]:
-    base = {"mean": mean, "ci95": 0.0192, "ci95_clustered": [0.01, 0.05], "n_rollouts": 300, "n_scenes": 60, "unit": "", "direction": "lower"}
-    return base | more
+    base = {"mean": mean, "ci95": 0.0192, "ci95_clustered": [0.01, 0.05], "n_rollouts": 300, "n_scenes": 60}
+    return base | {"unit": "", "direction": "lower"} | more
 
 
 def test_rate_is_percent_with_counts_and_both_intervals() -> None:
@@ -30,7 +32,9 @@ def test_rate_is_percent_with_counts_and_both_intervals() -> None:
 
 
 def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
-    summary = {"metrics": {"a": {"offroad": entry(None, reason="valid in none of 4 rollouts")}, "b": {"route_distance_m": entry(0.0, unit="m")}}}
+    summary = {
+        "metrics": {"a": {"offroad": entry(None, reason="valid in none of 4 rollouts")}, "b": {"route_distance_m": entry(0.0, unit="m")}}
+    }
     offroad, distance = metric_rows(summary, {("a", "offroad"): "the map has no edges"})
     assert offroad.cells[0].text == DASH
     assert offroad.cells[0].note == "the map has no edges"
@@ -68,7 +72,15 @@ def test_bars_stay_on_their_axis(mean: float) -> None:
 
 
 def test_pair_without_shared_cells_keeps_its_reason() -> None:
-    pair = {"baseline": "clean", "diff": None, "ci95": None, "p_value": None, "verdict": "undecided", "reason": "no shared cell", "n_missing": 3}
+    pair = {
+        "baseline": "clean",
+        "diff": None,
+        "ci95": None,
+        "p_value": None,
+        "verdict": "undecided",
+        "reason": "no shared cell",
+        "n_missing": 3,
+    }
     (row,) = pair_rows({"metrics": {}, "paired": {"3dgs": {"offroad": pair}}})
     assert row.diff.missing
     assert row.p_value.note == "no shared cell"
@@ -77,7 +89,15 @@ def test_pair_without_shared_cells_keeps_its_reason() -> None:
 
 
 def test_paired_zero_lies_in_the_middle() -> None:
-    pair = {"baseline": "clean", "diff": -0.2, "ci95": [-0.3, 0.1], "p_value": 0.0004, "verdict": "undecided", "unit": "m", "direction": "lower"}
+    pair = {
+        "baseline": "clean",
+        "diff": -0.2,
+        "ci95": [-0.3, 0.1],
+        "p_value": 0.0004,
+        "verdict": "undecided",
+        "unit": "m",
+        "direction": "lower",
+    }
     (row,) = pair_rows({"paired": {"3dgs": {"route_distance_m": pair}}})
     assert row.span is not None
     assert row.span.zero == 50.0
