@@ -131,7 +131,7 @@ def _rig_log(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) -> tu
     t_us = poses.t_ns // 1000
     keep = np.concatenate([[True], np.diff(t_us) > 0])
     up = matrix_from_quat(poses.quat)[:, :, 2]  # (T, 3) body z in the city
-    xyz = poses.xyz - origin - WHEEL_RADIUS_M * up
+    xyz = files.near(path, poses.xyz - origin - WHEEL_RADIUS_M * up)
     return checked_trajectory(files, path, t_us[keep], xyz[keep], poses.quat[keep], least=2), int((~keep).sum())
 
 

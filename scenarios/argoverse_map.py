@@ -111,7 +111,7 @@ def read_ground(files: SourceFiles, folder: Path, lane_map: LaneMap, wheels: F64
     # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer pixels.
     city = (np.stack([columns, rows], axis=1) / scale - shift) @ rotation
     known = np.isfinite(heights)
-    grid = np.column_stack([city[known], heights[known]]) - origin
+    grid = files.near(raster_path, np.column_stack([city[known], heights[known]]) - origin)
     edges = [e for lane in lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None]
     return from_points(np.concatenate([grid, *edges, *lane_map.drivable_areas, wheels]), GROUND_CELL_M)
 
@@ -148,7 +148,7 @@ def _line(files: SourceFiles, where: str, raw: dict[str, Any], key: str, origin:
         raise files.fail(where, f"no usable {key}: {error!r}", "give a list of points with x, y and z") from error
     if len(points) < least or not np.isfinite(points).all():
         raise files.fail(where, f"{key} with {len(points)} finite points", f"give at least {least} finite points")
-    return np.asarray(points - origin)
+    return files.near(where, points - origin)
 
 
 def _closed(ring: F64) -> F64:

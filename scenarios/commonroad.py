@@ -53,6 +53,8 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         raise files.fail(file, "no recorded traffic, so no drive to take the ego from", "use a scenario with dynamic obstacles")
     origin = np.array([*np.round(obstacles[0].centre[0, :2]), 0.0])  # whole metres: the subtraction loses nothing
     obstacles = tuple(_moved(o, -origin) for o in obstacles)
+    for obstacle in obstacles:
+        files.near(f"{file}, obstacle {obstacle.obstacle_id}", obstacle.centre)
     lane_map, map_notes = read_lanelets(files, file, root, origin)
     chosen, why = _choose_ego(files, file, obstacles, lane_map, ego)
     vehicle = _vehicle(chosen.box)

@@ -129,7 +129,7 @@ def _bound(files: SourceFiles, where: str, element: Element, side: str, origin: 
     points = [] if bound is None else [point(files, f"{where}, {side}", p) for p in bound.findall("point")]
     if len(points) < 2:
         raise files.fail(where, f"{side} with {len(points)} points", "give each lanelet two bounds of at least 2 points")
-    return np.array(points, dtype=np.float64) - origin
+    return files.near(f"{where}, {side}", np.array(points, dtype=np.float64) - origin)
 
 
 def _is_left_of(one: F64, other: F64) -> bool:

@@ -113,5 +113,6 @@ def read_poses(files: SourceFiles, folder: Path) -> tuple[Trajectory, str]:
     start_us = int(stamp["start"]) if stamp else 0
     poses = np.stack([frames[i] for i in range(len(frames))]) if frames else np.zeros((0, 4, 4))
     t_us = start_us + np.round(np.arange(len(poses)) * (1e6 / FRAME_RATE_HZ)).astype(np.int64)
+    files.near(path, poses[:, :3, 3])
     quat = quat_from_matrix(poses[:, :3, :3])
     return checked_trajectory(files, path, t_us, poses[:, :3, 3].copy(), quat, least=2), stamp["clip"] if stamp else path.stem

@@ -65,6 +65,8 @@ def read_layer(files: SourceFiles, folder: Path, layer: str) -> tuple[Label, ...
             raise files.fail(where, f"no readable shape: {error!r}", "use a file of the RDS-HQ layout") from error
         if not lines or any(len(line) == 0 or not np.isfinite(line).all() for line in lines):
             raise files.fail(where, "a shape without finite vertices", "repair or drop this label")
+        for line in lines:
+            files.near(where, line)
         out.append(Label(where, attributes, lines))
     return tuple(out)
 

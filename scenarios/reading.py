@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import tarfile
+import tokenize
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,8 +17,10 @@ import pyarrow as pa
 from pyarrow import feather
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import F64
 
 MAX_FILE_BYTES = 1 << 30  # refuse to load by mistake what is no scenario
+MAX_REACH_M = 10_000.0  # no recorded scene is wider; one broken coordinate must not ask for a ground grid of many gigabytes
 
 
 class SourceFiles:
@@ -39,6 +42,14 @@ class SourceFiles:
     def fail(self, path: Path | str, found: str, do_this: str) -> InputError:
         """Make the error that names a file; the caller raises it."""
         return InputError(self.doing, str(path), found, do_this)
+
+    def near(self, where: Path | str, xyz: F64) -> F64:
+        """Return local points ``(..., 3)`` after checking that they are finite and within `MAX_REACH_M` of the origin."""
+        distance = float(np.abs(xyz).max(initial=0.0))  # NaN stays NaN
+        if not distance <= MAX_REACH_M:
+            found = "a coordinate that is not finite" if not np.isfinite(distance) else f"a point {distance / 1000:.1f} km from the drive"
+            raise self.fail(where, found, "repair the coordinates of this file")
+        return xyz
 
     def only(self, folder: Path, patterns: tuple[str, ...], what: str) -> Path:
         """Return the one file of a folder that matches one of the glob patterns, the first pattern with a match deciding.
@@ -100,21 +111,22 @@ class SourceFiles:
         data = self.read_bytes(path)
         try:
             table = feather.read_table(pa.BufferReader(data))
-        except (pa.ArrowException, OSError) as error:
-            reason = str(error).splitlines()[0]
-            raise self.fail(path, f"no readable Arrow IPC file: {reason}", "fetch the file again; it may be truncated") from error
-        missing = [c for c in columns if c not in table.column_names]
-        if missing:
-            found = f"no column {missing[0]!r}, only {', '.join(table.column_names)}"
-            raise self.fail(path, found, "use a file of the Argoverse 2 sensor set")
-        return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
+            table.validate(full=True)
+            missing = [c for c in columns if c not in table.column_names]
+            if missing:
+                found = f"no column {missing[0]!r}, only {', '.join(table.column_names)}"
+                raise self.fail(path, found, "use a file of the Argoverse 2 sensor set")
+            return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise self.fail(path, f"no readable Arrow IPC file: {reason[:120]}", "fetch the file again; it may be truncated") from error
 
     def parse_npy(self, data: bytes, where: Path | str) -> np.ndarray[Any, Any]:
         """Parse a NumPy array without pickles."""
         try:
             array: np.ndarray[Any, Any] = np.load(io.BytesIO(data), allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
-            reason = str(error).splitlines()[0] if str(error) else "empty"
+        except (ValueError, EOFError, OSError, SyntaxError, tokenize.TokenError, MemoryError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise self.fail(where, f"no readable NumPy array: {reason}", "fetch the file again; it may be truncated") from error
         return array
 

@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, HeightField
 
+MAX_NODES = 30_000_000  # 240 MB of heights
 SLOPE_SPAN_M = 1.5  # half the length over which a pose's slope is taken: about half a wheelbase
 
 
@@ -28,7 +29,7 @@ def from_points(points: F64, cell_m: float = 2.0) -> HeightField:
         cell_m: Grid step in metres.
 
     Raises:
-        InputError: There is no point, or a coordinate is not finite.
+        InputError: There is no point, a coordinate is not finite, or the grid would have more than `MAX_NODES` nodes.
     """
     xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(xyz) == 0 or not np.isfinite(xyz).all() or cell_m <= 0:
@@ -36,7 +37,11 @@ def from_points(points: F64, cell_m: float = 2.0) -> HeightField:
         with_what = f"{len(xyz)} points, cell {cell_m} m"
         raise InputError("fitting a ground height field", with_what, bad, "give finite ground points and a cell > 0")
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
-    nx, ny = (np.floor((xyz[:, :2].max(axis=0) - low) / cell_m).astype(np.int64) + 2).tolist()
+    nx, ny = (int(n) + 2 for n in np.floor((xyz[:, :2].max(axis=0) - low) / cell_m))
+    if nx * ny > MAX_NODES:
+        found = f"a grid of {nx} x {ny} nodes, more than {MAX_NODES}"
+        with_what = f"{len(xyz)} points, cell {cell_m} m"
+        raise InputError("fitting a ground height field", with_what, found, "check the extent, or use a larger cell")
     means = _cell_means(xyz, low, cell_m, nx)
     xs, ys = low[0] + cell_m * np.arange(nx), low[1] + cell_m * np.arange(ny)
     nodes = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)  # (Ny * Nx, 2)

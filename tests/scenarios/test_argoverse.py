@@ -217,6 +217,34 @@ def test_truncated_raster(tmp_path):
     assert "no readable NumPy array" in refused(folder).found
 
 
+def test_text_that_is_no_utf_8_in_a_feather(tmp_path):
+    path = write_argoverse(tmp_path / "x") / "annotations.feather"
+    path.write_bytes(path.read_bytes().replace(b"REGULAR", b"REG\xff\xfeAR", 1))
+    error = refused(path.parent)
+    assert error.with_what == str(path)
+    assert "no readable Arrow IPC file" in error.found
+
+
+@pytest.mark.parametrize("header", [b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }", b"{'descr': (((", b"[]"])
+def test_raster_with_a_broken_header(tmp_path, header):
+    folder = write_argoverse(tmp_path / "x")
+    path = next(folder.glob("map/*.npy"))
+    path.write_bytes(b"\x93NUMPY\x01\x00" + (len(header) + 1).to_bytes(2, "little") + header + b"\n")
+    error = refused(folder)
+    assert error.with_what == str(path)
+    assert "no readable NumPy array" in error.found
+
+
+def test_one_point_on_another_continent(tmp_path):
+    error = refused(write_argoverse(tmp_path / "x", document=vector_map() | {"lane_segments": {"1": lane(1, 0, 4e6, 0)}}))
+    assert error.found == "a point 4000.0 km from the drive"
+    assert "lane 1" in error.with_what
+
+
+def test_drive_that_jumps_across_the_world(tmp_path):
+    assert "km from the drive" in refused(write_argoverse(tmp_path / "x", ego=bad_poses("tx_m", 4, 9e6), annotations=cuboids(TRACKS))).found
+
+
 def test_two_maps_are_ambiguous(tmp_path):
     folder = write_argoverse(tmp_path / "x")
     (folder / "map" / "log_map_archive_y____PIT_city_2.json").write_text("{}")

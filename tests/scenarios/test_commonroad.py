@@ -250,6 +250,7 @@ def test_unknown_encoding(tmp_path):
         (document(lanes='<lanelet id="1"/>').encode(), "leftBound with 0 points"),
         (document(lanes=lanelet(1, "west", 5, 0)).encode(), "x = 'west'"),
         (document(lanes=lanelet(1, "1e999", 5, 0)).encode(), "x = '1e999'"),
+        (document(lanes=lanelet(1, 0, 5e6, 0)).encode(), "a point 5000.0 km from the drive"),
         (document(lanes=lanelet(1, 0, 5, 0, "<laneletType>sidewalk</laneletType>")).encode(), "1 lanelets, none for vehicles"),
         (document(traffic=obstacle(1, drive(0, 0)) * 2).encode(), "obstacle id 1 twice"),
         (document(traffic=obstacle(1, drive(0, 0), shape="")).encode(), "no shape"),

@@ -77,6 +77,11 @@ def test_ground_without_usable_points_is_refused(points, found):
     assert "do: give finite ground points" in str(caught.value)
 
 
+def test_ground_of_a_continent_is_refused_before_memory_is_taken():
+    with pytest.raises(InputError, match="more than 30000000"):
+        from_points(np.array([[0.0, 0.0, 0.0], [4e6, 3e6, 0.0]]), 1.0)
+
+
 def test_level_ground_leaves_a_planar_pose():
     np.testing.assert_allclose(ground_pose(flat(2.0), 3.0, -4.0, 0.7), se2(3.0, -4.0, 0.7, 2.0), atol=1e-15)
 
