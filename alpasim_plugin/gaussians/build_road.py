@@ -3,8 +3,9 @@
 The plan is painted as an image (0.125 m near the path, 0.5 m beyond), and a quadtree over it yields the Gaussians: small at paint and
 kerbs, larger on plain surfaces and far from the path. The same quadtree with larger least cells gives the coarser levels of detail, so a
 level is the average of the finer one. Road paint is drawn a second time as long thin Gaussians `LIFT_M` above the ground: Gaussians are
-composited in the order of their centres, so at a grazing angle ground in front of a line would otherwise wash over it. The lift puts a
-line in front of all ground within ``LIFT_M * distance / camera height``, which grows with distance as the cells do.
+composited in the order of their centres, so at a grazing angle ground in front of a line would otherwise wash over it. The lift, and a
+shallow trench in the ground around it, put a line in front of all ground within ``(lift + trench) * distance / camera height``, which grows
+with distance as the cells do.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.paint import WHITE, YELLOW, Strokes
-from alpasim_plugin.gaussians.plan_image import PlanImage, paint_plan
+from alpasim_plugin.gaussians.plan_image import KERB_M, PlanImage, paint_plan
 from alpasim_plugin.gaussians.site import Site
 from alpasim_plugin.gaussians.surfels import SPREAD, THICKNESS, cloud_of, grid_cells, quats_along, upright_quats
 from alpasim_plugin.types import F32, F64, I64, Bool
@@ -24,7 +25,6 @@ FINE_M, COARSE_M = 0.125, 0.5
 TILE_M, FAR_TILE_M = 16.0, 32.0
 CORRIDOR_M = 9.0  # tiles that come this near to the path get the fine levels
 LIFT_M = 0.02
-KERB_M = 0.12
 MAX_LEVEL = 5  # cells of one image grow up to 2**5 of its pixels
 PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
 
@@ -60,7 +60,7 @@ def _ground_nodes(
     site: Site, name: str, image: PlanImage, fine_tiles: Bool, tile_m: float, floors: tuple[int, ...], keep_inside: bool
 ) -> list[SceneNode]:
     means = _pyramid(image.rgb)
-    raised = _pyramid(image.raised[:, :, None])
+    heights = _pyramid(image.height[:, :, None])
     levels = []
     for floor in floors:
         parts = []
@@ -74,11 +74,11 @@ def _ground_nodes(
             t = np.floor((plan - site.low) / TILE_M).astype(np.int64)
             inside = fine_tiles[np.clip(t[:, 1], 0, fine_tiles.shape[0] - 1), np.clip(t[:, 0], 0, fine_tiles.shape[1] - 1)]
             keep = inside if keep_inside else ~inside
-            parts.append((plan[keep], np.full(int(keep.sum()), size), means[k][i, j][keep], raised[k][i, j, 0][keep] > 0.5))
+            parts.append((plan[keep], np.full(int(keep.sum()), size), means[k][i, j][keep], heights[k][i, j, 0][keep].astype(np.float64)))
         if not parts:
             continue
-        plan, size_m, rgb, up = (np.concatenate(c) for c in zip(*parts, strict=True))
-        cloud = _flat(site, plan, size_m, rgb, np.where(up & (not site.highway), KERB_M, 0.0))
+        plan, size_m, rgb, above = (np.concatenate(c) for c in zip(*parts, strict=True))
+        cloud = _flat(site, plan, size_m, rgb, np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0)))
         tile = np.floor((plan - site.low) / tile_m).astype(np.int64)
         levels.append((image.cell_m * (1 << floor), cloud, tile[:, 1] * 100_000 + tile[:, 0]))
     return nodes_by_tile(name, levels)
@@ -159,9 +159,9 @@ def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
         heading = xy[len(plan) :] - xy[: len(plan)]
         direction = np.column_stack([heading, -np.sum(heading * normals[:, :2], axis=1) / normals[:, 2]])
         single = (n_v == 1)[owner]
-        # A lone row must fade at its own edge (sigma 0.36 of the width); rows side by side must close the gap between them.
-        across = np.where(single, 0.36, SPREAD) * (strokes.width_m / n_v)[owner]
-        scales = np.stack([SPREAD * (length / n_u)[owner], across, np.full(len(owner), 0.004)], axis=1)
+        # A lone row is half as strong at its own edge (sigma 0.42 of the width); rows side by side must close the gap between them.
+        across = np.where(single, 0.42, SPREAD) * (strokes.width_m / n_v)[owner]
+        scales = np.stack([0.75 * (length / n_u)[owner], across, np.full(len(owner), 0.004)], axis=1)
         levels.append((cell_m, cloud_of(means, quats_along(direction, normals), scales, rgb[owner], 0.97), tile_of[owner]))
     return nodes_by_tile("paint", levels, far_m=140.0)
 

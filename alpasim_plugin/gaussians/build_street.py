@@ -8,12 +8,12 @@ from alpasim_plugin.gaussians.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.contours import contours, places
 from alpasim_plugin.gaussians.nodes import SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.plan_image import KERB_M
 from alpasim_plugin.gaussians.site import CELL_M, Site
 from alpasim_plugin.gaussians.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
 from alpasim_plugin.geometry import arc_lengths, resample
 from alpasim_plugin.types import F64, I64, Bool
 
-KERB_M = 0.12
 KERB_RGB = (0.66, 0.65, 0.62)
 RAIL_RGB = (0.62, 0.64, 0.66)
 TREE_LINE_M = {False: 1.6, True: 7.0}  # distance of street trees from the road's edge, by highway or not

@@ -21,7 +21,7 @@ from alpasim_plugin.types import F64, I64, Paint
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern
 LINE_WIDTH_M = 0.14
-DOUBLE_OFFSET_M = 0.14
+DOUBLE_OFFSET_M = 0.16
 STEP_M = 0.75  # length of a stroke of a line; a quarter of a dash
 BAR_M = 0.45  # zebra bar and the gap beside it
 STOP_LINE_M = 0.4

@@ -1,4 +1,4 @@
-"""Paint the plan of a scene as an image: the colour of the ground, what is raised by a kerb, and how fine it must be sampled."""
+"""Paint the plan of a scene as an image: the colour of the ground, its height over the road, and how fine it must be sampled."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
 ASPHALT = (0.335, 0.335, 0.345)
 PAVEMENT = (0.55, 0.53, 0.50)
 GRASS = (0.33, 0.40, 0.22)
+KERB_M = 0.12
+TRENCH_M, TRENCH_DEPTH_M = 0.16, 0.03  # asphalt this near to paint lies this much lower, see build_road
 PAVEMENT_M = 2.6  # width of the pavement beside the road
 FORECOURT_M = 6.5  # paved or planted strip up to the facades
 
@@ -27,14 +29,14 @@ class PlanImage:
         cell_m: Metres.
         low: ``(2,)`` plan coordinates of the corner.
         rgb: ``(H, W, 3)`` 0..1.
-        raised: ``(H, W)`` 1 where the ground stands a kerb's height above the road.
+        height: ``(H, W)`` metres above the road's surface: a kerb's height beside the road, a little below zero around paint.
         level: ``(H, W)`` the largest square that may stand for the cell is ``cell_m * 2**level``.
     """
 
     cell_m: float
     low: F64
     rgb: F32
-    raised: F32
+    height: F32
     level: I64
 
 
@@ -64,25 +66,28 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
     rgb[:] = _verge(site, off, grain, texture)
     tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
     rgb[road] = (np.array(ASPHALT, dtype=np.float32) * tone[..., None])[road]
-    covers = [_coverage(strokes, colour, low, cell_m, (rows, columns)) for colour in (WHITE, YELLOW)]
+    # Next to the crisp strokes laid over them, cells half covered by a thin line would show as teeth along it.
+    thinnest = 0.3 if cell_m < CELL_M else 0.0
+    covers = [_coverage(strokes, colour, low, cell_m, (rows, columns), thinnest) for colour in (WHITE, YELLOW)]
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
-        if cell_m < CELL_M:
-            # Next to the crisp strokes laid over it, half-covered cells would show as teeth along a line.
-            cover = np.clip((cover - 0.35) / 0.5, 0.0, 1.0)
         worn = cover * (0.95 - 0.12 * texture * np.clip(grain, 0, 2))
         rgb += worn[..., None] * (np.array(PAINT_IMAGE_RGB[colour], dtype=np.float32) - rgb)
 
-    painted = (covers[0] + covers[1]) > 0.04
-    feature = edge
+    painted = np.zeros((rows, columns), dtype=bool)
+    for colour in (WHITE, YELLOW):
+        painted |= _coverage(strokes, colour, low, cell_m, (rows, columns)) > 0.04
+    near_paint = np.full_like(edge, 1.0e3)
     if painted.any():
-        feature = np.minimum(edge, cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * cell_m)
+        near_paint = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(cell_m)
+    feature = np.minimum(edge, near_paint)
     if cell_m < CELL_M:
         cap = np.where(road & (path < 2.5), 0.125, np.where(road & (path < 6.0), 0.25, 0.5))
     else:
         cap = np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
-    return PlanImage(cell_m, low, np.clip(rgb, 0, 1), (~road).astype(np.float32), level)
+    height = np.where(road, np.where(near_paint < TRENCH_M, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
+    return PlanImage(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
 
 
 def _sampled(raster: F32, site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
@@ -158,11 +163,11 @@ def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
         cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, int(rng.integers(60, 100)), 1, cv2.LINE_AA, SHIFT_BITS)
 
 
-def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
-    """Return the share ``(H, W)`` of each cell under paint of one colour."""
+def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tuple[int, int], thinnest_m: float = 0.0) -> F32:
+    """Return the share ``(H, W)`` of each cell under paint of one colour; strokes thinner than ``thinnest_m`` are left out."""
     mask = np.zeros(shape, dtype=np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
-    mine = (strokes.colour == colour) & np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
+    mine = (strokes.colour == colour) & (strokes.width_m >= thinnest_m) & np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
     start, end, width = strokes.start[mine], strokes.end[mine], strokes.width_m[mine]
     along = end - start
     length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)

@@ -157,10 +157,10 @@ def crossing(**kwargs: object) -> Scenario:
     lanes: dict[str, Lane] = {}
     for name, angle in (("e", 0.0), ("n", np.pi / 2), ("w", np.pi), ("s", -np.pi / 2)):
         d = np.array([np.cos(angle), np.sin(angle)])
-        lanes |= road_lanes(line(tuple(12 * d), tuple(150 * d)), name, 1)  # type: ignore[arg-type]
+        lanes |= road_lanes(line(tuple(12 * d), tuple(150 * d)), name, 1)
     for name, angle in (("x0", 0.0), ("x1", np.pi / 2)):
         d = np.array([np.cos(angle), np.sin(angle)])
-        lanes |= road_lanes(line(tuple(-12 * d), tuple(12 * d)), name, 1, is_intersection=True)  # type: ignore[arg-type]
+        lanes |= road_lanes(line(tuple(-12 * d), tuple(12 * d)), name, 1, is_intersection=True)
     return make_scenario(LaneMap(lanes), line((-70, -1.8), (40, -1.8)), **kwargs)  # type: ignore[arg-type]
 
 

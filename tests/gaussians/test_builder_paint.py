@@ -7,7 +7,7 @@ import pytest
 
 from alpasim_plugin.gaussians.paint import GAP_M, LINE_M, WHITE, YELLOW, Strokes, paint_strokes
 from alpasim_plugin.gaussians.site import make_site
-from alpasim_plugin.types import F64, LaneMap, Marking, Scenario
+from alpasim_plugin.types import F64, Lane, LaneMap, Marking, Scenario
 from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
 
 PATH = line((0, -1.8), (60, -1.8))
@@ -54,8 +54,8 @@ def test_unknown_edge_between_opposing_lanes_is_double_yellow(two_by_two: tuple[
     strokes, middle = two_by_two
     pair = at(middle, 0.0, 0.2)
     assert set(strokes.colour[pair]) == {YELLOW}
-    assert at(middle, 0.14).any()
-    assert at(middle, -0.14).any()
+    assert at(middle, 0.16).any()
+    assert at(middle, -0.16).any()
     assert not at(middle, 0.0).any()
 
 
@@ -68,7 +68,7 @@ def test_unknown_outer_edge_is_solid_white_just_inside_the_lane(two_by_two: tupl
 
 
 def test_dashes_run_on_from_lane_to_lane() -> None:
-    lanes = {}
+    lanes: dict[str, Lane] = {}
     for i in range(4):
         lanes |= road_lanes(line((i * 17.0, 0), (i * 17.0 + 17.0, 0)), f"r{i}", 2)
     strokes, middle = strokes_of(make_scenario(LaneMap(lanes), PATH))

@@ -83,7 +83,7 @@ def test_lane_lines_are_brighter_than_the_asphalt_beside_them(street: tuple[Scen
         return np.asarray(image[int(camera.fy * p[1] / p[2] + camera.cy), int(camera.fx * p[0] / p[2] + camera.cx)])
 
     for ahead in (10.0, 13.0, 17.0):
-        edge, lane, centre = seen(-7.0, ahead), seen(-1.8, ahead), seen(0.14, ahead)
+        edge, lane, centre = seen(-7.0, ahead), seen(-1.8, ahead), seen(0.16, ahead)
         assert edge.min() > lane.max() + 0.15  # the white line at the right edge
         assert centre[0] > centre[2] + 0.15  # the yellow line between the directions
         assert np.ptp(lane) < 0.06
@@ -104,7 +104,7 @@ def test_houses_leave_road_actors_and_each_other_alone() -> None:
     walls = [n for n in graph.background if n.name.startswith("house")]
     assert len(walls) > 8
     for node in walls:
-        plan = site.frame.to_plan(node.levels[0].cloud.means)
+        plan = site.frame.to_plan(node.levels[0].cloud.means.astype(np.float64))
         assert site.look_up(site.off_road_m, plan).min() > 1.5
         assert not site.look_up(site.taken, plan).any()
 
@@ -119,9 +119,9 @@ def test_everything_follows_a_sloping_ground() -> None:
     scenario = curve()
     for node in built(scenario).background:
         if node.name.startswith(("ground/", "paint/")):
-            means = node.levels[0].cloud.means
+            means = node.levels[0].cloud.means.astype(np.float64)
             above = means[:, 2] - height_at(scenario.ground, means)
-            assert above.min() > -0.01
+            assert above.min() > -0.04
             assert above.max() < 0.14
 
 
