@@ -23,6 +23,7 @@ F64 = npt.NDArray[np.float64]
 Arms = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
+MAX_OFFSET_M = 5.0  # one rollout that is far away must not flatten the others; the map shows where it went
 STRAY_M = 40.0  # how far from the log's bounds the view follows a rollout
 MIN_ASPECT = 0.12  # height / width
 
@@ -54,7 +55,7 @@ class OffsetChart:
     """Signed distance from the logged path over time; width 1000, height 200, zero in the middle."""
 
     tracks: tuple[Track, ...]
-    reach_m: str
+    reach: str
     end_s: str
 
 
@@ -63,6 +64,7 @@ class SceneView:
     """Everything that the template draws for one scene."""
 
     scene: str
+    source: str
     width: int
     height: int
     unit_per_m: float
@@ -177,11 +179,12 @@ def scene_view(
     lanes = content.get("lanes") or []
     return SceneView(
         scene=scene,
+        source=str(content.get("source") or ""),
         width=UNITS_ACROSS,
         height=frame.height,
         unit_per_m=frame.scale,
         lanes=_areas([_ring(lane) for lane in lanes], frame),
-        lines=_lines([lane.get(side) for lane in lanes for side in ("left", "right")], frame),
+        lines=_lines([edge for lane in lanes for edge in _painted(lane)], frame),
         edges=_lines(content.get("road_edges") or [], frame),
         crosswalks=_areas(content.get("crosswalks") or [], frame),
         log=path_data(frame.units(log)),
@@ -204,6 +207,12 @@ def _driven(own: Mapping[str, tuple[Any, F64]]) -> F64 | None:
 def _ring(lane: Mapping[str, Any]) -> list[list[float]]:
     left, right = lane.get("left"), lane.get("right")
     return [*left, *reversed(right)] if left and right else []
+
+
+def _painted(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
+    """List a lane's edges without those that carry no paint, such as the paths across an intersection."""
+    sides = zip((lane.get("left"), lane.get("right")), lane.get("paint") or ("unknown", "unknown"), strict=True)
+    return [edge for edge, paint in sides if paint != "none"]
 
 
 def _lines(lines: Sequence[Sequence[Sequence[float]] | None], frame: _Frame) -> str:
@@ -254,12 +263,12 @@ def _offset_chart(rollouts: Sequence[Rollout], series: Series, arm_of: Arms, lab
     if not own:
         return None
     reach = max(0.5, *(float(np.abs(v).max()) for _, v in own.values()))
-    reach = next((step for step in (0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0) if reach <= step), reach)
+    shown = next((step for step in (0.5, 1.0, 2.0, 3.0) if reach <= step), MAX_OFFSET_M)
     end_us = max(1, *(int(t[-1] - t[0]) for t, _ in own.values()))
     tracks = []
     for rollout in rollouts:
         if rollout.cell in own and (rollout.renderer, rollout.policy) in arm_of:
             t_us, offset = own[rollout.cell]
-            units = np.stack([(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / reach * 100.0], 1)
+            units = np.stack([(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / shown * 100.0], 1)
             tracks.append(Track(*arm_of[rollout.renderer, rollout.policy], label(rollout), path_data(units, tolerance=0.7)))
-    return OffsetChart(tuple(tracks), f"{reach:g}", f"{end_us * 1e-6:.1f}")
+    return OffsetChart(tuple(tracks), f"{shown:g}\u00a0m" + (" and more" if reach > shown else ""), f"{end_us * 1e-6:.1f}")

@@ -125,7 +125,7 @@ def drift_charts(rollouts: Sequence[Rollout], series: Series, arm_of: dict[tuple
     charts.append(
         Chart(
             "Distance from the logged path over time",
-            "Line: median over rollouts. Band: 10th to 90th percentile. Collided or off-road rollouts stay in as long as they were logged.",
+            "Line: median over rollouts. Band: 10th to 90th percentile. Drawn while at least half of the rollouts still run.",
             line_chart(curves(lambda members: _offset_band(members, series)), "s since start", "m beside the path"),
         )
     )
@@ -148,8 +148,9 @@ def _offset_band(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np
         seconds = (t_us - t_us[0]) * 1e-6
         inside = grid <= seconds[-1] + 1e-9
         row[inside] = np.abs(np.interp(grid[inside], seconds, offset))
-    low, middle, high = np.nanpercentile(values, [10, 50, 90], axis=0)
-    return grid, middle, low, high
+    enough = np.count_nonzero(np.isfinite(values), axis=0) * 2 >= len(own)  # later, the few long scenes would pass for a trend
+    low, middle, high = np.nanpercentile(values[:, enough], [10, 50, 90], axis=0)
+    return grid[enough], middle, low, high
 
 
 def _survival(members: list[Rollout], series: Series) -> tuple[npt.NDArray[np.float64], ...]:

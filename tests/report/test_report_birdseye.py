@@ -153,8 +153,27 @@ def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
     assert view.marks[0].text == "a \u00b7 seed 0: off-road at a time that no step shows"
 
 
+def test_edge_without_paint_gives_no_line() -> None:
+    lane = {"left": [[0, 2], [100, 2]], "right": [[0, -2], [100, -2]], "paint": ["none", "solid_white"]}
+    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[lane]), [], {}, ARMS)
+    assert view is not None
+    assert view.lines.count("M") == 1
+    assert view.lanes.count("z") == 1
+
+
+def test_one_far_rollout_does_not_flatten_the_offsets_of_the_others() -> None:
+    x = np.linspace(0, 50, 51).tolist()
+    near, far = Rollout("a", "p", "s", 0, "ok"), Rollout("a", "p", "s", 1, "ok")
+    series = {r.cell: series_of(x, [0.0] * 51, lateral_offset_m=[d] * 51) for r, d in ((near, 1.0), (far, 300.0))}
+    view = scene_view("s", scene(x, [0.0] * 51), [near, far], series, ARMS)
+    assert view is not None
+    assert view.offset is not None
+    assert view.offset.reach == "5\u00a0m and more"
+    assert decode(view.offset.tracks[0].d)[0, 1] == 80
+
+
 def test_offset_chart_keeps_the_worst_rollout_inside(tmp_path: Path) -> None:
-    run: Run = read_run(make_run(tmp_path, Plan(scenes=("hard/x",), pictures=False, clips=False)))
+    run: Run = read_run(make_run(tmp_path, Plan(scenes=("hard/x",), harm={"3dgs": 1.0}, pictures=False, clips=False)))
     content = run.scene_data("hard/x")
     assert content is not None
     arms = {(name, "lane-camera"): (i, 0) for i, name in enumerate(run.renderers)}
