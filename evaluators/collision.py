@@ -71,17 +71,22 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
 @register("collision", "contact with other actors, by side, and the least gap")
 def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step."""
-    origin = origin_of(rollout.ego)
+    origin = origin_of(rollout.ego, preset)
     t_us = rollout.ego.t_us
-    contacts, gap_m = find_contacts(ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin), t_us)
+    ego, actors = ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin)
+    contacts, gap_m = find_contacts(ego, actors, t_us)
+    if preset.hits == "last":
+        contacts = _last_per_step(contacts, ego, actors, t_us)
     front, rear, lateral = (_any_per_step(contacts, side, len(t_us)) for side in (FRONT, REAR, LATERAL))
     return [
         series("collision_any", t_us, front | rear | lateral),
-        series("collision_at_fault", t_us, front | lateral),
+        *([] if preset.hits == "last" else [series("collision_at_fault", t_us, front | lateral)]),
         series("collision_front", t_us, front),
         series("collision_lateral", t_us, lateral),
         series("collision_rear", t_us, rear),
-        series("min_distance_to_obstacle_m", t_us, gap_m, np.isfinite(gap_m), "no other actor is present"),
+        series(
+            "min_distance_to_obstacle_m", t_us, gap_m, np.isfinite(gap_m), "no other actor is present", keep_values=not preset.honour_valid
+        ),
     ]
 
 
@@ -89,3 +94,20 @@ def _any_per_step(contacts: Contacts, side: int, n_steps: int) -> Bool:
     out = np.zeros(n_steps, dtype=np.bool_)
     out[contacts.step[contacts.side == side]] = True
     return out
+
+
+def _last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us: I64) -> Contacts:
+    """Keep of each step's contacts the one that the spatial index names last.
+
+    AlpaSim builds an STRtree of the ego and all present actors at every step, in the log's order, and lets the last answer decide. The
+    order depends on the tree's layout, so the tree is built the same way here, for the steps with more than one contact.
+    """
+    keep = np.ones(len(contacts.step), dtype=np.bool_)
+    there = actors.at(t_us)
+    for step in np.flatnonzero(np.bincount(contacts.step, minlength=len(t_us)) > 1):
+        present = np.flatnonzero(there.present[:, step])
+        shapes = np.concatenate([ego.take(np.array([step])).shapes(), there.footprints(present, np.full(len(present), step)).shapes()])
+        order = [i for i in shapely.STRtree(shapes).query(shapes[0], predicate="intersects") if i != 0]
+        rows = np.flatnonzero(contacts.step == step)
+        keep[rows[contacts.actor[rows] != present[order[-1] - 1]]] = False
+    return Contacts(contacts.step[keep], contacts.actor[keep], contacts.side[keep])

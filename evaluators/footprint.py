@@ -22,9 +22,14 @@ Geometries = npt.NDArray[Any]  # of shapely geometries
 _UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # along x, y of the box
 
 
-def origin_of(track: Trajectory) -> F64:
-    """Return the whole-metre point ``(3,)`` nearest to the start of a track; subtracting it is exact in float64 up to 4e15 m."""
-    return np.asarray(np.round(track.xyz[0]))
+def origin_of(track: Trajectory, preset: Preset) -> F64:
+    """Return the point ``(3,)`` that geometry is relative to: whole metres near the start of a track; zero for float32 presets."""
+    return np.zeros(3) if preset.float32 else np.asarray(np.round(track.xyz[0]))
+
+
+def held(values: F64, preset: Preset) -> F64:
+    """Return coordinates as the preset holds them: float64, or rounded to float32."""
+    return values.astype(np.float32).astype(np.float64) if preset.float32 else values
 
 
 def corners(xy: F64, yaw: F64, size: F64) -> F64:
@@ -35,6 +40,14 @@ def corners(xy: F64, yaw: F64, size: F64) -> F64:
     return np.stack([xy[:, None, 0] + c * x - s * y, xy[:, None, 1] + s * x + c * y], axis=-1)
 
 
+def _corners_float32(xy: F64, yaw: F64, size: F64) -> F64:
+    """Return corners rounded to float32 after each step, the centre first, as AlpaSim does: half a millimetre 8 km from the origin."""
+    x, y = (xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
+    c, s = np.cos(yaw.astype(np.float32))[:, None], np.sin(yaw.astype(np.float32))[:, None]
+    along, across = ((_UNIT_CORNERS[:, d] * size[:, [d]]).astype(np.float32) for d in (0, 1))  # (N, 4)
+    return np.stack([(x + along * c) - across * s, (y + along * s) + across * c], axis=-1).astype(np.float64)
+
+
 @dataclass(frozen=True)
 class Footprints:
     """Boxes of one body at N instants."""
@@ -43,6 +56,7 @@ class Footprints:
     yaw: F64  # (N,)
     size: F64  # (N, 2) length, width after shrinking
     roundness: float = 0.0
+    float32: bool = False  # corners are worked out in float32
 
     @property
     def radius_m(self) -> F64:
@@ -56,23 +70,35 @@ class Footprints:
 
     def take(self, index: I64) -> Footprints:
         """Return the boxes at some rows."""
-        return Footprints(self.xy[index], self.yaw[index], self.size[index], self.roundness)
+        return Footprints(self.xy[index], self.yaw[index], self.size[index], self.roundness, self.float32)
+
+    def corners(self) -> F64:
+        """Return the corners ``(N, 4, 2)``."""
+        if self.float32:
+            return _corners_float32(self.xy, self.yaw, self.size)
+        return corners(self.xy, self.yaw, self.size)
+
+    def centres(self) -> F64:
+        """Return the point ``(N, 2)`` that stands for the body: the box centre, or for float32 presets the rounded shape's centroid."""
+        return np.asarray(shapely.get_coordinates(shapely.centroid(self.shapes()))) if self.float32 else self.xy
 
     def shapes(self) -> Geometries:
         """Return the footprints ``(N,)`` as shapely polygons."""
-        boxes = shapely.polygons(corners(self.xy, self.yaw, self.size))
+        boxes = shapely.polygons(self.corners())
         r = self._corner_radius_m()
-        return boxes if r is None else np.asarray(shapely.buffer(shapely.buffer(boxes, -r), r))
+        return boxes if r is None else np.asarray(shapely.buffer(shapely.buffer(boxes, -r, quad_segs=16), r, quad_segs=16))
 
     def bumpers(self) -> tuple[Geometries, Geometries]:
         """Return front and rear bumpers ``(N,)``: segments; with rounded corners the footprint's part within a corner radius of them."""
-        at = corners(self.xy, self.yaw, self.size)
+        at = self.corners()
         front, rear = shapely.linestrings(at[:, 0:2]), shapely.linestrings(at[:, 2:4])
         r = self._corner_radius_m()
         if r is None:
             return front, rear
         body = self.shapes()
-        return shapely.intersection(shapely.buffer(front, r), body), shapely.intersection(shapely.buffer(rear, r), body)
+        return shapely.intersection(shapely.buffer(front, r, quad_segs=16), body), shapely.intersection(
+            shapely.buffer(rear, r, quad_segs=16), body
+        )
 
     def _corner_radius_m(self) -> F64 | None:
         return self.roundness * self.size.min(axis=1) / 2 if self.roundness > 0 else None
@@ -86,8 +112,8 @@ def ego_footprints(rollout: RolloutLog, preset: Preset, origin: F64) -> Footprin
 def ego_footprints_at(xy: F64, yaw: F64, rollout: RolloutLog, preset: Preset) -> Footprints:
     """Return the ego's footprint at given box centres ``(N, 2)`` and headings ``(N,)``."""
     length_m, width_m = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
-    size = np.broadcast_to(np.array([length_m, width_m]) * (1.0 - preset.shrink), (len(xy), 2))
-    return Footprints(np.asarray(xy), np.asarray(yaw), size, preset.roundness)
+    size = np.broadcast_to(held(np.array([length_m, width_m]), preset) * (1.0 - preset.shrink), (len(xy), 2))
+    return Footprints(np.asarray(xy), np.asarray(yaw), size, preset.roundness, preset.float32)
 
 
 class ActorTable:
@@ -104,8 +130,9 @@ class ActorTable:
         self._start = np.concatenate([[0], np.cumsum([len(t) for t in self._t])]).astype(np.int64)
         self._xy = np.concatenate([np.zeros((0, 2)), *(actor.track.xyz[:, :2] - origin[:2] for actor in actors)])
         self._quat = np.concatenate([np.zeros((0, 4)), *(actor.track.quat for actor in actors)])
-        self.size = np.array([[actor.box.length_m, actor.box.width_m] for actor in actors]).reshape(-1, 2) * (1.0 - preset.shrink)
-        self.roundness = preset.roundness
+        size = np.array([[actor.box.length_m, actor.box.width_m] for actor in actors]).reshape(-1, 2)
+        self.size = held(size, preset) * (1.0 - preset.shrink)
+        self.preset = preset
         self.radius_m = np.hypot(self.size[:, 0], self.size[:, 1]) / 2  # (A,)
         self.inner_radius_m = self.size.min(axis=1, initial=np.inf) / 2
 
@@ -160,7 +187,7 @@ class ActorsAt:
         between = np.flatnonzero(f)
         if len(between):
             yaw[between] = yaw_from_quat(slerp(self.table._quat[row[between]], self.table._quat[follows[between]], f[between]))
-        return Footprints(xy, yaw, self.table.size[actor], self.table.roundness)
+        return Footprints(held(xy, self.table.preset), yaw, self.table.size[actor], self.table.preset.roundness, self.table.preset.float32)
 
     def _next(self) -> I64:
         return np.asarray(np.where(self.fraction > 0, self.row + 1, self.row))

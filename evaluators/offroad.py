@@ -83,8 +83,10 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     t_us = rollout.ego.t_us
     names = ("offroad", "wrong_lane", "min_distance_to_lane_boundary_m")
     if not scene.lane_map.lanes:
+        if preset.missing_road == "absent":
+            return []
         return [series(name, t_us, np.nan, False, NO_LANES) for name in names]
-    origin = origin_of(scene.ego_log)
+    origin = origin_of(scene.ego_log, preset)
     road = road_of(scene.lane_map, origin, preset)
     ego = ego_footprints(rollout, preset, origin)
     shapes = ego.shapes()
@@ -96,7 +98,9 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     if len(road.edges) and len(undecided):
         off[undecided] = road.touches_edge(shapes[undecided], xyz[undecided])
         known[undecided] = True
-    against = wrong_lane(road, held.near, ego.xy, yaw_from_quat(rollout.ego.quat), preset)
+    if preset.missing_road == "absent" and not known.all():
+        return []
+    against = wrong_lane(road, held.near, ego.centres(), yaw_from_quat(rollout.ego.quat), preset)
     return [
         series("offroad", t_us, off, known, NO_EDGES),
         series("wrong_lane", t_us, against),

@@ -27,12 +27,16 @@ class Preset:
     lane_radius_m: float = 6.0
     lane_query: Literal["line", "vertices"] = "line"
     lane_half_width_m: float = 1.85  # buffer of the centre where an edge is missing
+    seam_m: float = 1e-6  # gaps between nearby lanes up to this wide are rounding and are closed
     edge_touch_m: float = 0.001  # off-road below this distance from a road edge, if no lane contains the footprint
     edge_query: Literal["any", "nearest_vertex"] = "any"
     edge_height_m: float = 3.0  # edge_query "any": edges farther above or below the box centre belong to another road
     # Wrong lane. "none_agrees": no lane under the ego runs its way. "any_opposes": at least one runs against it.
+    missing_road: Literal["invalid", "absent"] = "invalid"  # no map, or an edge is needed and there is none
     wrong_lane_rule: Literal["none_agrees", "any_opposes"] = "none_agrees"
     wrap_heading: bool = True  # compare headings modulo a full turn
+    # Precision. False: float64 relative to a local origin. True: coordinates as they stand, poses and corners in float32.
+    float32: bool = False
     # Recorded path.
     invented_starts: bool = False  # the first two rows of the recording-based metrics are constants
     distance_from: Literal["handover", "log_start"] = "handover"  # where dist_traveled_m starts
@@ -40,7 +44,10 @@ class Preset:
     open_loop_horizon_us: int = 3_000_000
     min_ade_horizons_s: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0)
     min_ade_target: Literal["gt", "self"] = "gt"
+    min_ade_rule: Literal["by_time", "by_index"] = "by_time"
+    min_ade_with_z: bool = False
     plan_decay: float = 0.1  # weight exp(-plan_decay * k) of the k-th common plan time
+    plan_with_z: bool = False
     # Images. None: every logged camera counts.
     image_camera: str | None = None
     image_rule: Literal["own_times", "at_or_after_step"] = "own_times"
@@ -59,6 +66,29 @@ class Preset:
 
 PRESETS: dict[str, Preset] = {
     "paper": Preset(name="paper", ego_size_m=(4.855, 1.88)),
+    "alpasim": Preset(
+        name="alpasim",
+        shrink=0.02,
+        roundness=0.5,
+        hits="last",
+        lane_query="vertices",
+        seam_m=0.0,
+        edge_query="nearest_vertex",
+        missing_road="absent",
+        wrong_lane_rule="any_opposes",
+        wrap_heading=False,
+        float32=True,
+        invented_starts=True,
+        distance_from="log_start",
+        min_ade_rule="by_index",
+        image_camera="camera_front_wide_120fov",
+        image_rule="at_or_after_step",
+        aliases=True,
+        replay_is_scored=True,
+        honour_valid=False,
+        stop_beyond_gt_m=4.0,
+        drop_black=True,
+    ),
 }
 
 

@@ -20,7 +20,7 @@ from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, Actor, Lane, RolloutLog, Scene
 from evaluators.footprint import corners, origin_of
-from evaluators.presets import Preset
+from evaluators.presets import PRESETS, Preset
 from evaluators.route import recorded_path
 
 Point = tuple[Fraction, Fraction]
@@ -39,7 +39,7 @@ class StepContact:
 
 def contacts_by_step(rollout: RolloutLog, preset: Preset) -> list[StepContact]:
     """Classify every actor at every step; sharp-cornered footprints only."""
-    origin = origin_of(rollout.ego)
+    origin = origin_of(rollout.ego, preset)
     out = []
     for i, t_us in enumerate(rollout.ego.t_us.tolist()):
         ego = ego_corners(rollout, preset, i, origin)
@@ -133,7 +133,7 @@ class StepRoad:
 
 def road_by_step(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[StepRoad]:
     """Apply the off-road rule step by step (lane query "line", edge query "any")."""
-    origin = origin_of(scene.ego_log)
+    origin = origin_of(scene.ego_log, preset)
     lanes = {key: shifted(lane, origin) for key, lane in scene.lane_map.lanes.items()}
     edges = [edge - origin for edge in scene.lane_map.road_edges]
     out = []
@@ -142,7 +142,7 @@ def road_by_step(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Step
         body = shapely.Polygon(ego_corners(rollout, preset, i, origin))
         near = {key: lane for key, lane in lanes.items() if line_distance(centre, lane.centre) <= preset.lane_radius_m}
         areas = [lane_polygon(lane, preset.lane_half_width_m) for lane in near.values()]
-        union = shapely.union_all(areas)
+        union = shapely.union_all(areas).buffer(preset.seam_m / 2 if len(areas) > 1 else 0.0, join_style="mitre")
         inside_union = bool(areas) and bool(union.contains(body))
         on_road = any(area.contains(body) for area in areas) or inside_union
         touching = any(_touches(edge, body, float(centre[2]), preset) for edge in edges)
@@ -203,7 +203,7 @@ class StepRoute:
 
 def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
     """Project every step on the recorded path, segment by segment; the recording must cover all steps and have a length."""
-    recorded = recorded_path(rollout)
+    recorded = recorded_path(rollout, PRESETS["paper"])
     path = recorded.xyz[:, :2]
     there = interpolate(recorded, rollout.ego.t_us)[:, :2, 3]
     out = []
@@ -235,7 +235,7 @@ def _along(path: F64, point: F64) -> tuple[float, float, float]:
 
 def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
     """Return for each plan with poses whether any of them within the horizon touches an actor; sharp-cornered footprints only."""
-    origin = origin_of(rollout.ego_log)
+    origin = origin_of(rollout.ego_log, preset)
     size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (1.0 - preset.shrink)
     out = []
     for plan in rollout.plans:

@@ -46,7 +46,7 @@ class Road:
         key = np.packbits(lanes).tobytes()
         if key not in self._unions:
             chosen = self.areas[lanes]
-            shape = chosen[0] if len(chosen) == 1 else shapely.union_all(chosen)
+            shape = join(chosen, self._preset.seam_m)
             shapely.prepare(shape)
             self._unions[key] = shape
         return self._unions[key]
@@ -117,6 +117,16 @@ class _Polylines:
         body, segment = body[level], segment[level]
         out[body[shapely.distance(self._segments[segment], footprints[body]) < limit_m]] = True
         return out
+
+
+def join(areas: Geometries, seam_m: float) -> Any:
+    """Return the union of lane areas with gaps up to ``seam_m`` wide closed.
+
+    Lanes that share an edge, but not its vertices, differ there by rounding. Without closing, that hair would decide whether a footprint
+    across the edge is contained, and differently at every origin.
+    """
+    shape = areas[0] if len(areas) == 1 else shapely.union_all(areas)
+    return shapely.buffer(shape, seam_m / 2, join_style="mitre") if seam_m > 0 and len(areas) > 1 else shape
 
 
 def _segment_distance(start: F64, end: F64, points: F64) -> F64:

@@ -6,21 +6,24 @@ rig-to-box pose. All distances are in plan view. The paper's route distance is t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 
 from alpasim_plugin.geometry import arc_lengths, interpolate, offset_trajectory
 from alpasim_plugin.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.base import register, relevant, series
-from evaluators.footprint import origin_of
+from evaluators.footprint import ego_footprints, held, origin_of
 from evaluators.presets import Preset
 
 _MAX_CELLS = 2_000_000  # points x segments handled at once
 
 
-def recorded_path(rollout: RolloutLog) -> Trajectory:
+def recorded_path(rollout: RolloutLog, preset: Preset) -> Trajectory:
     """Return the recorded drive as poses of the box centre."""
-    return offset_trajectory(rollout.ego_log, rollout.T_rig_box)
+    path = offset_trajectory(rollout.ego_log, rollout.T_rig_box)
+    return replace(path, xyz=held(path.xyz, preset))
 
 
 def to_path(path: F64, points: F64) -> tuple[F64, F64]:
@@ -74,32 +77,40 @@ def progress_so_far(path: F64, points: F64) -> F64:
 def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the recording-based metrics and ``eval_relevant`` per step."""
     t_us = rollout.ego.t_us
-    origin = origin_of(rollout.ego_log)
-    recorded = recorded_path(rollout)
+    origin = origin_of(rollout.ego_log, preset)
+    recorded = recorded_path(rollout, preset)
     path = recorded.xyz[:, :2] - origin[:2]
-    ego = rollout.ego.xyz[:, :2] - origin[:2]
+    ego = ego_footprints(rollout, preset, origin).centres()
     distance_m, s = to_path(path, ego)
     length_m = float(arc_lengths(path)[-1])
     covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
-    there = interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :2, 3] - origin[:2]
+    there = held(interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3], preset)[:, :2] - origin[:2]
     away_m = np.hypot(*(ego - there).T)
     share = s / length_m if length_m > 0 else np.full(len(s), np.nan)
     no_length = "the recorded path has no length"
     outside = "the recording does not cover this time"
     engaged = relevant(rollout)
+    so_far = progress_so_far(there, ego)
+    traveled_m = driven(ego, int(np.argmax(engaged)) if preset.distance_from == "handover" else 0)
+    if preset.invented_starts:
+        # AlpaSim fills the first two rows in by hand, and projects the ego on its own path instead of adding up its steps.
+        traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
+        share[:2] = [0.0, share[2] / 2] if len(share) > 2 else 0.0
+        so_far[:2] = 1.0
+        for column in (distance_m, away_m, traveled_m):
+            column[:2] = 0.0
     out = [
         series("dist_to_gt_trajectory", t_us, distance_m),
-        series("route_distance_m", t_us, distance_m),
         series("dist_to_gt_location", t_us, away_m, covered, outside),
         series("progress", t_us, share, length_m > 0, no_length),
-        series("progress_rel", t_us, progress_so_far(there, ego), covered, outside),
-        series("dist_traveled_m", t_us, driven(ego, int(np.argmax(engaged)) if preset.distance_from == "handover" else 0)),
+        series("progress_rel", t_us, so_far, covered, outside),
+        series("dist_traveled_m", t_us, traveled_m),
         series("gt_dist_traveled_m", t_us, np.full(len(t_us), length_m)),
         series("eval_relevant", t_us, engaged),
     ]
     if preset.aliases:
-        out.append(series("progress_rel_to_total", t_us, share, length_m > 0, no_length))
-    return out
+        return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
+    return [*out, series("route_distance_m", t_us, distance_m)]
 
 
 def driven(ego: F64, first: int) -> F64:

@@ -91,7 +91,7 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = "paper
     if "eval_relevant" not in table:
         raise EvaluatorError("reducing a rollout", f"series {sorted(table)}", "no eval_relevant", "pass everything that score() returned")
     for name, parts in _DERIVED_FLAGS.items():
-        if all(part in table for part in parts):
+        if name not in table and all(part in table for part in parts):
             table[name] = _any_of(name, [table[part] for part in parts])
     first_us, last_us, ledger = _window(table, chosen)
     # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have it.
@@ -110,6 +110,7 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = "paper
 
 
 _DERIVED_FLAGS = {
+    "collision_at_fault": ("collision_front", "collision_lateral"),
     "offroad_or_collision": ("collision_any", "offroad"),
     "offroad_or_collision_at_fault": ("collision_at_fault", "offroad"),
 }

@@ -22,7 +22,7 @@ SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 
 
 def sides_by_step(log, preset=PAPER):
-    origin = origin_of(log.ego)
+    origin = origin_of(log.ego, preset)
     table = ActorTable(log, preset, origin)
     contacts, gap_m = find_contacts(ego_footprints(log, preset, origin), table, log.ego.t_us)
     out = [{} for _ in range(len(log.ego))]

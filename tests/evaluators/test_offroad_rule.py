@@ -28,7 +28,7 @@ def offroad_of(log, lane_map, preset="paper"):
 
 def held(log, lane_map, preset=PAPER):
     where = scene(lane_map, log)
-    origin = origin_of(where.ego_log)
+    origin = origin_of(where.ego_log, PAPER)
     road = road_of(lane_map, origin, preset)
     return containment(road, ego_footprints(log, preset, origin).shapes(), log.ego.xyz - origin)
 
@@ -65,7 +65,7 @@ def test_leaving_the_lanes_onto_the_edge_is_off_road():
 
 def test_touching_the_lane_border_from_inside_is_on_road():
     log = rollout(track(0.0, -1.75 + HALF_W))
-    origin = origin_of(scene(TWO_LANES, log).ego_log)
+    origin = origin_of(scene(TWO_LANES, log).ego_log, PAPER)
     ring = np.array([[-50, -1.75], [200, -1.75], [200, 1.75], [-50, 1.75]]) - origin[:2]
     assert held(log, TWO_LANES).in_one.tolist() == [convex_contains(ring, ego_corners(log, PAPER, 0, origin))]
     # Inside, the road edge half a millimetre away does not matter; outside it does.
@@ -165,7 +165,7 @@ def test_reversed_right_edge_is_repaired_to_its_two_triangles():
     # The ring crosses itself at x = 75, y = 0: on the left of it two triangles meet the left edge only near the ends.
     log = rollout(track([-40.0, 75.0], [0.0, 0.0]))
     where = scene(road_map(crossed), log)
-    area = road_of(where.lane_map, origin_of(where.ego_log), PAPER).areas[0]
+    area = road_of(where.lane_map, origin_of(where.ego_log, PAPER), PAPER).areas[0]
     assert shapely.is_valid(area)
     assert area.area == pytest.approx(250 * 3.5 / 2)
     assert held(log, where.lane_map).in_one.tolist() == [False, False]
@@ -261,6 +261,6 @@ def test_a_footprint_on_the_lane_border_flips_only_next_to_it(nudge, turn):
     turned = replace(one, centre=one.centre @ spin.T, left=one.left @ spin.T, right=one.right @ spin.T)
     at = spin @ np.array([3.0, 1.75 - HALF_W + nudge, 0.0])
     log = rollout(track(at[0], at[1], yaw=turn))
-    origin = origin_of(scene(road_map(turned), log).ego_log)
+    origin = origin_of(scene(road_map(turned), log).ego_log, PAPER)
     ring = np.concatenate([turned.left[:, :2], turned.right[::-1, :2]]) - origin[:2]
     assert held(log, road_map(turned)).in_one.tolist() == [convex_contains(ring, ego_corners(log, PAPER, 0, origin))]
