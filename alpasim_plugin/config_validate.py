@@ -52,8 +52,11 @@ def dotted(loc: Sequence[str | int]) -> str:
 
 def _as_input_error(model: type[BaseModel], document: Document, error: ValidationError, doing: str) -> InputError:
     problems = []
-    for item in error.errors(include_url=False):
+    items = error.errors(include_url=False)
+    for item in items:
         loc = tuple(item["loc"])
+        if _follows_from_another(item, items):
+            continue
         known = _in_document(document.data, loc)
         mark = document.mark(known)
         found, hint = _explain(model, document, item, loc, known)
@@ -65,6 +68,20 @@ def _as_input_error(model: type[BaseModel], document: Document, error: Validatio
         rest = "; ".join(f"{m}: {f}" for m, f, _ in problems[1:])
         found += f" (and {len(problems) - 1} more: {rest})"
     return InputError(doing, str(mark), found, hint)
+
+
+def _follows_from_another(item: Any, items: Sequence[Any]) -> bool:
+    """Say whether a problem is only the shadow of another one.
+
+    A list whose items are wrong counts as too short as well; a misspelt key leaves the right one missing.
+    """
+    loc = tuple(item["loc"])
+    if item["type"] == "too_short":
+        return any(len(o["loc"]) > len(loc) and tuple(o["loc"][: len(loc)]) == loc for o in items)
+    if item["type"] == "missing":
+        extra = [str(o["loc"][-1]) for o in items if o["type"] == "extra_forbidden" and tuple(o["loc"][:-1]) == loc[:-1]]
+        return bool(difflib.get_close_matches(str(loc[-1]), extra, n=1, cutoff=0.6))
+    return False
 
 
 def _in_document(data: Any, loc: Key) -> Key:
@@ -107,6 +124,9 @@ def _explain(model: type[BaseModel], document: Document, item: Any, loc: Key, kn
         return f"{name}: {found}", hint or "correct the value"
     if kind.endswith("_type") or kind.endswith("_parsing"):
         return f"{name} = {value!r} ({_kind_of(value)})", f"{item['msg'].replace('Input should be', 'give')}"
+    if kind in ("too_short", "too_long"):
+        bound = f"at least {ctx['min_length']}" if kind == "too_short" else f"at most {ctx['max_length']}"
+        return f"{name} = {value!r}", f"give {bound} item{'s' if bound[-2:] != ' 1' else ''}"
     return f"{name} = {value!r}", item["msg"].replace("Input should be", "give a value").replace("Input should", "the value should")
 
 

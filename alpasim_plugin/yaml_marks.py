@@ -93,30 +93,30 @@ def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[
     Raises:
         InputError: Not valid YAML, or outside the bounds.
     """
-    loader = _CoreLoader(text)
     try:
+        loader = _CoreLoader(text)
         node = loader.get_single_node()
-        builder = _Builder(loader, file, doing)
+        builder = _Builder(file, doing)
         data = builder.build(node, (), 0) if node is not None else None
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         at = file if mark is None or override else f"{file}:{mark.line + 1}:{mark.column + 1}"
         found = " ".join(str(part) for part in (e.context, e.problem) if part)
         raise InputError(doing, at, f"not valid YAML: {found}", "correct the syntax (indentation, colon, quote or bracket)") from e
-    except yaml.YAMLError as e:
-        raise InputError(doing, file, f"not valid YAML: {e}", "save the file as plain UTF-8 text") from e
+    except yaml.reader.ReaderError as e:
+        line = text.count("\n", 0, e.position) + 1
+        at = file if override else f"{file}:{line}:{e.position - text.rfind(chr(10), 0, e.position)}"
+        raise InputError(doing, at, f"not valid YAML: the control character {e.character!r}", "save the file as plain UTF-8 text") from e
     except RecursionError as e:
         raise InputError(doing, file, f"nested deeper than {MAX_DEPTH} levels", "flatten the file") from e
-    finally:
-        loader.dispose()
     return data, builder.marks
 
 
 class _Builder:
     """Turns a node tree into plain data and positions, within bounds."""
 
-    def __init__(self, loader: _CoreLoader, file: str, doing: str) -> None:
-        self.loader, self.file, self.doing = loader, file, doing
+    def __init__(self, file: str, doing: str) -> None:
+        self.file, self.doing = file, doing
         self.marks: dict[Key, Mark] = {}
         self.n_nodes = 0
         self.open: set[int] = set()
@@ -138,6 +138,8 @@ class _Builder:
         self.marks.setdefault(loc, self.position(node))
         if isinstance(node, yaml.ScalarNode):
             return self.scalar(node)
+        if not node.tag.endswith((":seq", ":map")):
+            raise self.fail(node, f"the tag {node.tag!r}", "use plain YAML values without tags")
         self.open.add(id(node))
         if isinstance(node, yaml.SequenceNode):
             out: Any = [self.build(child, (*loc, i), depth + 1) for i, child in enumerate(node.value)]
@@ -176,6 +178,11 @@ class _Builder:
             if kind == "int":
                 text = str(node.value)
                 return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
-            return float(self.loader.construct_yaml_float(node))
+            return _float(str(node.value))
         except ValueError as e:
             raise self.fail(node, f"{node.value!r} is not a number", "correct the number") from e
+
+
+def _float(text: str) -> float:
+    word = text.replace("_", "").lower()
+    return float(word.replace(".inf", "inf").replace(".nan", "nan"))

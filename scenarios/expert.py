@@ -17,10 +17,11 @@ from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceler
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.scripted import track_on_path
 from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
-from scenarios.foresight import Script, ScriptTable, foresee
+from scenarios.foresight import TIMES_S, Ahead, Script, ScriptTable, foresee
 
 LOG_STEP_US = 10_000  # 100 Hz
 DECISION_US = 50_000
+FORESIGHT_US = 100_000
 MAX_ACCEL_MPS2, MAX_BRAKE_MPS2, MAX_JERK_MPS3 = 2.0, 7.0, 10.0
 STOP_JERK_MPS3 = 5.0
 COMFORT_BRAKE_MPS2 = 1.5
@@ -111,8 +112,9 @@ class _Expert:
 
     def __init__(self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptTable) -> None:
         self.path, self.vehicle, self.table = path, vehicle, table
+        self.lookup = path.coarser(4)  # projections search every station; 1 m apart is enough for them
         self.limit = speed_limits(path, style)
-        self.s, self.a = s0_m, 0.0
+        self.s, self.a, self.cap = s0_m, 0.0, float("inf")
         self.v = min(style.speed_mps, float(np.interp(s0_m, path.s, self.limit)))
         self.params = IdmParams(style.cruise_mps, style.headway_s, MIN_GAP_M, MAX_ACCEL_MPS2 * 0.75, 2.0, MAX_BRAKE_MPS2)
         self.front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
@@ -132,11 +134,13 @@ class _Expert:
         ahead = float(np.interp(self.s + 0.4 * self.v, self.path.s, self.limit))
         wanted = min(1.5 * (ahead - self.v), MAX_ACCEL_MPS2)
         half = self.vehicle.box.width_m / 2
-        for leader in (find_leader(self.path, self.front_s, half, others, margin_m=0.3), nearest_ahead(self.standing, self.front_s, half)):
+        moving = find_leader(self.lookup, self.front_s, half, others, margin_m=0.3)
+        for leader in (moving, nearest_ahead(self.standing, self.front_s, half)):
             if leader.index >= 0:
                 wanted = min(wanted, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params))
-        cap = foresee(self.path, self.front_s, self.v, self.vehicle.box, self.table, [c.foreseen for c in cars], t_us, MIN_GAP_M)
-        return max(min(wanted, cap), -MAX_BRAKE_MPS2)
+        if t_us % FORESIGHT_US == 0:
+            self.cap = foresee(self.lookup, self.front_s, self.v, self.vehicle.box, _ahead(self.table, cars, t_us), MIN_GAP_M)
+        return max(min(wanted, self.cap), -MAX_BRAKE_MPS2)
 
     def advance(self, wanted: float, dt_s: float) -> None:
         step = MAX_JERK_MPS3 * dt_s
@@ -158,14 +162,9 @@ class _Car:
         self.standing = spans(f.path, 0.0, standing, f.path.length_m + 100.0, window=False)
 
     def bodies(self) -> Bodies:
-        return self.foreseen(0.0)
-
-    def foreseen(self, after_s: float) -> Bodies:
-        """Return where the car will be at its present speed, on its own line."""
-        s = self.s + self.v * after_s
-        if s > self.f.path.length_m:
+        if self.s > self.f.path.length_m:
             return NO_BODIES
-        xyz, yaw = self.f.path.at(s, self.f.offset_m)
+        xyz, yaw = self.f.path.at(self.s, self.f.offset_m)
         direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
         return bodies_from(xyz[:2], yaw, [self.f.box], self.v * direction)
 
@@ -185,3 +184,21 @@ class _Car:
 
     def track(self, times: I64) -> Trajectory:
         return track_on_path(self.f.path, times, np.array(self.log_s[: len(times)]), self.f.box, self.f.offset_m)
+
+
+def _ahead(table: ScriptTable, cars: Sequence[_Car], t_us: int) -> Ahead:
+    """Return scripted tracks as they are written, and reactive cars at their present speed on their own lines."""
+    rows = table.rows(t_us)
+    xy, yaw = [table.xy[rows]], [table.yaw[rows]]
+    velocity, present = [table.velocity[rows]], [table.present[rows]]
+    for car in cars:
+        s = car.s + car.v * TIMES_S
+        xyz, heading = car.f.path.at(s, car.f.offset_m)
+        xy.append(xyz[:, None, :2])
+        yaw.append(heading[:, None])
+        velocity.append(car.v * np.stack([np.cos(heading), np.sin(heading)], axis=-1)[:, None])
+        present.append((s <= car.f.path.length_m)[:, None])
+    return Ahead(
+        np.concatenate(xy, axis=1), np.concatenate(yaw, axis=1), np.concatenate(velocity, axis=1), np.concatenate(present, axis=1),
+        (*table.boxes, *(car.f.box for car in cars)), np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
+    )  # fmt: skip

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from alpasim_plugin.geometry import yaw_from_quat
-from alpasim_plugin.types import Box, Trajectory
+from alpasim_plugin.types import F64, I64, Bool, Box, Trajectory
 from alpasim_plugin.world.idm import Bodies, spans
 from alpasim_plugin.world.path import Path
-from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
+from alpasim_plugin.world.state import NO_BODIES, bodies_from
 
 LOOKAHEAD_S = tuple(float(t) for t in np.arange(0.5, 4.01, 0.5))
+TIMES_S = np.array([0.0, *LOOKAHEAD_S])
 HORIZON_M = 80.0
 SIDE_M = 0.3
 STANDING_M = 0.05  # a track that never moves farther than this stands
@@ -74,10 +75,25 @@ class ScriptTable:
         return bodies_from(self.xy[i, keep], self.yaw[i, keep], [self.boxes[k] for k in keep], self.velocity[i, keep])
 
 
-def foresee(
-    path: Path, front_s: float, speed_mps: float, box: Box, table: ScriptTable, reactive: Sequence[Callable[[float], Bodies]], t_us: int,
-    min_gap_m: float,
-) -> float:  # fmt: skip
+    def rows(self, t_us: int) -> I64:
+        """Return the grid rows of now and of the look-ahead."""
+        rows = (t_us + np.round(TIMES_S * 1e6).astype(np.int64)) // self.step_us
+        return np.minimum(rows, len(self.times) - 1)
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """Road users now (first row) and after each time of `LOOKAHEAD_S`."""
+
+    xy: F64  # (1 + n, K, 2)
+    yaw: F64  # (1 + n, K)
+    velocity: F64  # (1 + n, K, 2)
+    present: Bool  # (1 + n, K)
+    boxes: tuple[Box, ...]
+    yields: Bool  # (K,) reactive: it lets the ego go first when it is behind
+
+
+def foresee(path: Path, front_s: float, speed_mps: float, box: Box, ahead: Ahead, min_gap_m: float) -> float:
     """Return the largest acceleration that keeps behind everyone who will come into the corridor; infinite without such a one.
 
     For a body that will be in the corridor after ``tau`` seconds with its rear at ``r``, the own front must then not be beyond
@@ -90,45 +106,28 @@ def foresee(
         front_s: Arc length of the front bumper.
         speed_mps: Own speed.
         box: Ego body.
-        table: Scripted tracks.
-        reactive: For each reactive car, its foreseen bodies after a time in seconds.
-        t_us: Now.
+        ahead: Everyone who moves.
         min_gap_m: Gap to keep from a standing body; half a second is added for a moving one.
     """
-    half = box.width_m / 2 + SIDE_M
-    n_scripted = len(table.boxes)
-    now = _corridor(path, front_s, table.moving(t_us), [car(0.0) for car in reactive], half)
-    cap = np.inf
-    for tau in LOOKAHEAD_S:
-        scripted = table.moving(t_us + round(tau * 1e6))
-        if n_scripted and len(scripted.xy) != len(table.moving(t_us).xy):
-            continue  # someone enters or leaves the scene in between; its row numbers are not comparable
-        then = _corridor(path, front_s, scripted, [car(tau) for car in reactive], half)
-        for key, (rear, front, speed, inside) in then.items():
-            if not inside or key not in now:
-                continue
-            rear_now, _, _, inside_now = now[key]
-            is_reactive = key[0] == "r"
-            passed = front < front_s + speed_mps * tau - box.length_m - 1.0
-            if inside_now or passed or front < front_s or (is_reactive and rear_now < front_s + 0.5):
-                continue
-            gap = min_gap_m + 0.5 * speed
-            cap = min(cap, 2.0 * (rear - gap - front_s - speed_mps * tau) / (tau * tau))
-    return float(cap)
-
-
-def _corridor(
-    path: Path, front_s: float, scripted: Bodies, reactive: Sequence[Bodies], half_m: float
-) -> dict[tuple[str, int], tuple[float, float, float, bool]]:
-    """Return (rear, front, speed, inside) along the path by body; ("s", row) scripted, ("r", car) reactive."""
-    keys = [("s", i) for i in range(len(scripted.xy))]
-    for i, car in enumerate(reactive):
-        keys += [("r", i)] * len(car.xy)
-    span = spans(path, front_s, concatenate([scripted, *reactive]), HORIZON_M)
+    n, k = ahead.yaw.shape
+    if k == 0:
+        return float("inf")
+    flat = bodies_from(ahead.xy.reshape(-1, 2), ahead.yaw.reshape(-1), ahead.boxes * n, ahead.velocity.reshape(-1, 2))
+    span = spans(path, front_s, flat, HORIZON_M)
     if span is None:
-        return {}
-    inside = (span.low < half_m) & (span.high > -half_m)
-    return {
-        keys[int(row)]: (float(span.rear[n]), float(span.front[n]), float(span.speed[n]), bool(inside[n]))
-        for n, row in enumerate(span.index)
-    }
+        return float("inf")
+    half = box.width_m / 2 + SIDE_M
+    rear, front, speed = np.full(n * k, np.inf), np.full(n * k, -np.inf), np.zeros(n * k)
+    inside = np.zeros(n * k, dtype=np.bool_)
+    rear[span.index], front[span.index], speed[span.index] = span.rear, span.front, span.speed
+    inside[span.index] = (span.low < half) & (span.high > -half)
+    rear, front, speed, inside = (a.reshape(n, k) for a in (rear, front, speed, inside & ahead.present.reshape(-1)))
+    tau = TIMES_S[:, None]
+    passed = front < front_s + speed_mps * tau - box.length_m - 1.0
+    behind = ahead.yields & (rear[0] < front_s + 0.5)
+    counts = inside & ~passed & (front >= front_s) & ~inside[0] & ~behind & ahead.present[0]
+    counts[0] = False
+    if not counts.any():
+        return float("inf")
+    allowed = rear - (min_gap_m + 0.5 * speed) - front_s - speed_mps * tau
+    return float(np.min(2.0 * allowed[counts] / np.broadcast_to(tau, counts.shape)[counts] ** 2))

@@ -57,7 +57,7 @@ def sample_clothoid(
 
 
 def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> F64:
-    """Join two poses by a quintic Hermite curve with zero curvature at both ends.
+    """Join two poses by a quintic Hermite curve with zero curvature at both ends, and straights where a turn is longer on one side.
 
     The common tangent length is the one, out of a fixed set, with the smallest peak curvature: turning lanes come out as wide as the
     junction allows.
@@ -65,6 +65,39 @@ def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> 
     Returns:
         ``(N, 3)``: x, y, heading; first and last points are ``p0`` and ``p1`` exactly.
     """
+    before, after = _leads(p0, yaw0, p1, yaw1)
+    q0 = p0[:2] + before * np.array([np.cos(yaw0), np.sin(yaw0)])
+    q1 = p1[:2] - after * np.array([np.cos(yaw1), np.sin(yaw1)])
+    turn = _turn(q0, yaw0, q1, yaw1, step_m)
+    head, tail = _straight(p0, q0, yaw0, step_m)[:-1], _straight(q1, p1, float(turn[-1, 2]), step_m)[1:]
+    curve = np.concatenate([head, turn, tail])
+    curve[0, :2], curve[-1, :2] = p0[:2], p1[:2]
+    return curve
+
+
+def _leads(p0: F64, yaw0: float, p1: F64, yaw1: float) -> tuple[float, float]:
+    """Return the straights before and after a turn that make what is left of it as long on one side as on the other."""
+    d0, d1 = np.array([np.cos(yaw0), np.sin(yaw0)]), np.array([np.cos(yaw1), np.sin(yaw1)])
+    cross = float(d0[0] * d1[1] - d0[1] * d1[0])
+    if abs(cross) < 0.1:
+        return 0.0, 0.0
+    span = p1[:2] - p0[:2]
+    a = float(span[0] * d1[1] - span[1] * d1[0]) / cross  # from p0 to where the two lines meet
+    b = float(d0[0] * span[1] - d0[1] * span[0]) / cross  # and on to p1
+    if a <= 0 or b <= 0:
+        return 0.0, 0.0
+    shorter = min(a, b)
+    return a - shorter, b - shorter
+
+
+def _straight(p: F64, q: F64, yaw: float, step_m: float) -> F64:
+    """Return ``(N, 3)`` rows from p to q; the single row p where they are the same."""
+    n = int(np.ceil(float(np.hypot(*(q[:2] - p[:2]))) / step_m - 1e-6))
+    share = np.linspace(0.0, 1.0, n + 1)[:, None]
+    return np.column_stack([p[:2] + share * (q[:2] - p[:2]), np.full(n + 1, yaw)])
+
+
+def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float) -> F64:
     chord = float(np.hypot(p1[0] - p0[0], p1[1] - p0[1]))
     n = max(8, int(np.ceil(1.2 * chord / step_m)))
     t = np.linspace(0.0, 1.0, n + 1)

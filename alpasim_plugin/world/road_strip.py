@@ -86,7 +86,8 @@ def build_strip(draft: MapDraft, name: str, curve: F64, profile: Profile, joint:
             if key in joint:
                 line[0] = joint[key]
     forward = tuple(draft.add(_forward_lane(name, k, lines, profile)) for k in range(profile.forward))
-    backward = tuple(draft.add(_backward_lane(name, k, lines, profile)) for k in range(profile.backward))
+    turned = reverse(lines)
+    backward = tuple(draft.add(_backward_lane(name, k, turned, profile)) for k in range(profile.backward))
     add_sides(draft, name, lines, profile)
     return Strip(forward, backward, lines)
 
@@ -104,6 +105,11 @@ def make_lines(curve: F64, profile: Profile) -> dict[str, F64]:
     lines["right"] = offset_line(curve, -profile.right_extent_m()) if strip else lines[f"f{profile.forward}"]
     lines["left"] = offset_line(curve, profile.left_extent_m()) if strip else lines[f"b{profile.backward}"]
     return lines
+
+
+def reverse(lines: dict[str, F64]) -> dict[str, F64]:
+    """Return the oncoming lanes' lines in their own driving direction; neighbours go on sharing one array."""
+    return {key: line[::-1].copy() for key, line in lines.items() if key.startswith("b")}
 
 
 def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profile) -> None:
@@ -148,12 +154,12 @@ def _forward_lane(name: str, k: int, lines: dict[str, F64], profile: Profile) ->
     )
 
 
-def _backward_lane(name: str, k: int, lines: dict[str, F64], profile: Profile) -> Lane:
+def _backward_lane(name: str, k: int, turned: dict[str, F64], profile: Profile) -> Lane:
     return Lane(
         f"{name}_b{k}",
-        lines[f"bc{k}"][::-1],
-        lines[f"b{k}"][::-1],
-        lines[f"b{k + 1}"][::-1],
+        turned[f"bc{k}"],
+        turned[f"b{k}"],
+        turned[f"b{k + 1}"],
         left_neighbour=f"{name}_b{k - 1}" if k > 0 else None,
         right_neighbour=f"{name}_b{k + 1}" if k + 1 < profile.backward else None,
         left_paint=inner_paint(profile) if k == 0 else profile.lane_paint,

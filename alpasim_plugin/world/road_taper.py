@@ -9,7 +9,7 @@ import numpy as np
 from alpasim_plugin.types import F64, Lane
 from alpasim_plugin.world.curves import offset_line, smoothstep
 from alpasim_plugin.world.road_elements import Profile
-from alpasim_plugin.world.road_strip import Joint, MapDraft, Strip, add_sides, build_strip, make_lines
+from alpasim_plugin.world.road_strip import Joint, MapDraft, Strip, add_sides, build_strip, make_lines, reverse
 
 
 def build_taper(
@@ -50,8 +50,9 @@ def build_taper(
     inner = replace(profile, shoulder_m=0.0, parking_m=0.0)
     scratch = MapDraft()
     strip = build_strip(scratch, name, curve, inner)
+    turned = reverse(lines)
     for lane_id in (*strip.forward, *strip.backward):
-        draft.add(_with_lines(scratch.lanes[lane_id], lane_id, name, lines, n))
+        draft.add(_with_lines(scratch.lanes[lane_id], lane_id, name, lines, turned, n))
     slant = draft.add(
         Lane(f"{name}_{kind}", centre, left, right, left_paint="none", right_paint=profile.edge_paint,
              speed_limit_mps=profile.speed_limit_mps)
@@ -63,10 +64,10 @@ def build_taper(
     return Strip(strip.forward, strip.backward, end_lines), slant
 
 
-def _with_lines(lane: Lane, lane_id: str, name: str, lines: dict[str, F64], n: int) -> Lane:
+def _with_lines(lane: Lane, lane_id: str, name: str, lines: dict[str, F64], turned: dict[str, F64], n: int) -> Lane:
     """Put the shared line arrays into a lane, and dashed paint where the slanting lane crosses."""
     k = int(lane_id.removeprefix(f"{name}_")[1:])
     if lane_id.startswith(f"{name}_f"):
         paint = "dashed_white" if k == n - 1 else lane.right_paint
         return replace(lane, centre=lines[f"fc{k}"], left=lines[f"f{k}"], right=lines[f"f{k + 1}"], right_paint=paint)
-    return replace(lane, centre=lines[f"bc{k}"][::-1], left=lines[f"b{k}"][::-1], right=lines[f"b{k + 1}"][::-1])
+    return replace(lane, centre=turned[f"bc{k}"], left=turned[f"b{k}"], right=turned[f"b{k + 1}"])

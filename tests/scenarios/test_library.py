@@ -1,0 +1,143 @@
+"""Every shipped scenario: it loads, its expert drives cleanly, and its parts fit together."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
+from alpasim_plugin.types import F64, Box, Scenario
+from alpasim_plugin.world.actors import make_actors
+from alpasim_plugin.world.ego import ego_state_from_log
+from scenarios.load import LIBRARY, load_scenario, shipped_names
+from scenarios.suite import load_suite, shipped, suites
+
+BUILT = [name for name in shipped_names() if not name.startswith("real/")]
+CAR = Box(4.855, 1.88, 1.6)
+
+
+@functools.cache
+def scenario(name: str) -> Scenario:
+    return load_scenario(name)
+
+
+def rectangle(pose: F64, box: Box, ahead_m: float = 0.0) -> shapely.Polygon:
+    """One footprint by plain trigonometry: the slow twin of the array code in `scenarios.check`."""
+    yaw = yaw_of(pose)
+    centre = pose[:2, 3] + ahead_m * np.array([np.cos(yaw), np.sin(yaw)])
+    along, aside = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    l, w = box.length_m / 2, box.width_m / 2  # noqa: E741
+    return shapely.Polygon([centre + a * l * along + b * w * aside for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))])
+
+
+def test_the_library_is_as_large_as_promised() -> None:
+    def count(folder: str) -> int:
+        return sum(name.startswith(f"{folder}/") for name in shipped_names())
+
+    assert count("smoke") >= 3
+    assert count("urban") + count("highway") >= 20
+    assert count("hard") >= 8
+    assert count("real") >= 1
+
+
+@pytest.mark.parametrize("name", BUILT)
+def test_expert_stays_on_the_road_and_clear_of_everybody(name: str) -> None:
+    s = scenario(name)
+    lanes = [shapely.Polygon(np.concatenate([lane.left, lane.right[::-1]])[:, :2]).buffer(1e-3)  # type: ignore[index]
+             for lane in s.lane_map.lanes.values() if lane.kind == "vehicle"]  # fmt: skip
+    road = shapely.union_all(lanes)
+    shapely.prepare(road)
+    for t in range(0, s.end_us + 1, 100_000):
+        ego = rectangle(interpolate(s.ego_log, t), CAR, s.vehicle.rear_axle_to_centre_m)
+        assert road.covers(ego), f"off the lanes at {t / 1e6} s"
+        for actor in s.actors:
+            if actor.track.t_us[0] <= t <= actor.track.t_us[-1]:
+                gap = ego.distance(rectangle(interpolate(actor.track, t), actor.box))
+                assert gap > 0.3, f"{actor.actor_id} at {t / 1e6} s"
+
+
+@pytest.mark.parametrize("name", BUILT)
+def test_expert_drives_smoothly(name: str) -> None:
+    log = scenario(name).ego_log
+    assert (np.diff(log.t_us) == 10_000).all()
+    v = np.hypot(*np.gradient(log.xyz[:, :2], 0.01, axis=0).T)
+    a = np.gradient(v, 0.01)
+    jerk = np.gradient(a, 0.01)[3:-3]
+    yaw_rate = np.gradient(np.unwrap(yaw_from_quat(log.quat)), 0.01)
+    assert a.min() > -7.1
+    assert a.max() < 2.1
+    assert np.abs(jerk).max() < 13.0
+    assert np.abs(v * yaw_rate).max() < 3.2, "lateral acceleration"
+    heading = np.unwrap(np.arctan2(*np.diff(log.xyz[:, 1::-1], axis=0).T))
+    moving = np.hypot(*np.diff(log.xyz[:, :2], axis=0).T) > 0.01
+    slip = np.abs((heading - np.unwrap(yaw_from_quat(log.quat))[:-1] + np.pi) % (2 * np.pi) - np.pi)
+    assert slip[moving].max() < 0.02, "the rear axle moves where the car points"
+
+
+@pytest.mark.parametrize("name", [*BUILT, "real/us101"])
+def test_scenario_is_complete(name: str) -> None:
+    s = scenario(name)
+    assert s.ego_log.t_us[0] <= s.start_us < s.start_us + s.warmup_us < s.end_us <= s.ego_log.t_us[-1]
+    assert len({a.actor_id for a in s.actors}) == len(s.actors)
+    assert s.cameras
+    assert len(s.content_hash) == 64
+    assert set(s.route.lane_ids) <= set(s.lane_map.lanes)
+    assert s.lane_map.road_edges
+    for actor in s.actors:
+        assert (np.diff(actor.track.t_us) > 0).all()
+        assert np.isfinite(actor.track.xyz).all()
+        np.testing.assert_allclose(np.linalg.norm(actor.track.quat, axis=1), 1.0)
+    assert shipped()[name], "a description for simrun list"
+
+
+@pytest.mark.parametrize("name", [n for n in BUILT if n.startswith("smoke/")])
+def test_smoke_scenarios_are_short_and_small(name: str) -> None:
+    s = scenario(name)
+    assert (s.end_us - s.start_us) <= 8_000_000
+    assert s.cameras[0].width * s.cameras[0].height <= 256 * 144
+
+
+@pytest.mark.parametrize("name", ["smoke/lead_car", "highway/congestion", "urban/avenue_traffic"])
+def test_traffic_beside_the_expert_drives_as_it_did_at_load(name: str) -> None:
+    """The reactive drivers meet the same ego in the loop as at load, so they come out on their tracks."""
+    s = scenario(name)
+    actors = make_actors(s)
+    for t in range(s.start_us, s.end_us + 1, 50_000):
+        poses = actors.step(t, ego_state_from_log(s.ego_log, t, s.vehicle))
+    for actor in s.actors:
+        if actor.behaviour.kind == "idm" and s.end_us <= actor.track.t_us[-1]:
+            apart = poses[actor.actor_id][:2, 3] - interpolate(actor.track, t)[:2, 3]
+            assert np.hypot(*apart) < 1.5, actor.actor_id
+
+
+def test_scenarios_are_different_from_each_other() -> None:
+    shapes = {tuple(np.round(scenario(n).ego_log.xyz[::200, :2].ravel(), 1)) for n in BUILT}
+    assert len(shapes) == len(BUILT)
+
+
+def test_suites_hold_what_their_folders_hold() -> None:
+    for name in ("smoke", "urban", "highway", "hard"):
+        assert [Path(r.path).stem for r in load_suite(name)] == [n.split("/")[1] for n in BUILT if n.startswith(name)]
+    assert len(load_suite("suites/all")) == len(shipped_names())
+    assert set(suites()) == {"suites/smoke", "suites/urban", "suites/highway", "suites/hard", "suites/all"}
+
+
+def test_shipped_recording_is_the_published_file_with_its_licence() -> None:
+    data = LIBRARY / "data"
+    digest = hashlib.sha256((data / "USA_US101-3_3_T-1.xml").read_bytes()).hexdigest()
+    assert digest == "b8dacfb2d4d219daf9ac504ff27beaf454f012eb2af53e37151df01cdd33cc3f"
+    assert digest in (data / "SOURCE.md").read_text()
+    assert "Redistribution and use" in (data / "LICENSE.commonroad.txt").read_text()
+    assert "OpenStreetMap contributors" in (data / "SOURCE.md").read_text()
+
+
+def test_shipped_recording_loads_with_its_traffic() -> None:
+    s = scenario("real/us101")
+    assert (s.source, s.scene_id) == ("commonroad", "us101")
+    assert len(s.lane_map.lanes) == 12
+    assert len(s.actors) == 11

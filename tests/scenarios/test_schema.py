@@ -1,0 +1,54 @@
+"""The committed JSON Schema and the documented keys are those of the code."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import yaml
+
+from scenarios.load import LIBRARY, load_scenario, shipped_names
+from scenarios.schema import SCHEMA_FILE, ScenarioSpec, json_schema, models
+from scenarios.schema_docs import key_tables
+
+
+def test_committed_schema_is_current() -> None:
+    assert SCHEMA_FILE.read_text(encoding="utf-8") == json_schema(), "run python -m scenarios.schema"
+
+
+def test_schema_is_closed_and_versioned() -> None:
+    schema = json.loads(json_schema())
+    assert schema["properties"]["version"]["const"] == 1
+    assert schema["additionalProperties"] is False
+    assert all(d.get("additionalProperties") is False for name, d in schema["$defs"].items() if d.get("type") == "object")
+
+
+def test_every_key_has_a_description() -> None:
+    for where, model in models().items():
+        for name, field in model.model_fields.items():
+            assert field.description or name == "kind", f"{where}.{name}"
+
+
+def test_documented_tables_are_current(repo: Path) -> None:
+    text = (repo / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    begin, end = "<!-- keys: begin -->\n", "<!-- keys: end -->"
+    assert text.split(begin)[1].split(end)[0] == key_tables(), "run python -m scenarios.schema_docs docs/scenarios.md"
+
+
+def test_examples_in_the_docs_load(repo: Path, tmp_path: Path) -> None:
+    text = (repo / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    examples = [block for block in re.findall(r"```yaml\n(.*?)```", text, re.S) if "version: 1" in block and "road:" in block]
+    assert examples
+    for i, block in enumerate(examples):
+        path = tmp_path / f"example{i}.yaml"
+        path.write_text(block)
+        assert load_scenario(path).lane_map.lanes
+
+
+def test_shipped_files_use_no_default_spelled_out_wrongly() -> None:
+    """Every shipped file parses with an ordinary YAML reader as well: nothing depends on our own scalar rules."""
+    for name, file in shipped_names().items():
+        assert isinstance(yaml.safe_load(file.read_text()), dict), name
+    assert ScenarioSpec.model_fields["version"].is_required()
+    assert (LIBRARY / "schema.json").is_file()

@@ -1,0 +1,148 @@
+"""Seeds: the same file and seed give the same bits; another seed gives another scene inside the declared ranges."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import Scenario
+from scenarios.load import load_scenario
+
+BASE = """
+version: 1
+road:
+  lane_width_m: 3.5
+  segments:
+    - {kind: straight, length_m: 100}
+    - {kind: clothoid, length_m: 30, end_curvature_per_m: 0.01}
+    - {kind: arc, length_m: 120, curvature_per_m: 0.01}
+ego: {speed_mps: 10, cruise_mps: 10}
+actors:
+  - {kind: drive, id: lead, s_m: 40, speeds: [[0, 10]]}
+  - {kind: parked, id: parked, s_m: 30, clearance_m: 0.5}
+"""
+
+
+def write(folder: Path, more: str = "") -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(BASE + more)
+    return path
+
+
+def bits(value: Any) -> Any:
+    """Return plain data in which every array is its bytes."""
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, value.shape, value.tobytes())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: bits(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {k: bits(v) for k, v in value.items()}
+    return [bits(v) for v in value] if isinstance(value, tuple | list) else value
+
+
+@pytest.mark.parametrize("name", ["smoke/lead_car", "hard/occluded_pedestrian", "urban/junction_left", "real/us101"])
+def test_same_file_and_seed_give_a_bit_identical_scenario(name: str) -> None:
+    assert bits(load_scenario(name, seed=5)) == bits(load_scenario(name, seed=5))
+
+
+def test_asking_for_the_files_own_seed_changes_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path, "seed: 3\n")
+    assert bits(load_scenario(path)) == bits(load_scenario(path, seed=3))
+
+
+def test_other_seeds_change_road_actors_and_hash_and_name_the_scene(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    scenes = [load_scenario(path, seed=seed) for seed in range(5)]
+    assert len({s.content_hash for s in scenes}) == 5
+    assert len({s.scene_id for s in scenes}) == 5
+    assert len({float(s.lane_map.lanes["s2_f0"].centre[-1, 0]) for s in scenes}) == 5
+    assert len({float(s.actors[0].track.xyz[0, 0]) for s in scenes}) == 5
+    assert len({s.ego_log.xyz.tobytes() for s in scenes}) == 5
+
+
+def measures(s: Scenario) -> dict[str, float]:
+    centre = s.lane_map.lanes["s0_f0"].centre
+    left, right = s.lane_map.lanes["s0_f0"].left, s.lane_map.lanes["s0_f0"].right
+    assert left is not None
+    assert right is not None
+    return {"length": float(centre[-1, 0]), "width": float(left[0, 1] - right[0, 1]), "place": float(s.actors[0].track.xyz[0, 0]) - 20}
+
+
+def test_jitter_stays_inside_its_ranges(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    seen = [measures(load_scenario(path, seed=seed)) for seed in range(12)]
+    for key, nominal, reach in (("length", 100, 5.0), ("width", 3.5, 0.07), ("place", 40, 1.5)):
+        values = np.array([m[key] for m in seen])
+        assert (np.abs(values - nominal) <= reach + 1e-6).all(), key
+        assert np.ptp(values) > 0.3 * reach, key
+
+
+def test_jitter_switched_off_gives_the_numbers_in_the_file(tmp_path: Path) -> None:
+    path = write(tmp_path, "jitter: {length: 0, curvature: 0, lane_width: 0, speed: 0, position_m: 0, time_us: 0}\n")
+    assert measures(load_scenario(path, seed=9)) == pytest.approx({"length": 100.0, "width": 3.5, "place": 40.0})
+    assert load_scenario(path, seed=9).ego_log.xyz.tobytes() == load_scenario(path, seed=8).ego_log.xyz.tobytes()
+
+
+def test_curvature_jitter_keeps_transitions_smooth(tmp_path: Path) -> None:
+    s = load_scenario(write(tmp_path), seed=4)
+    centre = np.concatenate([s.lane_map.lanes["s1_f0"].centre, s.lane_map.lanes["s2_f0"].centre[1:]])
+    d = np.diff(centre[:, :2], axis=0)
+    turn = np.diff(np.unwrap(np.arctan2(d[:, 1], d[:, 0]))) / np.hypot(*d[1:].T)
+    assert np.abs(np.diff(turn)).max() < 1.5e-3
+
+
+def test_adding_an_actor_does_not_change_the_others(tmp_path: Path) -> None:
+    one = load_scenario(write(tmp_path), seed=2)
+    path = tmp_path / "scene.yaml"
+    path.write_text(BASE.replace("actors:\n", "actors:\n  - {kind: oncoming, id: new, s_m: 100, speed_mps: 8}\n"))
+    two = load_scenario(path, seed=2)
+    assert one.lane_map.lanes["s0_f0"].centre.tobytes() == two.lane_map.lanes["s0_f0"].centre.tobytes()
+    by_id = {a.actor_id: a for a in two.actors}
+    assert one.actors[0].track.xyz.tobytes() == by_id["lead"].track.xyz.tobytes()
+
+
+def test_ranges_and_choices_are_drawn_with_the_seed(tmp_path: Path) -> None:
+    more = "variations:\n  actors.lead.s_m: {low: 50, high: 60}\n  environment.sky: {choice: [dusk, overcast]}\n"
+    path = write(tmp_path, more)
+    scenes = [load_scenario(path, seed=seed) for seed in range(10)]
+    places = [measures(s)["place"] for s in scenes]
+    assert all(50 <= p <= 60 for p in places), "a declared range is not jittered on top"
+    assert len(set(places)) == 10
+    assert {s.environment.sky for s in scenes} == {"dusk", "overcast"}
+
+
+def test_explicit_samples_go_round(tmp_path: Path) -> None:
+    path = write(tmp_path, "samples:\n  - {actors.lead.s_m: 50}\n  - {actors.lead.s_m: 60, environment.sky: dusk}\n")
+    places = [measures(load_scenario(path, seed=seed))["place"] for seed in range(4)]
+    assert places == pytest.approx([50.0, 60.0, 50.0, 60.0])
+    assert load_scenario(path, seed=1).environment.sky == "dusk"
+
+
+def test_an_override_wins_over_variation_and_jitter(tmp_path: Path) -> None:
+    path = write(tmp_path, "variations: {actors.lead.s_m: {low: 50, high: 60}}\n")
+    s = load_scenario(path, seed=3, overrides=["actors.lead.s_m=44", "road.lane_width_m=3.25", "actors.1.clearance_m=0.9"])
+    assert measures(s)["place"] == pytest.approx(44.0)
+    assert measures(s)["width"] == pytest.approx(3.25)
+    assert s.content_hash != load_scenario(path, seed=3).content_hash
+
+
+def test_a_variation_of_an_unknown_key_names_the_variation(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as e:
+        load_scenario(write(tmp_path, "variations: {ego.cruse_mps: {low: 9, high: 10}}\n"))
+    assert "variation ego.cruse_mps" in e.value.with_what
+    assert "did you mean 'cruise_mps'" in e.value.do_this
+
+
+def test_hash_depends_on_the_bytes_of_data_files(tmp_path: Path) -> None:
+    (tmp_path / "bg.ply").write_bytes(b"ply one")
+    path = write(tmp_path, "background: {file: bg.ply}\n")
+    first = load_scenario(path)
+    assert first.background is not None
+    assert first.background.path == str(tmp_path / "bg.ply")
+    (tmp_path / "bg.ply").write_bytes(b"ply two")
+    assert load_scenario(path).content_hash != first.content_hash

@@ -1,0 +1,91 @@
+"""Suites: files, folders, names, seeds and overrides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.errors import InputError
+from scenarios.load import load_scenario
+from scenarios.suite import ScenarioRef, expand, load_suite
+
+SCENE = "version: 1\nroad: {segments: [{kind: straight, length_m: 200}]}\ntiming: {duration_us: 2000000}\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "one.yaml").write_text(SCENE)
+    (tmp_path / "two.yaml").write_text(SCENE)
+    (tmp_path / "suite.yaml").write_text(
+        "version: 1\nscenarios:\n  - one.yaml\n  - {path: two.yaml, seeds: [4, 5], set: {ego.cruise_mps: 8}}\n  - smoke/straight\n"
+    )
+    return tmp_path
+
+
+def test_a_suite_lists_scenarios_with_seeds_and_overrides(folder: Path) -> None:
+    refs = load_suite(folder / "suite.yaml")
+    assert [(Path(r.path).name, r.seed, r.overrides) for r in refs] == [
+        ("one.yaml", None, ()),
+        ("two.yaml", 4, ("ego.cruise_mps=8",)),
+        ("two.yaml", 5, ("ego.cruise_mps=8",)),
+        ("straight.yaml", None, ()),
+    ]
+    scenes = [load_scenario(r.path, r.seed, r.overrides) for r in refs]
+    assert len({s.scene_id for s in scenes}) == 4
+
+
+def test_a_folder_gives_its_scenarios_and_not_its_suites(folder: Path) -> None:
+    assert [Path(r.path).name for r in load_suite(folder)] == ["one.yaml", "two.yaml"]
+
+
+def test_one_scenario_or_recording_is_a_suite_of_one(folder: Path, repo: Path) -> None:
+    assert load_suite(folder / "one.yaml") == [ScenarioRef(str(folder / "one.yaml"))]
+    xml = repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml"
+    assert load_suite(xml) == [ScenarioRef(str(xml))]
+
+
+def test_argoverse_folder_is_one_recording(shared_data: Path) -> None:
+    log = next(p for p in sorted((shared_data / "av2").iterdir()) if p.is_dir())
+    assert load_suite(log) == [ScenarioRef(str(log))]
+
+
+def test_command_line_overrides_come_last(folder: Path) -> None:
+    refs = expand(str(folder / "suite.yaml"), ["ego.cruise_mps=9"])
+    assert refs[1].overrides == ("ego.cruise_mps=8", "ego.cruise_mps=9")
+    assert refs[0].overrides == ("ego.cruise_mps=9",)
+
+
+def test_shipped_suites_have_short_names() -> None:
+    assert load_suite("smoke") == load_suite("suites/smoke")
+
+
+def test_an_unknown_entry_is_placed_in_the_suite(folder: Path) -> None:
+    (folder / "bad.yaml").write_text("version: 1\nscenarios:\n  - one.yaml\n  - smoke/strait\n")
+    with pytest.raises(InputError) as e:
+        load_suite(folder / "bad.yaml")
+    assert "bad.yaml:4:5" in e.value.with_what
+    assert "did you mean smoke/straight" in e.value.do_this
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("version: 1\nscenarios: []\n", "scenarios = []"),
+        ("version: 1\nscenarios: [{path: a, sed: 1}]\n", "unknown key 'sed'"),
+        ("version: 1\nscenarios: [bad.yaml]\n", "contains itself"),
+        ("scenarios: [a]\n", "no 'version'"),
+    ],
+)
+def test_bad_suites_are_refused(folder: Path, text: str, found: str) -> None:
+    (folder / "bad.yaml").write_text(text)
+    with pytest.raises(InputError) as e:
+        load_suite(folder / "bad.yaml")
+    assert found in e.value.found
+
+
+def test_an_empty_folder_and_a_missing_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="a folder without scenario files"):
+        load_suite(tmp_path)
+    with pytest.raises(InputError, match="did you mean suites/smoke"):
+        load_suite("suites/smok")

@@ -1,0 +1,100 @@
+"""The driver model and the choice of a leader."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.types import Box
+from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, nearest_ahead, spans
+from alpasim_plugin.world.path import polyline_path
+from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
+
+P = IdmParams(desired_speed_mps=20.0, headway_s=1.5, min_gap_m=2.0, accel_mps2=1.0, brake_mps2=1.5)
+ROAD = polyline_path(np.column_stack([np.linspace(0, 200, 201), np.zeros(201), np.zeros(201)]))
+INF = float("inf")
+
+
+def car(x: float, y: float, yaw: float = 0.0, speed: float = 0.0, box: Box = Box(4.6, 1.85, 1.5)) -> Bodies:
+    return bodies_from(np.array([x, y]), np.array([yaw]), [box], speed * np.array([np.cos(yaw), np.sin(yaw)]))
+
+
+def test_free_road_follows_the_power_law() -> None:
+    assert idm_acceleration(0.0, INF, 0.0, P) == 1.0
+    assert idm_acceleration(10.0, INF, 0.0, P) == pytest.approx(1.0 - 0.5**4)
+    assert idm_acceleration(20.0, INF, 0.0, P) == pytest.approx(0.0)
+    assert idm_acceleration(25.0, INF, 0.0, P) < 0.0
+
+
+def test_equilibrium_gap_of_the_equation_gives_no_acceleration() -> None:
+    # Treiber et al. (2000): s_e = (s0 + v T) / sqrt(1 - (v / v0)^4)
+    for v in (0.0, 5.0, 15.0, 19.0):
+        gap = (P.min_gap_m + v * P.headway_s) / np.sqrt(1 - (v / P.desired_speed_mps) ** 4)
+        assert idm_acceleration(v, gap, 0.0, P) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_closing_in_brakes_harder_and_is_cut_off_at_what_the_vehicle_can_do() -> None:
+    assert idm_acceleration(15.0, 30.0, 10.0, P) < idm_acceleration(15.0, 30.0, 0.0, P)
+    assert idm_acceleration(20.0, 1.0, 20.0, P) == -P.hard_brake_mps2
+    assert idm_acceleration(10.0, -3.0, 0.0, P) == -P.hard_brake_mps2
+
+
+@settings(deadline=None)
+@given(st.floats(0, 40), st.floats(0.1, 200), st.floats(-20, 40), st.floats(0.5, 100))
+def test_a_larger_gap_never_brakes_harder(speed: float, gap: float, closing: float, more: float) -> None:
+    assert idm_acceleration(speed, gap + more, closing, P) >= idm_acceleration(speed, gap, closing, P)
+
+
+def test_a_platoon_behind_a_stopped_car_stops_without_contact() -> None:
+    x, v = np.array([80.0, 40.0, 0.0]), np.array([0.0, 15.0, 15.0])
+    for _ in range(6000):
+        a = [idm_acceleration(v[i], x[i - 1] - 5.0 - x[i], v[i] - v[i - 1], P) if i else 0.0 for i in range(3)]
+        v = np.maximum(0.0, v + 0.01 * np.array(a))
+        x = x + 0.01 * v
+        assert (x[:-1] - 5.0 - x[1:] > 0).all()
+    # The model creeps the last metre ever more slowly towards its gap at standstill.
+    np.testing.assert_allclose(x[:-1] - 5.0 - x[1:], P.min_gap_m, atol=0.5)
+    assert (v < 0.1).all()
+
+
+def test_the_nearest_body_in_the_corridor_leads() -> None:
+    leader = find_leader(ROAD, 10.0, 0.95, concatenate([car(60, 0, speed=5), car(40, 0, speed=7), car(30, 3.5)]))
+    assert leader.index == 1
+    assert leader.gap_m == pytest.approx(40 - 2.3 - 10, abs=1e-6)
+    assert leader.speed_mps == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize(("y", "leads"), [(0.0, True), (2.0, True), (2.2, False), (-2.2, False)])
+def test_corridor_is_as_wide_as_the_car_and_a_margin(y: float, leads: bool) -> None:
+    assert (find_leader(ROAD, 10.0, 0.95, car(40, y)).index == 0) == leads  # 0.95 + 0.2 + 1.85 / 2 = 2.075
+
+
+def test_a_body_behind_is_no_leader_and_a_touching_one_is() -> None:
+    assert find_leader(ROAD, 50.0, 0.95, car(45, 0)).index == -1
+    touching = find_leader(ROAD, 50.0, 0.95, car(51.5, 0))
+    assert touching.index == 0
+    assert touching.gap_m < 0
+
+
+def test_a_crossing_truck_blocks_with_its_length() -> None:
+    truck = Box(10.0, 2.5, 3.0)
+    assert find_leader(ROAD, 10.0, 0.95, car(40, 5.0, np.pi / 2, 3.0, truck)).gap_m == pytest.approx(40 - 1.25 - 10)
+    assert find_leader(ROAD, 10.0, 0.95, car(40, 5.0, 0.0, 3.0, truck)).index == -1
+
+
+def test_oncoming_leader_counts_as_standing() -> None:
+    assert find_leader(ROAD, 10.0, 0.95, car(40, 0, np.pi, 8.0)).speed_mps == 0.0
+
+
+def test_nobody_there() -> None:
+    assert find_leader(ROAD, 10.0, 0.95, NO_BODIES).gap_m == INF
+    assert find_leader(ROAD, 10.0, 0.95, car(190, 0), horizon_m=50).index == -1
+
+
+def test_known_places_of_standing_bodies_give_the_same_leader() -> None:
+    bodies = concatenate([car(60, 0.5), car(90, 0), car(50, 4)])
+    whole = spans(ROAD, 0.0, bodies, 300.0, window=False)
+    for front in (5.0, 40.0, 63.0, 80.0):
+        assert nearest_ahead(whole, front, 0.95) == find_leader(ROAD, front, 0.95, bodies)

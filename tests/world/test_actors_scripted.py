@@ -1,0 +1,88 @@
+"""Scripted tracks: speeds, lane changes, walkers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.geometry import yaw_from_quat
+from alpasim_plugin.types import Box
+from alpasim_plugin.world.path import polyline_path
+from alpasim_plugin.world.scripted import (
+    brake_rows,
+    cut_in_track,
+    grid,
+    integrate,
+    speed_profile,
+    standing_track,
+    track_on_path,
+    walk_track,
+)
+from alpasim_plugin.world.state import speeds
+
+BOX = Box(4.0, 1.8, 1.5)
+
+
+def straight(y: float) -> object:
+    return polyline_path(np.column_stack([np.linspace(0, 150, 151), np.full(151, y), np.zeros(151)]))
+
+
+def test_grid_ends_exactly_at_the_end() -> None:
+    assert grid(0, 120_000).tolist() == [0, 50_000, 100_000, 120_000]
+
+
+def test_hard_brake_stops_after_the_physical_distance() -> None:
+    t = grid(0, 8_000_000)
+    s = integrate(t, speed_profile(t, brake_rows(12.0, 2_000_000, 6.0, 0.0, None)), 10.0)
+    assert s[-1] == pytest.approx(10 + 12 * 2 + 12**2 / (2 * 6), abs=1e-9)
+    assert s[-1] == s[-20]
+
+
+def test_a_driver_who_resumes_reaches_the_first_speed_again() -> None:
+    t = grid(0, 12_000_000)
+    v = speed_profile(t, brake_rows(8.0, 1_000_000, 4.0, 2.0, 5_000_000))
+    assert v[0] == 8.0
+    assert v.min() == 2.0
+    assert v[-1] == 8.0
+
+
+def test_cut_in_starts_and_ends_in_the_middle_of_its_lanes_without_a_jolt() -> None:
+    t = grid(0, 6_000_000, 10_000)
+    s = integrate(t, np.full(len(t), 12.0), 5.0)
+    track = cut_in_track(straight(-3.5), straight(0.0), t, s, BOX, 1_000_000, 2_500_000)
+    y = track.xyz[:, 1]
+    assert (y[t <= 1_000_000] == -3.5).all()
+    np.testing.assert_allclose(y[t >= 3_500_000], 0.0, atol=1e-9)
+    assert (np.diff(y) >= -1e-9).all()
+    lateral_accel = np.gradient(np.gradient(y, 0.01), 0.01)
+    # Peak of the quintic: 10 / sqrt(3) * distance / duration^2.
+    assert np.abs(lateral_accel).max() == pytest.approx(10 / np.sqrt(3) * 3.5 / 2.5**2, rel=0.02)
+    heading = yaw_from_quat(track.quat)
+    v = np.gradient(track.xyz[:, :2], 0.01, axis=0)
+    np.testing.assert_allclose(heading[5:-5], np.arctan2(v[5:-5, 1], v[5:-5, 0]), atol=2e-3)
+
+
+def test_track_is_cut_where_the_path_ends() -> None:
+    t = grid(0, 10_000_000)
+    track = track_on_path(straight(0.0), t, integrate(t, np.full(len(t), 20.0), 100.0), BOX)
+    assert track.xyz[-1, 0] <= 150.0
+    assert track.t_us[-1] == 2_500_000
+    assert (track.xyz[:, 2] == 0.75).all()
+
+
+def test_walker_stands_walks_at_its_speed_and_stands_again() -> None:
+    t = grid(0, 12_000_000, 10_000)
+    track = walk_track(np.array([0.0, -5, 0]), np.array([0.0, 5, 0]), t, 2_000_000, 1.4, BOX)
+    assert (track.xyz[t <= 2_000_000, 1] == -5.0).all()
+    assert track.xyz[-1, 1] == pytest.approx(5.0)
+    v = speeds(track)
+    assert v.max() == pytest.approx(1.4, abs=1e-6)
+    assert np.abs(np.gradient(v, 0.01)).max() < 1.4 / 0.4 + 0.1
+    np.testing.assert_allclose(yaw_from_quat(track.quat), np.pi / 2)
+    assert track.xyz[:, 1].max() <= 5.0 + 1e-9
+
+
+def test_standing_track_covers_the_whole_time() -> None:
+    track = standing_track(1.0, 2.0, 0.5, 0.3, grid(0, 5_000_000), BOX)
+    assert track.t_us.tolist() == [0, 5_000_000]
+    assert track.xyz[0].tolist() == [1.0, 2.0, 1.25]
