@@ -52,12 +52,12 @@ def _kerbs(site: Site) -> list[Item]:
         quats = quats_along(site.frame.turned(along))
         # Contours run through the centres of the first cells off the road: half a cell behind the edge.
         xy = xy - 0.5 * CELL_M * away
-        face = site.world(xy, 0.45 * KERB_M)
+        face = site.world(xy, 0.4 * KERB_M)
         top = site.world(xy + 0.08 * away, KERB_M)
         n = len(xy)
         size = np.full(n, SPREAD * step)
         clouds = [
-            cloud_of(face, quats, np.column_stack([size, np.full(n, 0.03), np.full(n, 0.07)]), 0.80 * rgb),
+            cloud_of(face, quats, np.column_stack([size, np.full(n, 0.05), np.full(n, 0.08)]), 0.80 * rgb),
             cloud_of(top, quats, np.column_stack([size, np.full(n, 0.09), np.full(n, 0.015)]), 1.05 * rgb),
         ]
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (2, 1))))

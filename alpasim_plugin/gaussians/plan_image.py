@@ -86,7 +86,8 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
         cap = np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
-    height = np.where(road, np.where(near_paint < TRENCH_M, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
+    trench = (near_paint < TRENCH_M) & (edge > TRENCH_M)  # not at the kerb's foot: a gap would open there
+    height = np.where(road, np.where(trench, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
     return PlanImage(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
 
 
@@ -167,7 +168,8 @@ def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tup
     """Return the share ``(H, W)`` of each cell under paint of one colour; strokes thinner than ``thinnest_m`` are left out."""
     mask = np.zeros(shape, dtype=np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
-    mine = (strokes.colour == colour) & (strokes.width_m >= thinnest_m) & np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
+    near = np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
+    mine = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
     start, end, width = strokes.start[mine], strokes.end[mine], strokes.width_m[mine]
     along = end - start
     length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
