@@ -47,7 +47,7 @@ class CleanReport:
 
 @dataclass(frozen=True, eq=False)
 class GaussianCloud:
-    """A set of N Gaussians in one frame.
+    """A set of N Gaussians in one frame; its arrays are read-only.
 
     Attributes:
         means: ``(N, 3)`` centres, metres; float64 keeps UTM-sized coordinates exact.
@@ -71,6 +71,9 @@ class GaussianCloud:
             value = np.asarray(getattr(self, name))
             if value.dtype not in (np.float32, np.float64):
                 value = value.astype(np.float64)
+            # A view that cannot be written through: what is prepared for rendering stays true to the cloud.
+            value = value.view()
+            value.flags.writeable = False
             object.__setattr__(self, name, value)
         n = self.means.shape[0] if self.means.ndim else -1
         wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}

@@ -70,7 +70,9 @@ def prepare(cloud: GaussianCloud, *, sh_frame: ShFrame = "object") -> PreparedCl
     n, size = len(index), cloud.sh.shape[1]
     kept = GaussianCloud(cloud.means[index], cloud.quats[index], cloud.scales[index], cloud.opacities[index], np.empty((n, 1, 3)))
     sh = np.empty((n + (-n % _LANES)) * size * 3, np.float32)
-    colours_in_lanes(cloud.sh.reshape(-1), size * 3, index, sh)
+    coefficients = cloud.sh.reshape(-1).view()
+    coefficients.flags.writeable = False  # as in a fresh cloud, also where this one was unpickled: one type for compiled code
+    colours_in_lanes(coefficients, size * 3, index, sh)
     opacity = kept.opacities.astype(np.float64)
     geometry = np.zeros((n, GEO_SIZE), np.float32)
     geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = (kept.rotations() * kept.scales.astype(np.float64)[:, None, :]).reshape(n, 9)

@@ -164,8 +164,8 @@ def rasterize_cpu(
 ) -> RasterOutput:
     """Render one cloud in world coordinates.
 
-    The prepared form of a cloud is kept as long as the cloud lives, so repeated frames of one cloud are fast; clouds are therefore not to
-    be changed in place.
+    The prepared form of a cloud is kept as long as the cloud lives, so repeated frames of one cloud are fast. Arrays that a cloud was built
+    from are therefore not to be changed in place (those of the cloud itself are read-only).
     """
     prepared = _prepared.get(cloud)
     if prepared is None:

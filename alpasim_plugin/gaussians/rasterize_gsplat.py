@@ -32,7 +32,7 @@ def gsplat_arguments(cloud: GaussianCloud, camera: PinholeCamera, near_m: float,
     """
 
     def tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array, dtype=np.float32), device=device)
+        return torch.as_tensor(np.array(array, dtype=np.float32), device=device)
 
     view = np.eye(4)
     view[:3, :3] = camera.T_camera_world[:3, :3]

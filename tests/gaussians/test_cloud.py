@@ -105,8 +105,8 @@ def test_moving_turns_covariances_and_leaves_scales_alone():
     moved = cloud.transformed(T)
     R = T[:3, :3]
     assert np.abs(moved.covariances() - R @ cloud.covariances() @ R.T).max() < 1e-12
-    assert moved.scales is cloud.scales
-    assert cloud.transformed(T, rotate_colour=False).sh is cloud.sh
+    assert np.shares_memory(moved.scales, cloud.scales)
+    assert np.shares_memory(cloud.transformed(T, rotate_colour=False).sh, cloud.sh)
 
 
 def test_moving_by_something_that_is_not_rigid_is_an_error():
@@ -127,3 +127,11 @@ def test_whole_numbers_become_floats_and_single_precision_stays():
     cloud = GaussianCloud(np.arange(24).reshape(8, 3), data["quats"].astype(np.float32), data["scales"], data["opacities"], data["sh"])
     assert cloud.means.dtype == np.float64
     assert cloud.quats.dtype == np.float32
+
+
+def test_arrays_of_a_cloud_cannot_be_written_and_those_given_stay_writable():
+    data = arrays()
+    cloud = GaussianCloud(**data)
+    with pytest.raises(ValueError, match="read-only"):
+        cloud.means[0] = 0.0
+    data["means"][0] = 0.0
