@@ -1,0 +1,162 @@
+"""The command line as a user meets it: exit codes, four-part errors, JSON, dry runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.run import parse_seeds
+from alpasim_plugin.errors import InputError
+
+GOOD = ["--renderer", "clean", "--policy", "log-replay"]
+
+
+def four_parts(text: str) -> dict[str, str]:
+    """Return the parts of a printed error; fails unless there are exactly four lines."""
+    parts = dict(line.strip().split(": ", 1) for line in text.strip().splitlines())
+    assert list(parts) == ["error", "with", "found", "do"], text
+    return parts
+
+
+def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
+    """Return, by situation, a command line and what its error must mention."""
+    (folder / "broken.yaml").write_text("version: 1\nroad: [\n")
+    (folder / "typo.yaml").write_text("version: 1\nroda: {}\n")
+    (folder / "empty").mkdir()
+    (folder / "cut.xml").write_text('<?xml version="1.0"?><commonRoad commonRoadVersion="2018b" timeStepSize="0.1"><lanelet id="1">')
+    (folder / "notes.txt").write_text("hello")
+    scene = ["smoke/straight"]
+    return {
+        "malformed YAML": ([*GOOD, str(folder / "broken.yaml")], "broken.yaml:"),
+        "unknown key": ([*GOOD, str(folder / "typo.yaml")], "road"),
+        "missing file": ([*GOOD, str(folder / "none.yaml")], "none.yaml"),
+        "misspelt shipped name": ([*GOOD, "smoke/straigth"], "smoke/straight"),
+        "folder without scenarios": ([*GOOD, str(folder / "empty")], "empty"),
+        "truncated XML": ([*GOOD, str(folder / "cut.xml")], "cut.xml"),
+        "file of another kind": ([*GOOD, str(folder / "notes.txt")], "notes.txt"),
+        "unknown renderer": (["--renderer", "clena", "--policy", "log-replay", *scene], "did you mean 'clean'"),
+        "unknown policy": (["--renderer", "clean", "--policy", "lane-cam", *scene], "did you mean 'lane-camera'"),
+        "policy that does not import": (["--policy", "no.such:Thing", *scene], "no.such:Thing"),
+        "unknown preset": ([*GOOD, "--preset", "papr", *scene], "known: paper"),
+        "baseline that is not run": ([*GOOD, "--baseline", "3dgs", *scene], "--baseline 3dgs"),
+        "bad seeds": ([*GOOD, "--seeds", "a,b", *scene], "--seeds a,b"),
+        "no seeds": ([*GOOD, "--seeds", "0", *scene], "--seeds 0"),
+        "renderer named twice": (["--renderer", "clean,clean", "--policy", "log-replay", *scene], "one of them twice"),
+        "override of an unknown key": ([*GOOD, "--set", "rats.camera_us=1", *scene], "rates"),
+        "camera period that is no multiple": ([*GOOD, "--set", "rates.camera_us=150001", *scene], "multiple"),
+        "one-frame scene": ([*GOOD, "--set", "timing.duration_us=1", *scene], "duration_us"),
+        "no camera for the policy": (["--renderer", "clean", "--policy", "lane-camera", "--set", "cameras=[]", *scene], "camera"),
+    }
+
+
+SITUATIONS = (
+    "malformed YAML",
+    "unknown key",
+    "missing file",
+    "misspelt shipped name",
+    "folder without scenarios",
+    "truncated XML",
+    "file of another kind",
+    "unknown renderer",
+    "unknown policy",
+    "policy that does not import",
+    "unknown preset",
+    "baseline that is not run",
+    "bad seeds",
+    "no seeds",
+    "renderer named twice",
+    "override of an unknown key",
+    "camera period that is no multiple",
+    "one-frame scene",
+)
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_bad_input_is_a_four_part_error_with_exit_code_2(situation: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command, mention = bad_inputs(tmp_path)[situation]
+    assert run_command([*command, "--out", str(tmp_path / "out")]) == 2
+    captured = capsys.readouterr()
+    four_parts(captured.err)
+    assert mention in captured.err
+    assert "Traceback" not in captured.err
+    assert not (tmp_path / "out" / "run.json").exists()
+
+
+def test_json_errors_are_one_document_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--renderer", "nope", "--json", "smoke/straight"]) == 2
+    document = json.loads(capsys.readouterr().out)
+    assert set(document["error"]) == {"doing", "with", "found", "do", "failure_class"}
+    assert document["exit_code"] == 2
+
+
+def test_debug_adds_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--renderer", "nope", "--debug", "smoke/straight"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_unknown_options_are_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--rendrer", "clean", "smoke/straight"]) == 2
+
+
+def test_a_dry_run_counts_without_running(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["--renderer", "clean,3dgs", "--seeds", "3", "--dry-run", "--json", "--out", str(tmp_path / "out"), "suites/smoke"]
+    assert run_command(command) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["rollouts"] == 2 * 3 * len(plan["scenes"])
+    assert plan["camera_frames"] > 0
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [*GOOD, "--workers", "1", "--set", "timing.duration_us=1000000", "--out", str(tmp_path), "smoke/straight"]
+    assert run_command(command) == 0
+    captured = capsys.readouterr()
+    assert "route_distance_m" in captured.out
+    assert "report.html" in captured.out
+    names = {"run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", "junit.xml", "report.html"}
+    assert names <= {p.name for p in tmp_path.iterdir()}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert {"preset", "metrics", "paired", "censoring", "failures", "speed"} <= set(summary)
+    entry = summary["metrics"]["clean"]["collision_any"]
+    assert {"mean", "ci95", "ci95_clustered", "n_rollouts", "n_scenes", "unit", "direction"} <= set(entry)
+    assert run_command(["report", str(tmp_path)]) == 0
+
+
+def test_report_of_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["report", str(tmp_path)]) == 2
+    assert "name a folder written by simrun" in four_parts(capsys.readouterr().err)["do"]
+
+
+@pytest.mark.parametrize("kind", ["renderers", "policies", "scenarios", "metrics"])
+def test_lists_name_every_part_with_help(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["list", kind, "--json"]) == 0
+    known = json.loads(capsys.readouterr().out)
+    assert known
+    assert all(known.values()), [name for name, text in known.items() if not text]
+
+
+def test_doctor_tries_the_parts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["doctor", "--json"]) == 0
+    checks = {row["check"]: row for row in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks["rasteriser (cpu)"]["ok"]
+    assert checks["video"]["ok"]
+
+
+def test_help_of_every_verb_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ("run", "report", "list", "doctor"):
+        assert run_command([verb, "--help"]) == 0
+        assert "simrun" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("1", [0]), ("3", [0, 1, 2]), ("4,7", [4, 7]), ("0,", [0])])
+def test_seeds_are_a_count_or_a_list(text: str, seeds: list[int]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["-1", "", "x", "1,-2", "1.5"])
+def test_other_seeds_are_refused(text: str) -> None:
+    with pytest.raises(InputError):
+        parse_seeds(text)
