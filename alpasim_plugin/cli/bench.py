@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -27,7 +28,7 @@ def raster(
 ) -> None:
     """Time the CPU rasteriser on a random street and compare it with the float64 reference."""
     del debug
-    rows = [dict(row) for row in bench_raster(repeats=repeats)]
+    rows = [asdict(row) for row in bench_raster(repeats=repeats)]
     if as_json:
         print(json.dumps(rows))
         return

@@ -48,9 +48,9 @@ class BenchRow:
         ms_p95: 95th percentile of it.
         cpu_ms: Processor time of a frame, all threads together: what remains comparable on a busy machine.
         first_ms: Preparing the scene and drawing the first frame, kernels compiled or loaded included where they were not before.
-        max_error: Largest difference of a colour from the float64 reference, full scale 1; NaN where it was not asked for.
-        share_above_lsb: Share of the pixels that differ by more than 1/255; NaN likewise.
-        torch_ms: One frame of the torch backend; NaN where it was left out as too large.
+        max_error: Largest difference of a colour from the float64 reference, full scale 1; None where it was not asked for.
+        share_above_lsb: Share of the pixels that differ by more than 1/255; None likewise.
+        torch_ms: One frame of the torch backend; None where it was left out as too large.
     """
 
     n: int
@@ -64,9 +64,9 @@ class BenchRow:
     ms_p95: float
     cpu_ms: float
     first_ms: float
-    max_error: float
-    share_above_lsb: float
-    torch_ms: float
+    max_error: float | None
+    share_above_lsb: float | None
+    torch_ms: float | None
 
 
 def bench_raster(
@@ -88,7 +88,7 @@ def bench_raster(
     for n, width, height in sizes:
         scene, camera = driving_like_scene(n, seed), driving_camera(width, height)
         want = rasterize_reference(scene, camera, SKY) if with_error else None
-        torch_ms = _torch_ms(scene, camera) if n * width * height <= _TORCH_LIMIT else float("nan")
+        torch_ms = _torch_ms(scene, camera) if n * width * height <= _TORCH_LIMIT else None
         for count in threads:
             begin = time.perf_counter()
             nodes = [(prepare(scene), None)]
@@ -97,12 +97,12 @@ def bench_raster(
             used = time.process_time()
             times = _times_ms(partial(rasterize_prepared, nodes, camera, SKY, threads=count), repeats)
             cpu_ms = (time.process_time() - used) / repeats * 1e3
-            error = np.full(1, np.nan) if want is None else np.abs(out.rgb - want.rgb).max(axis=2)
+            error = None if want is None else np.abs(out.rgb - want.rgb).max(axis=2)
             rows.append(
                 BenchRow(
                     n, width, height, count, out.stats["visible"], out.stats["pairs"],
                     min(times), float(np.median(times)), float(np.percentile(times, 95)), cpu_ms, first_ms,
-                    float(error.max()), float(np.mean(error > _LSB)) if want is not None else float("nan"), torch_ms,
+                    None if error is None else float(error.max()), None if error is None else float(np.mean(error > _LSB)), torch_ms,
                 )
             )  # fmt: skip
     return rows
@@ -129,12 +129,13 @@ def format_rows(rows: Sequence[BenchRow]) -> str:
         "|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for r in rows:
-        torch_ms = "-" if np.isnan(r.torch_ms) else f"{r.torch_ms:.0f}"
-        error = ("-", "-") if np.isnan(r.max_error) else (f"{r.max_error / _LSB:.4f}", f"{r.share_above_lsb:.2g}")
+        torch_ms = "-" if r.torch_ms is None else f"{r.torch_ms:.0f}"
+        worst = "-" if r.max_error is None else f"{r.max_error / _LSB:.4f}"
+        share = "-" if r.share_above_lsb is None else f"{r.share_above_lsb:.2g}"
         times = " | ".join(f"{ms:.1f}" for ms in (r.ms_best, r.ms_p50, r.ms_p95, r.cpu_ms))
         lines.append(
             f"| {r.n} | {r.width}x{r.height} | {r.threads} | {r.visible} | {r.pairs} | {times} | "
-            f"{r.first_ms:.0f} | {error[0]} | {error[1]} | {torch_ms} |"
+            f"{r.first_ms:.0f} | {worst} | {share} | {torch_ms} |"
         )
     return "\n".join(lines)
 
