@@ -15,8 +15,8 @@ from alpasim_plugin.types import F64, U8, CameraSpec, Frame, Observation, Plan, 
 from policies.base import POLICIES, plan_times, seconds
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
-from policies.lane_plan import Blend, alternatives, blend, guess_from_route, progress_behind
-from policies.lane_vision import RidgeFilter, find_paint
+from policies.lane_plan import Blend, blend, cruise, guess_from_route, progress_behind, sampled, wander
+from policies.lane_vision import PaintPoints, RidgeFilter, find_paint
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
 from policies.paths import curve_speeds, follow
 from policies.pure_pursuit import has_route, route_points
@@ -26,7 +26,9 @@ MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any m
 LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
 OTHER_LANE = 0.55  # the route asks for the next lane when it lies this share of a width off the centre
 OTHER_LANE_FRAMES = 5
-CHOOSE_AT_M = 12.0
+SAME_HEADING_RAD = 0.25
+CHOOSE_AT_M, CHOOSE_AT_S = 12.0, 1.2
+DOUBT_AT_M = 10.0
 OBSTACLE_RANGE_M = 48.0
 
 
@@ -69,6 +71,8 @@ class LaneCamera:
     def reset(self, seed: int, route: Route) -> None:
         """Forget everything of the drive before."""
         self.seed, self.step = seed, 0
+        self.noise: F64 | None = None  # the samples' errors, which last for seconds
+        self.acted_us = 0
         self.cruise_mps: float | None = None
         self.lane: LaneState | None = None
         self.road: RoadColour | None = None
@@ -92,22 +96,25 @@ class LaneCamera:
         if self.seen_us is None or frame.t_us > self.seen_us:
             self._look(frame, _pose_at(observation, frame.t_us), route, pose_now, speed)
         lane = None if self.lane is None else _moved(self.lane, self.seen_pose, pose_now)
-        blended = blend(lane, route)
+        blended = blend(lane, route, speed)
+        random = stream(self.scene_id, self.seed, "policy", self.step)
+        self.noise = wander(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
+        self.step, self.acted_us = self.step + 1, observation.t_us
+        wanted_mps = cruise(self.cruise_mps, self.noise)
         times = plan_times(observation.t_us)
         progress = progress_behind(
             speed,
-            curve_speeds(blended.path, self.cruise_mps),
+            curve_speeds(blended.path, wanted_mps),
             seconds(times),
             self._obstacle_now(observation),
             self.bumper_m,
-            self.cruise_mps,
+            wanted_mps,
         )
         xy, yaw = follow(blended.path, progress, max(speed, 0.0))
-        samples = alternatives(xy, yaw, stream(self.scene_id, self.seed, "policy", self.step))
-        self.step += 1
-        chosen = samples[0]
+        doubt_m = 0.0 if lane is None else float(lane.sigma(np.array([DOUBT_AT_M]))[0])
+        chosen, *others = sampled(xy, yaw, self.noise, doubt_m)
         debug = self._debug(lane, route, blended)
-        return Plan(observation.t_us, times, chosen[:, :2].copy(), chosen[:, 2].copy(), tuple(samples[1:]), debug)
+        return Plan(observation.t_us, times, chosen[:, :2].copy(), chosen[:, 2].copy(), tuple(others), debug)
 
     def _frame(self, observation: Observation) -> Frame:
         frame = observation.frames.get(self.camera.name)
@@ -130,8 +137,8 @@ class LaneCamera:
         self.seen_us, self.seen_pose = frame.t_us, pose
         ground = self.grid.warp(frame.rgb)
         there = None if route is None else _points_in(route, pose_now, pose)
-        self._look_for_lane(ground, there)
-        path = blend(self.lane, there).path
+        self._look_for_lane(ground, there, speed)
+        path = blend(self.lane, there, speed).path
         centre_y = np.interp(self.grid.x_m, *_increasing(path.xy))
         lab = cv2.cvtColor(ground, cv2.COLOR_RGB2LAB)
         free_m = self.obstacle.distance_m if self.obstacle is not None else np.inf
@@ -142,7 +149,7 @@ class LaneCamera:
             foot = find_foot(anomaly(lab, self.road, self.grid), self.grid, centre_y, float(self.grid.x_m[0]), reach)
         self.obstacle = track_obstacle(self.obstacle, foot, speed, dt_s, float(self.grid.x_m[0]))
 
-    def _look_for_lane(self, ground: U8, route: F64 | None) -> None:
+    def _look_for_lane(self, ground: U8, route: F64 | None, speed: float) -> None:
         points = find_paint(ground, self.grid, self.ridges)
         row_m = np.interp(points.x_m, self.grid.x_m, self.grid.row_m)
         if self.lane is not None:
@@ -155,18 +162,27 @@ class LaneCamera:
             if self.lane is not None:
                 self.lane = update(self.lane, points, row_m)
         if self.lane is not None and route is not None:
-            self.lane = self._choose_lane(self.lane, route)
+            self.lane = self._choose_lane(self.lane, route, points, row_m, speed)
 
-    def _choose_lane(self, lane: LaneState, route: F64) -> LaneState:
-        """Move to the neighbouring lane once the route has asked for it over several frames."""
+    def _choose_lane(self, lane: LaneState, route: F64, points: PaintPoints, row_m: F64, speed: float) -> LaneState | None:
+        """Change to the lane that the route is in, once it has run beside the present one over several frames.
+
+        A route that points elsewhere than the lane does not run beside it: it turns off, which `blend` sees to.
+        """
         x, y = _increasing(route)
-        at = np.array([CHOOSE_AT_M])
-        off = float((np.interp(at, x, y) - lane.centre(at))[0]) / float(lane.mean[4])
-        self.other_lane_frames = self.other_lane_frames + 1 if abs(off) > OTHER_LANE and x[-1] > CHOOSE_AT_M else 0
+        at = np.array([max(CHOOSE_AT_M, CHOOSE_AT_S * speed)])
+        beside_m = float((np.interp(at, x, y) - lane.centre(at))[0])
+        turn = float(np.arctan2(np.interp(at + 2, x, y) - np.interp(at - 2, x, y), 4.0)[0] - np.arctan(lane.slope(at))[0])
+        beside = abs(beside_m) > OTHER_LANE * lane.mean[4] and abs(turn) < SAME_HEADING_RAD and x[-1] > at[0] + 2
+        self.other_lane_frames = self.other_lane_frames + 1 if beside else 0
         if self.other_lane_frames < OTHER_LANE_FRAMES:
             return lane
         self.other_lane_frames = 0
-        return shift(lane, 1 if off > 0 else -1)
+        found = search(points, row_m, float(lane.mean[0]) + beside_m, float(lane.mean[1]), float(lane.mean[2]))
+        if found is not None:
+            return found
+        lanes = round(beside_m / float(lane.mean[4]))
+        return shift(lane, lanes) if abs(beside_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4] else None
 
     def _is_lost(self, lane: LaneState) -> bool:
         sigma = float(lane.sigma(np.array([5.0]))[0])

@@ -20,8 +20,9 @@ LEAVE_BEFORE_M = 8.0
 HEADWAY_S, MIN_GAP_M = 1.3, 3.5
 IDM_ACCEL_MPS2, IDM_BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.5, 2.0, 7.0
 
-N_ALTERNATIVES = 5
-NOISE_LATERAL_M, NOISE_SPEED = 0.08, 0.02
+N_SAMPLES = 6
+NOISE_LATERAL_M, NOISE_SPEED, NOISE_S = 0.15, 0.03, 3.0
+MAX_NOISE_M = 0.5
 NOISE_RAMP_M = 12.0
 
 
@@ -54,7 +55,7 @@ class Blend:
     route_leaves_m: float  # distance at which the route leaves the lane; inf: it does not
 
 
-def blend(lane: LaneState | None, route: F64 | None) -> Blend:
+def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
 
     Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route has no say in the
@@ -62,11 +63,11 @@ def blend(lane: LaneState | None, route: F64 | None) -> Blend:
     """
     if lane is None:
         points = np.array([[0.0, 0.0], [10.0, 0.0]]) if route is None else route
-        return Blend(make_path(points, PATH_M), 0.0 if route is None else 1.0, np.inf)
+        return Blend(make_path(points, PATH_M, speed_mps), 0.0 if route is None else 1.0, np.inf)
     if route is None:
         x = np.arange(0.0, 40.0)
         y = _straight_beyond(lane, x, max(lane.seen_to_m, 10.0))
-        return Blend(make_path(np.stack([x, y], axis=1), PATH_M), 0.0, np.inf)
+        return Blend(make_path(np.stack([x, y], axis=1), PATH_M, speed_mps), 0.0, np.inf)
     points = resample(route, np.arange(0.0, max(float(arc_lengths(route)[-1]), 2.0), 1.0))
     step = np.gradient(points, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
@@ -90,7 +91,7 @@ def blend(lane: LaneState | None, route: F64 | None) -> Blend:
     # The correction is measured along the rig's y axis; along the path's normal it is shorter by the cosine.
     fused = points + normal * (correction * np.cos(heading))[:, None]
     at_10 = int(np.argmin(np.abs(x - 10.0)))
-    return Blend(make_path(fused, PATH_M), float(1.0 - lane_share[at_10]), leaves)
+    return Blend(make_path(fused, PATH_M, speed_mps), float(1.0 - lane_share[at_10]), leaves)
 
 
 def progress_behind(
@@ -120,22 +121,48 @@ def progress_behind(
     return np.array(progress)
 
 
-def alternatives(xy: F64, yaw: F64, random: np.random.Generator) -> list[F64]:
-    """Return `N_ALTERNATIVES` noisy versions ``(T, 3)`` of a plan: shifted to a side over the first metres, and faster or slower.
+def wander(before: F64 | None, dt_s: float, random: np.random.Generator) -> F64:
+    """Return the noise ``(N_SAMPLES, 2)`` of a step, lateral and speed in standard deviations, given that of the step before.
 
-    Each has one lateral shift and one speed factor, so it is as drivable as the plan itself.
+    A first-order Markov process with `NOISE_S` as its time: a policy that errs keeps erring for a while. White noise would be
+    filtered away by the vehicle.
+    """
+    fresh = random.normal(0.0, 1.0, (N_SAMPLES, 2))
+    if before is None:
+        return np.asarray(fresh)
+    keep = float(np.exp(-dt_s / NOISE_S))
+    return np.asarray(keep * before + np.sqrt(1 - keep**2) * fresh)
+
+
+def cruise(speed_mps: float, noise: F64) -> float:
+    """Return the speed that the first sample wants to cruise at."""
+    return speed_mps * (1.0 + NOISE_SPEED * float(noise[0, 1]))
+
+
+def sampled(xy: F64, yaw: F64, noise: F64, doubt_m: float) -> list[F64]:
+    """Return `N_SAMPLES` noisy versions ``(T, 3)`` of a plan: shifted to a side over the first metres, and faster or slower.
+
+    Each has one lateral shift and one speed factor, so it is as drivable as the plan itself. The first sample's speed is in the plan
+    already (see `cruise`), the others differ from it.
+
+    Args:
+        xy: ``(T, 2)`` the plan.
+        yaw: ``(T,)`` its headings.
+        noise: ``(N_SAMPLES, 2)`` from `wander`.
+        doubt_m: Standard deviation of the lane's centre: what is seen badly is also driven badly.
     """
     s = arc_lengths(xy)
     ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
     ramp_slope = np.where(s < NOISE_RAMP_M, 6 * ramp * (1 - ramp) / NOISE_RAMP_M, 0.0)
     ramp = ramp * ramp * (3 - 2 * ramp)
+    sigma_m = min(float(np.hypot(NOISE_LATERAL_M, doubt_m)), MAX_NOISE_M)
     out = []
-    for shift_m, factor in zip(
-        random.normal(0.0, NOISE_LATERAL_M, N_ALTERNATIVES), random.normal(0.0, NOISE_SPEED, N_ALTERNATIVES), strict=True
-    ):
+    ahead = np.linspace(0.0, 1.0, len(s))  # the speed drifts apart over the horizon; it does not jump
+    for lateral, faster in zip(noise[:, 0], noise[:, 1] - noise[0, 1], strict=True):
+        shift_m = sigma_m * float(lateral)
         shifted = xy + shift_m * ramp[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
         line = np.column_stack([shifted, yaw + np.arctan(shift_m * ramp_slope)])
-        out.append(_retimed(line, s, s * (1.0 + factor)))
+        out.append(_retimed(line, s, s * (1.0 + NOISE_SPEED * float(faster) * ahead)))
     return out
 
 

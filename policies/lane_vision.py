@@ -14,6 +14,7 @@ from policies.ground_grid import CELL_M, GroundGrid
 PAINT_WIDTH_M = 0.15
 MIN_CONTRAST = 7.0  # grey levels
 NOISE_FACTOR = 4.0
+BAR_M = (0.4, 2.3)  # how far bars of a crosswalk stand from the next and the next but one
 MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double line)
 
 
@@ -76,12 +77,18 @@ def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter) -> PaintPoints
     before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
     bend = np.maximum(2 * here - before - after, 1e-6)
     shift = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
-    return PaintPoints(
-        grid.x_m[rows],
-        grid.y_m[cols] - shift * CELL_M,
-        here / threshold[rows],
-        np.hypot(0.05, 0.5 * grid.pixel_m[rows]),
-    )
+    y = np.asarray(grid.y_m[cols] - shift * CELL_M)
+    strength = here / threshold[rows]
+    line = ~_is_bar(rows, y)
+    rows = rows[line]
+    return PaintPoints(grid.x_m[rows], y[line], strength[line], np.hypot(0.05, 0.5 * grid.pixel_m[rows]))
+
+
+def _is_bar(rows: npt.NDArray[np.intp], y: F64) -> Bool:
+    """Tell which ridge points ``(N,)`` are bars of a crosswalk: at least two others stand beside them, closer than any lane is wide."""
+    apart = np.abs(y[:, None] - y[None, :])
+    beside = (rows[:, None] == rows[None, :]) & (apart > BAR_M[0]) & (apart < BAR_M[1])
+    return np.asarray(beside.sum(axis=1) >= 2)
 
 
 def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:

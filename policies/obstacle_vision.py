@@ -19,7 +19,7 @@ from policies.ground_grid import CELL_M, GroundGrid
 STRIPS = 4
 CORRIDOR_HALF_M = 0.95  # half the ego's width: what stands outside can be passed
 TALL = 0.8  # how high to look, as a share of the camera's height
-LOW = 0.35  # the least that is asked where a curve ends the look
+LOW = 0.45  # the least that is asked where a curve ends the look
 LEAVE_LANE_M = 1.4
 NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
 ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9

@@ -13,7 +13,9 @@ from alpasim_plugin.types import F64
 MAX_LATERAL_MPS2 = 2.5  # comfort in curves
 MIN_LOOKAHEAD_M = 4.0
 LOOKAHEAD_S = 0.7
+SMOOTH_S = 0.8
 MAX_CURVATURE_1PM = 0.2  # turning radius 5 m
+MAX_PURSUIT_MPS2 = 4.0  # a target far to the side is met no harder than this
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,16 @@ class Path:
     curvature: F64  # (N,) 1/m, left positive
 
 
-def make_path(points: F64, length_m: float = 120.0) -> Path:
-    """Return a path through points ``(M, 2)``, resampled, smoothed over 5 m and extended straight to ``length_m``.
+def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> Path:
+    """Return a path through points ``(M, 2)``, resampled and extended straight to ``length_m``.
+
+    Its curvature is that of a heading averaged over what is driven in `SMOOTH_S`, at least 5 m: a coarse polyline has corners,
+    an estimate wobbles, and a car feels neither.
 
     Args:
         points: In driving order, at least two apart by more than a centimetre.
         length_m: Shortest length of the result.
+        speed_mps: At which it will be driven.
     """
     s = arc_lengths(points)
     tail = points[-1] - resample(points, [max(s[-1] - 5.0, 0.0)])[0]
@@ -42,9 +48,9 @@ def make_path(points: F64, length_m: float = 120.0) -> Path:
     xy = resample(line, at)
     step = np.gradient(xy, Path.SPACING_M, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    # Corners of a coarse polyline are spread over 5 m, which is shorter than any lookahead.
-    kernel = np.full(5, 0.2)
-    smooth = np.convolve(np.pad(heading, 2, mode="edge"), kernel, mode="valid")
+    half = round(max(5.0, SMOOTH_S * speed_mps) / Path.SPACING_M / 2)
+    kernel = np.full(2 * half + 1, 1.0 / (2 * half + 1))
+    smooth = np.convolve(np.pad(heading, half, mode="edge"), kernel, mode="valid")
     return Path(xy, np.gradient(smooth, Path.SPACING_M))
 
 
@@ -78,6 +84,7 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
     an exact arc, so the plan starts at the car's pose and heading and can be driven.
     """
     lookahead = max(MIN_LOOKAHEAD_M, LOOKAHEAD_S * speed_mps)
+    limit = min(MAX_CURVATURE_1PM, MAX_PURSUIT_MPS2 / max(speed_mps**2, 1.0))
     xs, ys = path.xy[:, 0].tolist(), path.xy[:, 1].tolist()
     x = y = yaw = 0.0
     out = np.zeros((len(progress), 3))
@@ -87,7 +94,7 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
         nearest, target = _targets(xs, ys, x, y, nearest, lookahead)
         dx, dy = xs[target] - x, ys[target] - y
         left = -math.sin(yaw) * dx + math.cos(yaw) * dy
-        curvature = min(max(2 * left / max(dx * dx + dy * dy, 1e-6), -MAX_CURVATURE_1PM), MAX_CURVATURE_1PM)
+        curvature = min(max(2 * left / max(dx * dx + dy * dy, 1e-6), -limit), limit)
         half = 0.5 * curvature * ds
         chord = ds * (math.sin(half) / half if abs(half) > 1e-8 else 1.0)
         x += chord * math.cos(yaw + half)

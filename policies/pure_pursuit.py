@@ -37,7 +37,7 @@ class PurePursuit:
         if self.cruise_mps is None:
             self.cruise_mps = max(speed, MIN_CRUISE_MPS)
         times = plan_times(observation.t_us)
-        path = make_path(route_points(observation.route_rig))
+        path = make_path(route_points(observation.route_rig), speed_mps=speed)
         progress = speed_profile(speed, curve_speeds(path, self.cruise_mps), seconds(times))
         xy, yaw = follow(path, progress, speed)
         return Plan(observation.t_us, times, xy, yaw, debug={"cruise_mps": self.cruise_mps})
