@@ -27,7 +27,7 @@ def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
     if lane.left is None or lane.right is None:
         xy = np.ascontiguousarray(lane.centre[:, :2])
         line = shapely.linestrings(xy) if len(xy) > 1 else shapely.points(xy[0])
-        return shapely.buffer(line, half_width_m)
+        return shapely.buffer(line, half_width_m, quad_segs=16)
     ring = np.concatenate([lane.left[:, :2], lane.right[::-1, :2]])
     if len(ring) < 3:
         return shapely.Polygon()

@@ -1,9 +1,14 @@
-"""Read the golden scenes for parity tests: the vector map of a scene archive, and AlpaSim's own scores of a log."""
+"""Read the golden scenes for parity tests: the vector map of a scene archive, and AlpaSim's own scores of a log.
+
+``python -m tests.evaluators.golden DATA/alpasim-golden`` prints the parity table over all its logs.
+"""
 
 from __future__ import annotations
 
 import io
+import sys
 import zipfile
+from collections import defaultdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -66,3 +71,30 @@ def expected(log: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
             rows.append((t, value, valid))
     empty = (np.zeros(0),) * 3
     return {name: tuple(np.array(column) for column in zip(*rows, strict=True)) if rows else empty for name, rows in out.items()}
+
+
+def parity_table(folder: Path, skip: tuple[str, ...] = ("synthetic-opendrive-a",)) -> str:
+    """Compare every step of every metric over the logs of ``rollouts/``; road metrics of the scenes in ``skip`` are left out."""
+    from evaluators import score
+
+    compared: dict[str, list] = defaultdict(lambda: [0, 0, 0, 0.0])  # logs, values, equal, largest difference
+    for log in sorted(folder.glob("rollouts/*/*/rollout.asl")):
+        name = log.parent.parent.name
+        rollout, scene = read_case(log, folder / "scenes" / f"{name}.usdz")
+        found = {one.name: one for one in score(rollout, scene, "alpasim")}
+        for metric, (_, value, _) in expected(log).items():
+            if name in skip and metric not in found:
+                continue
+            got = found[metric].value
+            both_missing = np.isnan(got) & np.isnan(value)
+            off = np.where((got == value) | both_missing, 0.0, np.abs(got - value))
+            row = compared[metric]
+            row[0], row[1], row[2] = row[0] + 1, row[1] + len(value), row[2] + int(np.sum(off == 0))
+            row[3] = max(row[3], float(off.max(initial=0.0)))
+    lines = ["| metric | logs | values | exactly equal | largest difference |", "|---|---|---|---|---|"]
+    lines += [f"| `{metric}` | {n} | {total} | {equal} | {worst:.1e} |" for metric, (n, total, equal, worst) in sorted(compared.items())]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(parity_table(Path(sys.argv[1])))

@@ -78,7 +78,7 @@ def test_the_human_drive_hits_nobody_stays_on_the_road_and_on_its_path(shared_da
 
 # Steps (of 0.1 s) whose footprint the lanes do not hold; none of them touches a road edge.
 UNHELD = {
-    "7fab2350": range(150, 160),  # right-hand side up to 9 cm outside the lane, in the junction's exit
+    "7fab2350": range(150, 160),  # leaving a junction, over a wedge between the outlines of its turn lanes
     "adcf7d18": (),
     "3bffdcff": (),
 }

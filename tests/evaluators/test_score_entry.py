@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.errors import EvaluatorError, InputError
-from alpasim_plugin.types import Box, Trajectory
+from alpasim_plugin.types import Box, LoggedPlan, Trajectory
 from evaluators import EVALUATORS, METRICS, MetricInfo, score
 from evaluators.base import run_evaluator, series
 from evaluators.metrics import declare, info
@@ -49,6 +49,15 @@ def test_a_log_with_a_broken_track_is_refused(who, poses, text):
     assert text in str(caught.value)
     assert {"ego": "the ego ", "ego_log": "the recorded drive", "actor": "actor 'a'"}[who] in caught.value.with_what
     assert "session 'uuid'" in caught.value.with_what
+
+
+def test_a_broken_plan_is_refused_and_named():
+    good, late = track(np.arange(3.0), 0.0, t_us=[0, 100, 200]), track(np.arange(3.0), 0.0, t_us=[300_000, 300_100, 300_100])
+    plans = (LoggedPlan(0, 100, good, (good, good)), LoggedPlan(300_000, 300_100, good, (good, late)))
+    with pytest.raises(EvaluatorError) as caught:
+        score(*bad(plans=plans))
+    assert caught.value.with_what.startswith("the plan at 300000 us")
+    assert "time 300100 us is repeated" in caught.value.found
 
 
 @pytest.mark.parametrize("box", [Box(0.0, 1.0, 1.0), Box(4.0, -1.0, 1.0), Box(np.nan, 1.0, 1.0)])
