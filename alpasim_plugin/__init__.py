@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from policies import make_policy
     from scenarios.load import load_scenario
 
+__version__ = "0.1.0"
+
 _HOMES = {
     "load_scenario": "scenarios.load",
     "make_policy": "policies",
@@ -21,7 +23,7 @@ _HOMES = {
     "run_rollout": "alpasim_plugin.runtime.rollout",
 }
 
-__all__ = ["load_scenario", "make_policy", "make_renderer", "run_rollout"]
+__all__ = ["__version__", "load_scenario", "make_policy", "make_renderer", "run_rollout"]
 
 
 def __getattr__(name: str) -> Any:

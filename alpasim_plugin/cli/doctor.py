@@ -7,7 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -50,7 +50,7 @@ def doctor(
     raise typer.Exit(4 if broken else 0)
 
 
-def _raster(backend: str) -> str:
+def _raster(backend: Literal["cpu", "gsplat"]) -> str:
     from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 
     cloud = GaussianCloud(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 import typer
@@ -16,24 +17,22 @@ EPILOG = "Example: `simrun list scenarios`"
 
 
 def list_parts(
-    kind: Annotated[Literal["renderers", "fixers", "policies", "scenarios", "metrics"], typer.Argument(help="What to list.")],
+    kind: Annotated[Literal["renderers", "policies", "scenarios", "metrics"], typer.Argument(help="What to list.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """List renderers, fixers, policies, shipped scenarios or metrics, one a line with one line of help."""
+    """List renderers, policies, shipped scenarios or metrics, one a line with one line of help."""
     del debug
-    known = {
+    tables: dict[str, Callable[[], dict[str, str]]] = {
         "renderers": RENDERERS.names,
-        "fixers": dict,
         "policies": POLICIES.names,
         "scenarios": shipped,
         "metrics": lambda: {name: facts.help for name, facts in METRICS.items()},
-    }[kind]()
+    }
+    known = tables[kind]()
     if as_json:
         print(json.dumps(known))
         return
     width = max((len(name) for name in known), default=0)
     for name, help_text in known.items():
         print(f"{name:<{width}}  {help_text}")
-    if not known:
-        print(f"no {kind} are installed")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.asl import AslFile
 from alpasim_plugin.alpasim.wire import common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2, traffic_pb2
 from alpasim_plugin.errors import InputError
@@ -257,7 +257,7 @@ class AslWriter:
         )
 
     def _version(self, service: str) -> common_pb2.VersionId:
-        given = self.header.versions.get(service, _own_version() if service == "runtime" else "<skip>")
+        given = self.header.versions.get(service, __version__ if service == "runtime" else "<skip>")
         major, minor, patch = WIRE_API
         api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
         return common_pb2.VersionId(version_id=given, git_hash="<skip>" if given == "<skip>" else "", grpc_api_version=api)
@@ -318,10 +318,3 @@ class AslWriter:
             image_format=sensorsim_pb2.PNG if encoding == "png" else sensorsim_pb2.JPEG,
             image_quality=95,
         )
-
-
-def _own_version() -> str:
-    try:
-        return metadata.version("alpasim-onefixer")
-    except metadata.PackageNotFoundError:
-        return "uninstalled"

@@ -78,7 +78,8 @@ def _run_here(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Th
 
 def _run_pool(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Threads) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Run cells in pools; a worker that dies breaks its pool, so the cells then in flight are run again alone, at the end."""
-    left, suspects = list(todo), []
+    left = list(todo)
+    suspects: list[Cell] = []
     while left:
         in_flight: dict[Future[dict[str, Any]], Cell] = {}
         try:

@@ -15,6 +15,7 @@ from alpasim_plugin.types import Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
+SLUG_LENGTH = 80
 LOG_VERSION = 1  # raise when a rollout made by an older version must not be reused
 
 
@@ -113,10 +114,11 @@ def digest(value: object) -> str:
 
 
 def slug(name: str) -> str:
-    """Return a name that is safe as one folder.
+    """Return a name that is safe as one folder; different names have different slugs.
 
     Example:
-        >>> slug("nre://host:50051"), slug("onefixer@1")
-        ('nre-host-50051', 'onefixer@1')
+        >>> slug("onefixer@1"), slug("nre://host:50051")
+        ('onefixer@1', 'nre-host-50051-9d6a75a3')
     """
-    return re.sub(r"[^A-Za-z0-9._@+-]+", "-", name).strip("-.") or "unnamed"
+    safe = re.sub(r"[^A-Za-z0-9._@+-]+", "-", name).strip("-.")[:SLUG_LENGTH]
+    return name if safe == name and safe else f"{safe}-{digest(name)[:8]}"

@@ -9,12 +9,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("alpasim-onefixer", "numpy", "scipy", "numba", "torch", "shapely", "opencv-contrib-python-headless", "pyarrow", "av")
+from alpasim_plugin import __version__
+
+PACKAGES = ("numpy", "scipy", "numba", "torch", "shapely", "opencv-contrib-python-headless", "pyarrow", "av")
 
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and the libraries that shape results; a missing one says so."""
-    found = {"python": platform.python_version()}
+    found = {"alpasim-onefixer": __version__, "python": platform.python_version()}
     for package in PACKAGES:
         try:
             found[package] = version(package)

@@ -13,14 +13,13 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.clock import Clock
-from alpasim_plugin.log import AslWriter, encode_image, header_from_scenario, read_asl, write_facts, write_mp4
+from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.runtime.pictures import Pictures
 from alpasim_plugin.runtime.stages import StageTimes
-from alpasim_plugin.runtime.store import write_bytes
-from alpasim_plugin.types import F64, U8, CameraSpec, EgoState, Frame, Observation, RenderRequest, RolloutLog, Scenario, Trajectory
+from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, RenderRequest, RolloutLog, Scenario, Trajectory
 from alpasim_plugin.world.ego import ego_state_from_log
 
-LOG_NAME, FRAMES_NAME, STRIP_NAME, VIDEO_NAME = "rollout.asl", "frames.jsonl", "strip.jpg", "front.mp4"
-STRIP_FRAMES = 4
+LOG_NAME, FRAMES_NAME = "rollout.asl", "frames.jsonl"
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 
@@ -54,11 +53,10 @@ class Recorder:
         self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
         self._times = StageTimes()
         self._frames: list[dict[str, Any]] = []
-        self._kept: list[tuple[int, U8]] = []
+        self._pictures: Pictures | None = None
         self._told_us = -1
         self._steps = 0
         self._writer: AslWriter | None = None
-        self._clock: Clock | None = None
 
     def __enter__(self) -> Recorder:
         return self
@@ -75,10 +73,8 @@ class Recorder:
 
     def start(self, clock: Clock, cameras: Mapping[str, CameraSpec]) -> None:
         """Open the log and write its header."""
-        self._clock = clock
-        self._strip_us = {
-            clock.start_us + int(f * clock.n_steps) * clock.rates.control_us for f in np.linspace(0.1, 0.9, STRIP_FRAMES)
-        }
+        if cameras:
+            self._pictures = Pictures(clock, next(iter(cameras)), self._keep_frames)
         header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps, self._versions)
         self._writer = AslWriter(self.folder / LOG_NAME, header)
         self._writer.begin(list(cameras.values()))
@@ -102,9 +98,8 @@ class Recorder:
                     "events": " ".join(frame.events),
                 }
             )
-            near = any(abs(frame.t_us - t) < self._scenario.rates.camera_us / 2 for t in self._strip_us)
-            if self._keep_frames or near:
-                self._kept.append((frame.t_us, frame.rgb))
+            if self._pictures is not None:
+                self._pictures.add(frame)
 
     def question(self, observation: Observation, clock: Clock) -> None:
         """Log what the policy was told."""
@@ -153,23 +148,13 @@ class Recorder:
             "frame_events": events,
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
-            "strip_t_us": [t_us for t_us, _ in self._strip()],
+            "strip_t_us": [] if self._pictures is None else self._pictures.strip_us,
         }
 
     def save_pictures(self, video: bool) -> None:
         """Write the strip of frames, and the video if asked for."""
-        if not self._kept:
-            return
-        strip = [rgb for _, rgb in self._strip()]
-        if strip:
-            write_bytes(self.folder / STRIP_NAME, encode_image(np.concatenate(strip, axis=1), "jpeg", 90))
-        if video:
-            write_mp4(self.folder / VIDEO_NAME, [rgb for _, rgb in self._kept], 1e6 / self._scenario.rates.camera_us)
-
-    def _strip(self) -> list[tuple[int, U8]]:
-        """Return time and picture of the frames that go side by side into the strip."""
-        near_us = self._scenario.rates.camera_us / 2
-        return [(t_us, rgb) for t_us, rgb in self._kept if any(abs(t_us - t) < near_us for t in self._strip_us)][:STRIP_FRAMES]
+        if self._pictures is not None:
+            self._pictures.save(self.folder, video)
 
     @property
     def _log(self) -> AslWriter:

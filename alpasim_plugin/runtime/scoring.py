@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.geometry import inverse, offset_trajectory, project, yaw_from_quat
+from alpasim_plugin.geometry import arc_lengths, inverse, offset_trajectory, project, yaw_from_quat
 from alpasim_plugin.log import read_asl, read_facts
-from alpasim_plugin.types import MetricSeries, RolloutLog, Scenario
+from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from evaluators import Reduction, reduce_rollout, score
 
 
@@ -58,22 +58,36 @@ def _row(t_us: int, metric: str, value: Any, why_missing: str = "") -> dict[str,
 def _state_rows(rollout: RolloutLog) -> list[dict[str, Any]]:
     """Return where the ego was: not metrics, but what plots and stratified results need."""
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    yaw = yaw_from_quat(rig.quat)
-    speed = _speeds(rig.t_us, rig.xyz)
-    rows = []
-    for i, t in enumerate(rig.t_us.tolist()):
-        state: Mapping[str, float] = {
-            "ego_x_m": float(rig.xyz[i, 0]),
-            "ego_y_m": float(rig.xyz[i, 1]),
-            "ego_yaw_rad": float(yaw[i]),
-            "ego_speed_mps": float(speed[i]),
-            "lateral_offset_m": project(rollout.ego_log.xyz, rig.xyz[i])[1] if len(rollout.ego_log) > 1 else 0.0,
-        }
-        rows += [_row(t, name, value) for name, value in state.items()]
+    state: Mapping[str, F64] = {
+        "ego_x_m": rig.xyz[:, 0],
+        "ego_y_m": rig.xyz[:, 1],
+        "ego_yaw_rad": yaw_from_quat(rig.quat),
+        "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
+    }
+    rows = [_row(t, name, float(v)) for name, values in state.items() for t, v in zip(rig.t_us.tolist(), values, strict=True)]
+    path = rollout.ego_log.xyz
+    for t, at in zip(rig.t_us.tolist(), rig.xyz, strict=True):
+        rows.append(_row(t, "lateral_offset_m", _offset(path, at), "not beside the logged path"))
     return rows
 
 
-def _speeds(t_us: np.ndarray[Any, Any], xyz: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _offset(path: F64, at: F64) -> float | None:
+    """Return the signed distance from the logged path, left positive; None before its start and past its end."""
+    moved = np.flatnonzero(np.linalg.norm(path[:, :2] - path[0, :2], axis=1) > 0.5)
+    if not moved.size:
+        return None  # the recorded car stood still: there is no path to be beside of
+    first = path[moved[0], :2] - path[0, :2]
+    back = np.flatnonzero(np.linalg.norm(path[:, :2] - path[-1, :2], axis=1) > 0.5)[-1]
+    last = path[-1, :2] - path[back, :2]
+    if (at[:2] - path[0, :2]) @ first < -0.1 and project(path, at)[0] <= 0.0:
+        return None
+    s, offset = project(path, at)
+    if s >= arc_lengths(path)[-1] and (at[:2] - path[-1, :2]) @ last > 0.1:
+        return None
+    return offset
+
+
+def _speeds(t_us: I64, xyz: F64) -> F64:
     if len(t_us) < 2:
         return np.zeros(len(t_us))
     seconds = (t_us - t_us[0]).astype(np.float64) * 1e-6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,19 +45,39 @@ def write_tables(
     sink = pa.BufferOutputStream()
     pq.write_table(pa.concat_tables(parts) if parts else STEPS_SCHEMA.empty_table(), sink, compression="zstd")
     write_bytes(root / "steps.parquet", sink.getvalue().to_pybytes())
-    renderers = list(dict.fromkeys(row["renderer"] for row in rows))
-    chosen = baseline if baseline in renderers else renderers[0] if renderers else None
     summary = {
         "preset": preset,
-        "metrics": aggregate(rows),
-        "paired": paired(rows, chosen) if chosen is not None and len(renderers) > 1 else {},
-        "censoring": censoring(manifests),
+        "metrics": _by_policy(rows, aggregate),
+        "paired": _by_policy(rows, lambda some: _pairs(some, baseline)),
+        "censoring": _by_policy(manifests, censoring),
         "failures": _failures(manifests),
-        "speed": {name: speed([m for m in manifests if m["renderer"] == name and m["status"] == "ok"]) for name in renderers},
+        "speed": _by_policy([m for m in manifests if m["status"] == "ok"], _speeds),
         "pool": _pool(root, manifests, threads, wall_s),
     }
     write_json(root / "summary.json", summary)
     return summary
+
+
+def _by_policy(rows: Sequence[dict[str, Any]], table: Callable[[Sequence[dict[str, Any]]], dict[str, Any]]) -> dict[str, Any]:
+    """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY: policies are never averaged."""
+    policies = list(dict.fromkeys(row["policy"] for row in rows))
+    out: dict[str, Any] = {}
+    for policy in policies:
+        part = table([row for row in rows if row["policy"] == policy])
+        out |= part if len(policies) == 1 else {f"{renderer}/{policy}": entry for renderer, entry in part.items()}
+    return out
+
+
+def _pairs(rows: Sequence[dict[str, Any]], baseline: str | None) -> dict[str, Any]:
+    renderers = list(dict.fromkeys(row["renderer"] for row in rows))
+    if len(renderers) < 2:
+        return {}
+    return dict(paired(rows, baseline if baseline is not None and baseline in renderers else renderers[0]))
+
+
+def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    renderers = list(dict.fromkeys(m["renderer"] for m in manifests))
+    return {name: speed([m for m in manifests if m["renderer"] == name]) for name in renderers}
 
 
 def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:

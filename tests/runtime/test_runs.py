@@ -158,6 +158,9 @@ def test_two_scenarios_with_one_id_are_refused() -> None:
         make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
 
 
-def test_names_become_safe_folders() -> None:
-    assert slug("nre://host:50051") == "nre-host-50051"
-    assert slug("../../etc") == "etc"
+def test_names_become_safe_folders_that_never_collide() -> None:
+    assert slug("onefixer@1") == "onefixer@1"
+    assert slug("../../etc").startswith("etc-")
+    assert len({slug(name) for name in ("a/b", "a-b", "a:b", "a b", "", "-")}) == 6
+    assert len(slug("x" * 300)) < 100
+    assert slug("x" * 300) != slug("x" * 299)
