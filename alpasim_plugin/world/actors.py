@@ -16,7 +16,7 @@ from alpasim_plugin.geometry import interpolate, se2, se3, slerp, wrap_angle, ya
 from alpasim_plugin.types import F64, Actor, EgoState, HeightField, LaneMap, Scenario, Vehicle
 from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.ground import ground_pose
-from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration
+from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, wanted_gap_m
 from alpasim_plugin.world.lane_map import LaneIndex
 from alpasim_plugin.world.path import Path, polyline_path
 from alpasim_plugin.world.state import bodies_from, concatenate
@@ -85,11 +85,11 @@ class Actors:
         for driver in self.drivers:
             driver.close(from_us, to_us)
         for _ in range(n):
-            others = [d.bodies() for d in self.drivers]
-            for i, driver in enumerate(self.drivers):
-                if driver.present:
-                    driver.decide(concatenate([fixed, *others[:i], *others[i + 1 :]]))
-            for driver in self.drivers:
+            driving = [d for d in self.drivers if d.motion is not None]
+            everybody = concatenate([fixed, *(d.bodies() for d in driving)])
+            for row, driver in enumerate(driving, start=len(fixed.xy)):
+                driver.decide(everybody, row)
+            for driver in driving:
                 driver.advance(dt_s)
 
 
@@ -204,12 +204,15 @@ class _Driver:
         direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
         return bodies_from(xyz[:2], yaw, [self.actor.box], m.speed_mps * direction)
 
-    def decide(self, others: Bodies) -> None:
+    def decide(self, everybody: Bodies, own_row: int) -> None:
+        """Choose the acceleration for the next step."""
         m = self.motion
         if m is None or self.path is None:
             return
         front = m.s_m + self.actor.box.length_m / 2
-        leader = find_leader(self.path, front, self.actor.box.width_m / 2, others)
+        # Twice the wanted gap behind a standing leader: beyond it the interaction is below a quarter of the own acceleration.
+        horizon_m = 20.0 + 2.0 * wanted_gap_m(m.speed_mps, m.speed_mps, self.params)
+        leader = find_leader(self.path, front, self.actor.box.width_m / 2, everybody, horizon_m, own_row=own_row)
         m.accel_mps2 = idm_acceleration(m.speed_mps, leader.gap_m, m.speed_mps - leader.speed_mps, self.params)
 
     def advance(self, dt_s: float) -> None:

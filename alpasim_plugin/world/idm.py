@@ -32,6 +32,12 @@ class IdmParams:
         return IdmParams(**{k: float(v) for k, v in params.items()})
 
 
+def wanted_gap_m(speed_mps: float, closing_mps: float, p: IdmParams) -> float:
+    """Return the gap that the driver wants at a speed and a closing speed (equation 3)."""
+    dynamic = speed_mps * p.headway_s + speed_mps * closing_mps / (2.0 * float(np.sqrt(p.accel_mps2 * p.brake_mps2)))
+    return p.min_gap_m + max(0.0, dynamic)
+
+
 def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmParams) -> float:
     """Return the acceleration behind a leader (``gap_m`` infinite: free road), within ``[-hard_brake, accel]``.
 
@@ -47,12 +53,7 @@ def idm_acceleration(speed_mps: float, gap_m: float, closing_mps: float, p: IdmP
     """
     v0 = max(p.desired_speed_mps, 0.1)
     free = 1.0 - (speed_mps / v0) ** 4
-    if np.isinf(gap_m):
-        interaction = 0.0
-    else:
-        dynamic = speed_mps * p.headway_s + speed_mps * closing_mps / (2.0 * np.sqrt(p.accel_mps2 * p.brake_mps2))
-        wanted_gap = p.min_gap_m + max(0.0, dynamic)
-        interaction = (wanted_gap / max(gap_m, 0.01)) ** 2
+    interaction = 0.0 if np.isinf(gap_m) else (wanted_gap_m(speed_mps, closing_mps, p) / max(gap_m, 0.01)) ** 2
     return float(np.clip(p.accel_mps2 * (free - interaction), -p.hard_brake_mps2, p.accel_mps2))
 
 
@@ -117,24 +118,27 @@ def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0,
 
 
 def find_leader(
-    path: Path, front_s_m: float, half_width_m: float, bodies: Bodies, horizon_m: float = 120.0, margin_m: float = 0.2
+    path: Path, front_s_m: float, half_width_m: float, bodies: Bodies, horizon_m: float = 120.0, margin_m: float = 0.2, own_row: int = -1
 ) -> Leader:
     """Return the nearest body that reaches into the corridor of a path ahead of the own front bumper.
+
+    ``own_row`` is the driver's own row in ``bodies``, which is left out.
 
     A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the path and its rear end is not more than 2 m
     behind the own front bumper, so that touching bodies still count.
     """
-    return nearest_ahead(spans(path, front_s_m, bodies, horizon_m), front_s_m, half_width_m, horizon_m, margin_m)
+    return nearest_ahead(spans(path, front_s_m, bodies, horizon_m), front_s_m, half_width_m, horizon_m, margin_m, own_row)
 
 
 def nearest_ahead(
-    span: Spans | None, front_s_m: float, half_width_m: float, horizon_m: float = 120.0, margin_m: float = 0.2
+    span: Spans | None, front_s_m: float, half_width_m: float, horizon_m: float = 120.0, margin_m: float = 0.2, own_row: int = -1
 ) -> Leader:
     """Return the leader among bodies whose place on the path is known (see `find_leader`)."""
     if span is None:
         return NO_LEADER
     reach = half_width_m + margin_m
     ahead = (span.low < reach) & (span.high > -reach) & (span.rear > front_s_m - 2.0) & (span.rear < front_s_m + horizon_m)
+    ahead &= span.index != own_row
     if not ahead.any():
         return NO_LEADER
     k = int(np.argmin(np.where(ahead, span.rear, np.inf)))
