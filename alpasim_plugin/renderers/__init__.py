@@ -1,5 +1,6 @@
 """From a scene and a camera pose to a frame."""
 
+from alpasim_plugin.renderers import broken as broken
 from alpasim_plugin.renderers import gaussian as gaussian
 from alpasim_plugin.renderers.base import RENDERERS, make_renderer
 

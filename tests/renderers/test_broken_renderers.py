@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.geometry import se3
+from alpasim_plugin.renderers import RENDERERS, make_renderer
+from alpasim_plugin.renderers.broken import LATE_FRAMES, SHIFT_SHARE
+from alpasim_plugin.renderers.gaussian import clear_cache
+from alpasim_plugin.types import Renderer, RenderRequest, Scenario
+from tests.gaussians.scene_maps import straight
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Iterator[Scenario]:
+    yield straight(actors=())
+    clear_cache()
+
+
+def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
+    out = []
+    for i in range(5, 5 + n):
+        T = se3(scenario.ego_log.xyz[i], scenario.ego_log.quat[i]) @ scenario.cameras[0].T_rig_camera
+        out.append(RenderRequest(int(scenario.ego_log.t_us[i]), scenario.cameras[0], np.stack([T, T]), {}))
+    return out
+
+
+def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(scenario: Scenario) -> None:
+    names = [name for name in RENDERERS if name.startswith("broken-")]
+    assert len(names) == 6
+    for name in names:
+        clean, broken = make_renderer("clean", scenario), make_renderer(name, scenario)
+        assert isinstance(broken, Renderer)
+        for r in requests(scenario, LATE_FRAMES + 2):
+            good, bad = clean.render(r), broken.render(r)
+        assert bad.t_us == good.t_us
+        assert bad.rgb.shape == good.rgb.shape
+        assert bad.rgb.dtype == np.uint8
+        assert np.mean(np.abs(bad.rgb.astype(int) - good.rgb)) > 2, name
+
+
+def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(scenario: Scenario) -> None:
+    views = requests(scenario, LATE_FRAMES + 3)
+    clean = [make_renderer("clean", scenario).render(r).rgb for r in views]
+    frozen, late = make_renderer("broken-frozen", scenario), make_renderer("broken-late", scenario)
+    for i, r in enumerate(views):
+        np.testing.assert_array_equal(frozen.render(r).rgb, clean[0])
+        np.testing.assert_array_equal(late.render(r).rgb, clean[max(0, i - LATE_FRAMES)])
+
+
+def test_mirrored_and_shifted_move_pixels_where_they_say(scenario: Scenario) -> None:
+    r = requests(scenario, 1)[0]
+    good = make_renderer("clean", scenario).render(r).rgb
+    np.testing.assert_array_equal(make_renderer("broken-mirrored", scenario).render(r).rgb, good[:, ::-1])
+    n = round(SHIFT_SHARE * good.shape[1])
+    np.testing.assert_array_equal(make_renderer("broken-shifted", scenario).render(r).rgb[:, n:], good[:, :-n])
