@@ -15,7 +15,7 @@ from alpasim_plugin.types import F64, U8, CameraSpec, Frame, Observation, Plan, 
 from policies.base import POLICIES, plan_times, seconds
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
-from policies.lane_plan import Blend, blend, cruise, guess_from_route, progress_behind, sampled, wander
+from policies.lane_plan import Blend, RouteGuess, blend, cruise, guess_from_route, progress_behind, sampled, wander
 from policies.lane_vision import PaintPoints, RidgeFilter, find_paint
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
 from policies.paths import curve_speeds, follow
@@ -26,7 +26,7 @@ MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any m
 LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
 OTHER_LANE = 0.55  # the route asks for the next lane when it lies this share of a width off the centre
 OTHER_LANE_FRAMES = 5
-SAME_HEADING_RAD = 0.25
+SAME_HEADING_RAD, TURN_OFF_RAD = 0.25, 0.3
 CHOOSE_AT_M, CHOOSE_AT_S = 12.0, 1.2
 DOUBT_AT_M = 10.0
 OBSTACLE_RANGE_M = 48.0
@@ -152,12 +152,12 @@ class LaneCamera:
     def _look_for_lane(self, ground: U8, route: F64 | None, speed: float) -> None:
         points = find_paint(ground, self.grid, self.ridges)
         row_m = np.interp(points.x_m, self.grid.x_m, self.grid.row_m)
+        guess = guess_from_route(np.array([[0.0, 0.0], [20.0, 0.0]]) if route is None else route)
         if self.lane is not None:
             self.lane = update(self.lane, points, row_m)
-            if self._is_lost(self.lane):
+            if self._is_lost(self.lane, guess if route is not None else None):
                 self.lane = None
         if self.lane is None:
-            guess = guess_from_route(route) if route is not None else guess_from_route(np.array([[0.0, 0.0], [20.0, 0.0]]))
             self.lane = search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm)
             if self.lane is not None:
                 self.lane = update(self.lane, points, row_m)
@@ -184,7 +184,12 @@ class LaneCamera:
         lanes = round(beside_m / float(lane.mean[4]))
         return shift(lane, lanes) if abs(beside_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4] else None
 
-    def _is_lost(self, lane: LaneState) -> bool:
+    def _is_lost(self, lane: LaneState, route: RouteGuess | None) -> bool:
+        if route is not None:
+            at = 5.0
+            turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(np.array([at]))[0])
+            if abs(turn) > TURN_OFF_RAD:
+                return True
         sigma = float(lane.sigma(np.array([5.0]))[0])
         heading, width = float(lane.mean[1]), float(lane.mean[4])
         return sigma > LOST_SIGMA_M or lane.blind_m > LOST_BLIND_M or abs(heading) > MAX_HEADING_RAD or not 2.2 < width < 5.5

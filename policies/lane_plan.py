@@ -13,6 +13,7 @@ from policies.obstacle_vision import ObstacleTrack
 from policies.paths import Path, make_path
 
 ROUTE_SIGMA_M = 0.75  # how far a lane's centre may lie from the route, for all the policy knows
+SAME_LANE_M = 1.5
 PATH_M = 70.0
 LEAVE_M, LEAVE_RAD = 1.2, 0.2  # the route leaves the lane where it is this far off and points this much elsewhere
 LEAVE_BEFORE_M = 8.0
@@ -59,7 +60,8 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
 
     Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route has no say in the
-    lateral position; it takes over beyond the paint that is seen, and where it turns away from the lane (an intersection, an exit).
+    lateral position; it takes over beyond the paint that is seen, where it turns away from the lane (an intersection, an exit), and
+    where the two are more than `SAME_LANE_M` apart.
     """
     if lane is None:
         points = np.array([[0.0, 0.0], [10.0, 0.0]]) if route is None else route
@@ -81,8 +83,11 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     if (apart & turned & usable).any():
         leaves = float(x[np.argmax(apart & turned & usable)])
         sigma = np.hypot(sigma, 0.3 * np.maximum(x - (leaves - LEAVE_BEFORE_M), 0.0))
-    lane_share = ROUTE_SIGMA_M**2 / (ROUTE_SIGMA_M**2 + sigma**2)
-    correction = np.where(usable, lane_share * (y_lane - y), 0.0)
+    off = y_lane - y
+    # A lane far from the route is another lane than the route's, not a better estimate of it.
+    same_lane = np.exp(-((np.maximum(np.abs(off) - SAME_LANE_M, 0.0) / 0.7) ** 2))
+    lane_share = same_lane * ROUTE_SIGMA_M**2 / (ROUTE_SIGMA_M**2 + sigma**2)
+    correction = np.where(usable, lane_share * off, 0.0)
     if not usable.all():
         last = max(int(np.argmin(usable)) - 1, 0)
         beyond = np.arange(len(x)) > last
