@@ -17,7 +17,6 @@ from alpasim_plugin.gaussians.layout import HALF_WIDTH, RADIUS_X, RADIUS_Y, RECO
 
 _RADIX_BITS = 11
 _LOW = np.int64(0xFFFFFFFF)
-CHUNK = 2048  # splats a thread takes at a time
 
 
 @njit(cache=True, nogil=True)
@@ -130,16 +129,16 @@ def _tile_box(records, at, tiles_x, tiles_y):
 
 
 @njit(cache=True, nogil=True)
-def gather_and_count(cursor, count, order, records, tiles_x, tiles_y, ordered, histogram):
-    """Copy records into depth order and count, per chunk of CHUNK splats, how many meet each tile."""
-    n_chunks = (count + CHUNK - 1) // CHUNK
+def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram):
+    """Copy records into depth order and count, per chunk of ``chunk_size`` splats, how many meet each tile."""
+    n_chunks = histogram.shape[0]
     while True:
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= n_chunks:
             return
         counts = histogram[chunk]
         counts[:] = 0
-        for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
             v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
             source, at = (order[rank] & _LOW) * RECORD, rank * RECORD
             v.store(ordered, at, v.load(records, source))
@@ -154,9 +153,9 @@ def gather_and_count(cursor, count, order, records, tiles_x, tiles_y, ordered, h
 
 
 @njit(cache=True, nogil=True)
-def tile_offsets(count, histogram, starts):
+def tile_offsets(histogram, starts):
     """Turn the counts into each chunk's write positions; fill ``starts`` (tiles + 1); return the number of (splat, tile) pairs."""
-    n_chunks = (count + CHUNK - 1) // CHUNK
+    n_chunks = histogram.shape[0]
     total = 0
     for tile in range(starts.shape[0] - 1):
         starts[tile] = total
@@ -169,15 +168,15 @@ def tile_offsets(count, histogram, starts):
 
 
 @njit(cache=True, nogil=True)
-def fill_tiles(cursor, count, ordered, tiles_x, tiles_y, histogram, lists):
+def fill_tiles(cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists):
     """Write each tile's list of ranks; chunks ascend and so do the ranks in a chunk, hence every list is in depth order."""
-    n_chunks = (count + CHUNK - 1) // CHUNK
+    n_chunks = histogram.shape[0]
     while True:
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= n_chunks:
             return
         position = histogram[chunk]
-        for rank in range(chunk * CHUNK, min((chunk + 1) * CHUNK, count)):
+        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
             at = rank * RECORD
             left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
             for row in range(top, bottom):

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.gaussians.binning import CHUNK, depth_order, fill_tiles, gather_and_count, tile_offsets
+from alpasim_plugin.gaussians.binning import depth_order, fill_tiles, gather_and_count, tile_offsets
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
 from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
@@ -106,16 +106,18 @@ def rasterize_prepared(
     keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
     order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
     ordered = _buffers.get("ordered", count * RECORD, np.float32)
-    n_chunks, n_tiles = -(-count // CHUNK), tiles_x * tiles_y
+    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
+    chunk_size = max(2048, -(-count // 64))
+    n_chunks, n_tiles = -(-count // chunk_size), tiles_x * tiles_y
     histogram = _buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
     starts = np.empty(n_tiles + 1, np.int64)
     cursor[:] = 0
     workers = threads if count > _WORTH_THREADS else 1
-    run_on_threads(workers, gather_and_count, cursor, count, order, records, tiles_x, tiles_y, ordered, histogram)
-    pairs = int(tile_offsets(count, histogram, starts))
+    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram)
+    pairs = int(tile_offsets(histogram, starts))
     lists = _buffers.get("lists", pairs, np.int32)
     cursor[:] = 0
-    run_on_threads(workers, fill_tiles, cursor, count, ordered, tiles_x, tiles_y, histogram, lists)
+    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists)
 
     shape = (camera.height, camera.width)
     rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
