@@ -26,7 +26,7 @@ ARGOVERSE = ("7fab2350", "adcf7d18", "3bffdcff")
 LOGS = (*ARGOVERSE, "USA_US101-3_3_T-1", "USA_Lanker-1_1_T-1", "cosmos")
 
 
-@lru_cache(maxsize=3)
+@lru_cache(maxsize=6)
 def read(folder: Path, name: str) -> RecordedLog:
     if name in ARGOVERSE:
         return read_argoverse(folder / "av2" / name)
