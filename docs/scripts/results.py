@@ -92,7 +92,8 @@ def scene_table(run: Path) -> str:
     """Return one row per scene and renderer, averaged over seeds."""
     rows = pq.read_table(run / "rollouts.parquet").to_pylist()
     keys = list(dict.fromkeys((row["scene"], row["renderer"]) for row in rows))
-    lines = ["| scene | renderer | at fault | any contact | off-road | route distance (m) | progress (%) |", "|---|---|---|---|---|---|---|"]
+    head = ("scene", "renderer", "at fault", "any contact", "off-road", "route distance (m)", "progress (%)")
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for scene, renderer in keys:
         mine = [row for row in rows if (row["scene"], row["renderer"]) == (scene, renderer)]
 
@@ -143,7 +144,7 @@ def main() -> None:
     given = inputs(data)
     both = ("--renderer", "clean,3dgs", "--policy", "lane-camera", "--seeds", "3")
     real = simrun(runs / "real", *both, *given.values())
-    replay = simrun(runs / "replay", "--renderer", "clean", "--policy", "log-replay", *list(given.values())[1:])
+    simrun(runs / "replay", "--renderer", "clean", "--policy", "log-replay", *list(given.values())[1:])
     suites = {name: simrun(runs / name, *both, f"suites/{name}") for name in ("smoke", "urban", "highway", "hard")}
     one = simrun(runs / "one", "--renderer", "clean,3dgs", "--policy", "lane-camera", "--workers", "1", "suites/smoke")
     scenes = list(dict.fromkeys(row["scene"] for row in pq.read_table(runs / "real" / "rollouts.parquet").to_pylist()))
