@@ -147,7 +147,7 @@ def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
     rgb = np.array([PAINT_RGB[WHITE], PAINT_RGB[YELLOW]])[strokes.colour] * wear
     length = np.linalg.norm(strokes.end - strokes.start, axis=1)
     levels = []
-    for cell_m, link_m, across_m in ((0.125, 0.3, 0.15), (0.3, 0.75, 0.25), (0.8, 1.5, 0.5)):
+    for cell_m, link_m, across_m in ((0.125, 0.19, 0.15), (0.3, 0.75, 0.25), (0.8, 1.5, 0.5)):
         n_u = np.maximum(np.round(length / link_m), 1).astype(np.int64)
         n_v = np.maximum(np.round(strokes.width_m / across_m), 1).astype(np.int64)
         owner, u, v = grid_cells(n_u, n_v)

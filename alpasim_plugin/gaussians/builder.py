@@ -9,15 +9,17 @@ from alpasim_plugin.gaussians.build_facades import build_facades
 from alpasim_plugin.gaussians.build_road import build_road
 from alpasim_plugin.gaussians.build_street import build_street
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.nodes import nodes_by_tile
+from alpasim_plugin.gaussians.nodes import Level, SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.paint import paint_strokes
 from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.sh import dc_from_rgb
 from alpasim_plugin.gaussians.site import HeightAt, make_site
 from alpasim_plugin.gaussians.sky import make_sky
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, Scenario
 
 FILE_TILE_M = 16.0
+LIGHT = {"clear": (1.0, 1.0, 1.0), "overcast": (0.86, 0.88, 0.91), "dusk": (0.74, 0.63, 0.62)}  # on everything but the sky, by sky
 
 
 def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
@@ -29,13 +31,14 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
         height_at: Ground height under ``(N, 2+)`` world points, ``(N,)`` metres.
     """
     sky = make_sky(scenario.environment.sky, stream(scenario.scene_id, scenario.seed, "scene/sky"))
-    actors = build_actors(scenario)
+    light = np.array(LIGHT[scenario.environment.sky])
+    actors = [lit(node, light) for node in build_actors(scenario)]
     if scenario.background is not None:
         return SceneGraph([], actors, sky)
     site = make_site(scenario, height_at)
     nodes = build_road(site, paint_strokes(site))
     facades, houses = build_facades(site)
-    return SceneGraph([*nodes, *facades, *build_street(site, houses)], actors, sky)
+    return SceneGraph([lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky)
 
 
 def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) -> SceneGraph:
@@ -50,6 +53,19 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
     tile = np.floor(placed.means[:, :2] / FILE_TILE_M).astype(np.int64)
     nodes = nodes_by_tile("file", [(0.0, placed, tile[:, 1] * 1_000_003 + tile[:, 0])])
     return SceneGraph(nodes, list(graph.actors.values()), graph.sky, graph.sh_frame, graph.cell_px)
+
+
+def lit(node: SceneNode, light: F64) -> SceneNode:
+    """Return the node with all colours multiplied by ``light (3,)``."""
+    if np.all(light == 1.0):
+        return node
+    levels = []
+    for level in node.levels:
+        c = level.cloud
+        sh = c.sh * light
+        sh[:, 0] += dc_from_rgb(0.5 * light)  # colour is 0.5 + C0 dc: the half is lit as well
+        levels.append(Level(level.cell_m, GaussianCloud(c.means, c.quats, c.scales, c.opacities, sh.astype(np.float32))))
+    return SceneNode(node.name, node.kind, tuple(levels), node.far_m)
 
 
 def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
@@ -33,6 +34,7 @@ STEPS = 8
 BEHIND_M = 6.0  # a Gaussian's log camera is the one this far before it
 KNOT_US = 400_000  # spacing of the wandering of exposure and poses
 SEEN_TOLERANCE = 0.06  # share of depth by which a Gaussian may lie behind the surface a log camera saw
+EDGE_SHARE = 0.05
 GHOST = "~ghost"
 
 
@@ -40,7 +42,8 @@ class LogView:
     """Depth as one log camera saw it."""
 
     def __init__(self, camera: PinholeCamera, depth: F32, alpha: F32) -> None:
-        self.camera, self.depth, self.solid = camera, depth, alpha > 0.5
+        # The farthest surface of the neighbouring pixels: what shows beside an occluder's edge from a metre on counts as seen.
+        self.camera, self.depth, self.solid = camera, cv2.dilate(depth, np.ones((3, 3), dtype=np.uint8)), alpha > 0.5
 
     def sees(self, points: F64, size_m: F64) -> Bool:
         """Return which points ``(N, 3)`` of radius ``size_m (N,)`` lie in view and not behind what was seen."""
@@ -50,8 +53,10 @@ class LogView:
         safe = np.where(ahead, z, 1.0)
         u = np.floor(camera.fx * x / safe + camera.cx)
         v = np.floor(camera.fy * y / safe + camera.cy)
-        inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        row, column = np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
+        edge = EDGE_SHARE * camera.width  # a Gaussian just outside the image still shows in it
+        inside = ahead & (u >= -edge) & (u < camera.width + edge) & (v >= -edge) & (v < camera.height + edge)
+        row = np.clip(np.where(inside, v, 0), 0, camera.height - 1).astype(np.int64)
+        column = np.clip(np.where(inside, u, 0), 0, camera.width - 1).astype(np.int64)
         limit = self.depth[row, column] * (1 + SEEN_TOLERANCE) + 0.3 + size_m
         return np.asarray(inside & (~self.solid[row, column] | (z < limit)))
 

@@ -16,11 +16,11 @@ WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
 LOW_RAD, HIGH_RAD = np.radians(-20.0), np.radians(70.0)
 STEP_PX = 8  # directions are computed this often and interpolated in between
 
-# zenith, mid, horizon, haze below the horizon, cloud, share of cloud, hills
+# zenith, middle, horizon, what shows below the horizon where the scene has a hole, cloud, hills
 _COLOURS: dict[str, tuple[tuple[float, float, float], ...]] = {
-    "clear": ((0.30, 0.50, 0.80), (0.52, 0.70, 0.90), (0.82, 0.89, 0.94), (0.55, 0.58, 0.50), (0.97, 0.97, 0.97), (0.50, 0.56, 0.56)),
-    "overcast": ((0.62, 0.65, 0.69), (0.70, 0.73, 0.76), (0.80, 0.82, 0.83), (0.52, 0.54, 0.49), (0.86, 0.87, 0.88), (0.52, 0.55, 0.54)),
-    "dusk": ((0.23, 0.28, 0.46), (0.52, 0.46, 0.56), (0.95, 0.70, 0.48), (0.40, 0.36, 0.33), (0.93, 0.62, 0.52), (0.30, 0.29, 0.34)),
+    "clear": ((0.30, 0.50, 0.80), (0.52, 0.70, 0.90), (0.82, 0.89, 0.94), (0.37, 0.38, 0.34), (0.97, 0.97, 0.97), (0.50, 0.56, 0.56)),
+    "overcast": ((0.62, 0.65, 0.69), (0.70, 0.73, 0.76), (0.80, 0.82, 0.83), (0.34, 0.35, 0.33), (0.86, 0.87, 0.88), (0.52, 0.55, 0.54)),
+    "dusk": ((0.23, 0.28, 0.46), (0.52, 0.46, 0.56), (0.95, 0.70, 0.48), (0.27, 0.24, 0.23), (0.93, 0.62, 0.52), (0.30, 0.29, 0.34)),
 }
 _CLOUD_SHARE = {"clear": 0.34, "overcast": 0.85, "dusk": 0.45}
 

@@ -32,8 +32,8 @@ from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
 LOG_VIEW_WIDTH = 160
-LOG_VIEW_SPACING_M = 4.0
-LOG_VIEWS = 40
+LOG_VIEW_SPACING_M = 2.5
+LOG_VIEWS = 60
 SOFT_CELL_PX = 4.5  # a bad reconstruction has fewer, larger Gaussians
 
 T = TypeVar("T")

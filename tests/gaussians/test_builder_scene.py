@@ -193,6 +193,13 @@ def test_actors_of_one_scene_differ_in_colour_and_keep_it(street: tuple[Scenario
     np.testing.assert_array_equal(again.levels[0].cloud.sh, street[1].actors["car-1"].levels[0].cloud.sh)
 
 
+def test_dusk_darkens_everything_below_the_sky(street: tuple[Scenario, SceneGraph]) -> None:
+    scenario = straight(environment=Environment(sky="dusk"))
+    day, dusk = (g.render(view(scenario, 2), {}) for g in (street[1], built(scenario)))
+    ground = day.alpha > 0.98
+    np.testing.assert_allclose(dusk.rgb[ground].mean(axis=0) / day.rgb[ground].mean(axis=0), [0.74, 0.63, 0.62], atol=0.02)
+
+
 def test_file_background_is_scaled_turned_and_cut_into_blocks(street: tuple[Scenario, SceneGraph]) -> None:
     cloud = street[1].actors["bus-1"].levels[0].cloud
     T = np.eye(4)
