@@ -1,0 +1,92 @@
+"""One transformer block and the final layer, each with its modulation or with the modulation folded into its weights."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from torch import Tensor, nn
+
+from alpasim_plugin.nets.adaln import LowRankModulation, Modulation, fold_input, fold_output, residual, stack_rows
+from alpasim_plugin.nets.attention import Attend, CrossAttention, SelfAttention
+from alpasim_plugin.nets.layers import PATCH, layer_norm
+from alpasim_plugin.nets.mlp import Mlp
+from alpasim_plugin.nets.rope import RopeTable
+from alpasim_plugin.nets.sizes import DiTSizes
+
+TimeSignal = tuple[Tensor, Tensor]  # emb (B, T, width), lora (B, T, 3 * width), both float32
+KeysValues = tuple[Tensor, Tensor]
+
+
+class Block(nn.Module):
+    """Self-attention, cross-attention, MLP, in this order, each ``x + gate * f(LN(x) * (1 + scale) + shift)``."""
+
+    def __init__(self, sizes: DiTSizes) -> None:
+        super().__init__()
+        self.self_attn = SelfAttention(sizes.width, sizes.head_width)
+        self.cross_attn = CrossAttention(sizes.width, sizes.context_width, sizes.head_width)
+        self.mlp = Mlp(sizes.width, sizes.mlp_width)
+        self.adaln_modulation_self_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
+        self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
+        self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
+
+    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, look: Attend) -> Tensor:
+        """Advance the stream by one block.
+
+        Args:
+            x: ``(B, T, N, width)``.
+            time: Time signal; None once folded.
+            text: Cross-attention keys and values of this block.
+            table: Rotation of the block's tokens.
+            look: Self-attention with whatever past it holds.
+        """
+        x = residual(x, lambda n: self.self_attn(n, table, look), _modulation(self.adaln_modulation_self_attn, time))
+        x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
+        return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
+
+    def fold(self, time: TimeSignal) -> None:
+        """Move the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
+        attn, cross, mlp = self.self_attn, self.cross_attn, self.mlp
+        shift, scale, gate = _due(self.adaln_modulation_self_attn, time)
+        attn.fuse(fold_input(stack_rows([attn.q_proj, attn.k_proj, attn.v_proj]), shift, scale))
+        attn.output_proj = fold_output(attn.output_proj, gate)
+        shift, scale, gate = _due(self.adaln_modulation_cross_attn, time)
+        cross.q_proj = fold_input(cross.q_proj, shift, scale)
+        cross.output_proj = fold_output(cross.output_proj, gate)
+        shift, scale, gate = _due(self.adaln_modulation_mlp, time)
+        mlp.layer1 = fold_input(mlp.layer1, shift, scale)
+        mlp.layer2 = fold_output(mlp.layer2, gate)
+        self.adaln_modulation_self_attn = self.adaln_modulation_cross_attn = self.adaln_modulation_mlp = None
+
+
+class FinalLayer(nn.Module):
+    """Map tokens to patches of velocity: ``Linear(LN(x) * (1 + scale) + shift)``."""
+
+    def __init__(self, sizes: DiTSizes) -> None:
+        super().__init__()
+        self.linear = nn.Linear(sizes.width, sizes.latent_channels * PATCH * PATCH, bias=False)
+        self.adaln_modulation: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 2)
+
+    def forward(self, x: Tensor, time: TimeSignal | None) -> Tensor:
+        """Map ``(B, T, N, width)`` to ``(B, T, N, 4 * channels)``, ordered (row, column, channel)."""
+        if self.adaln_modulation is None:
+            return cast(Tensor, self.linear(layer_norm(x)))
+        assert time is not None, "a network that is not folded needs its time signal"
+        shift, scale = (part.to(x.dtype) for part in self.adaln_modulation.split(*time))
+        return cast(Tensor, self.linear(layer_norm(x) * (1 + scale) + shift))
+
+    def fold(self, time: TimeSignal) -> None:
+        """Move the modulation of one time step into the weights, in place."""
+        assert self.adaln_modulation is not None, "folded twice"
+        shift, scale = self.adaln_modulation.split(*time)
+        self.linear = fold_input(self.linear, shift, scale)
+        self.adaln_modulation = None
+
+
+def _modulation(layer: LowRankModulation | None, time: TimeSignal | None) -> Modulation | None:
+    return None if layer is None else _due(layer, time)
+
+
+def _due(layer: LowRankModulation | None, time: TimeSignal | None) -> Modulation:
+    assert layer is not None and time is not None, "modulation and time signal go together"
+    shift, scale, gate = layer.split(*time)
+    return shift, scale, gate

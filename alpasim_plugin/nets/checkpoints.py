@@ -1,0 +1,158 @@
+"""Weights on disk: safetensors first, pickles only as far as they hold nothing but tensors.
+
+Precision: by default tensors come back as they are stored; ``dtype`` converts the floating ones on request.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+
+StateDict = dict[str, Tensor]
+WRAPPERS = ("model", "state_dict")
+RECOMPUTED = ("pos_embedder.seq", "pos_embedder.dim_spatial_range", "pos_embedder.dim_temporal_range")
+CHECKPOINT_INFIX = "_checkpoint_wrapped_module."
+ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
+
+
+def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str = "cpu", sha256: str | None = None) -> StateDict:
+    """Read a checkpoint file.
+
+    Args:
+        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (nothing but tensors and plain containers).
+        dtype: Precision for floating tensors; None keeps each as stored.
+        device: Where the tensors go.
+        sha256: Expected digest, in hexadecimal; checked before anything is read.
+
+    Returns:
+        Tensors by key, taken out of an outer ``{"model": ...}`` or ``{"state_dict": ...}``.
+
+    Raises:
+        InputError: No file, wrong digest, truncated or foreign file, or a pickle with anything but tensors.
+    """
+    path = Path(path)
+    doing = "reading network weights"
+    if not path.is_file():
+        raise InputError(doing, str(path), "no such file", "give the path of a .safetensors file")
+    if sha256 is not None and (found := file_sha256(path)) != sha256.lower():
+        raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", "download the file again or correct the expected digest")
+    with path.open("rb") as file:
+        head = file.read(4)
+    if head.startswith(ZIP_MAGIC) or head.startswith(PICKLE_MAGIC):
+        content = _load_pickle(path, device)
+    else:
+        try:
+            content = load_file(path, device=device)
+        except (SafetensorError, ValueError) as error:
+            found = f"not a whole safetensors file of {path.stat().st_size} bytes: {error}"
+            raise InputError(doing, str(path), found, "download or copy the file again; it is truncated or of another format") from error
+    tensors = unwrap(content, str(path))
+    if dtype is None:
+        return tensors
+    return {key: convert(key, value, dtype, str(path)) for key, value in tensors.items()}
+
+
+def save_weights(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write a safetensors file, whole or not at all."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    save_file({key: value.detach().contiguous() for key, value in tensors.items()}, part, dict(metadata or {}))
+    os.replace(part, path)
+
+
+def file_sha256(path: str | Path) -> str:
+    """Return a file's digest in hexadecimal."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def unwrap(content: object, source: str) -> StateDict:
+    """Take the tensors out of an outer dictionary; entries of the training framework are left behind.
+
+    Raises:
+        InputError: No dictionary, no tensors, or something else under a key that should hold a tensor.
+    """
+    for wrapper in WRAPPERS:
+        if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
+            content = content[wrapper]
+    doing, do = "reading network weights", "give a dictionary of tensors, alone or under the key 'model' or 'state_dict'"
+    if not isinstance(content, Mapping) or not any(isinstance(value, Tensor) for value in content.values()):
+        raise InputError(doing, source, f"a {type(content).__name__} without tensors", do)
+    tensors = {str(key): value for key, value in content.items() if not _is_bookkeeping(str(key))}
+    for key, value in tensors.items():
+        if not isinstance(value, Tensor):
+            raise InputError(doing, source, f"{key} is a {type(value).__name__}", do)
+    return tensors
+
+
+def clean(tensors: Mapping[str, Tensor]) -> StateDict:
+    """Return the network's own tensors under their plain keys.
+
+    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights, optimiser) is left behind. Also left behind:
+    rotary buffers (recomputed), training counters, transformer-engine states, the infix of activation checkpointing.
+    """
+    prefixed = any(key.startswith("net.") for key in tensors)
+    out: StateDict = {}
+    for key, value in tensors.items():
+        if prefixed and not key.startswith("net."):
+            continue
+        plain = key.removeprefix("net.").replace(CHECKPOINT_INFIX, "")
+        if plain not in RECOMPUTED and not _is_bookkeeping(plain):
+            out[plain] = value
+    return out
+
+
+def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
+    """Return a floating tensor in another precision, always as a copy; others as they are.
+
+    Raises:
+        InputError: A finite value that overflows the new precision.
+    """
+    if not value.is_floating_point():
+        return value
+    out = value.detach().to(dtype, copy=True)
+    if value.device.type != "meta" and bool((~out.isfinite() & value.isfinite()).any()):
+        found = f"{key} holds {float(value.abs().max()):.4g}, beyond {dtype}"
+        raise InputError("converting network weights", source, found, "use torch.bfloat16 or torch.float32")
+    return out
+
+
+def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
+    """Return a copy of one weight in the precision a network wants, after checking that it can be one.
+
+    Raises:
+        InputError: An integer tensor, or values that are not finite, or not finite any more.
+    """
+    doing = "loading network weights"
+    if not value.is_floating_point():
+        raise InputError(doing, source, f"{key} holds {value.dtype}", "give floating-point weights; quantise after loading")
+    if value.device.type != "meta" and not bool(value.isfinite().all()):
+        found = f"{key} holds {int((~value.isfinite()).sum())} values that are not finite, of {value.numel()}"
+        raise InputError(doing, source, found, "use a checkpoint from before training diverged")
+    return convert(key, value, dtype, source)
+
+
+def _is_bookkeeping(key: str) -> bool:
+    return key.split(".")[-1].startswith("accum_") or key.endswith("_extra_state")
+
+
+def _load_pickle(path: Path, device: str) -> object:
+    try:
+        return torch.load(path, map_location=device, weights_only=True)
+    except pickle.UnpicklingError as error:
+        reason = str(error).split("WeightsUnpickler error:")[-1].strip().splitlines()
+        found = f"a pickle that holds more than tensors ({reason[0] if reason else 'unknown content'}); loading it could run code"
+        raise InputError("reading network weights", str(path), found, "save the tensors alone, best as safetensors") from error
+    except (RuntimeError, EOFError, OSError) as error:
+        found = f"a truncated or damaged torch file: {str(error).splitlines()[0]}"
+        raise InputError("reading network weights", str(path), found, "download or copy the file again") from error

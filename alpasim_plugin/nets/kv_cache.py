@@ -1,0 +1,222 @@
+"""Keys and values of the past, per layer: a fixed buffer for inference and a list with gradients for training.
+
+Both say what a block sees in the same way (see `attention`): the window counts the sink and the own block; keys are stored rotated to their
+absolute positions and are never rotated again.
+
+`RollingCache` allocates once. Latent ``i`` lies in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so the newest
+latents overwrite the oldest and nothing is moved. Softmax does not care about the order of keys, so the buffer is used as it lies.
+`GraphCache` keeps every block's tensors as they are: slower, growing, readable, and it lets gradients through. It is the rolling cache's twin.
+
+A block is a series of forwards at one position: `begin` opens it (again), `attend` answers one layer, `commit` keeps what the last forward wrote
+and moves on.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.attention import attend, visible_latents
+from alpasim_plugin.nets.rope import Rope3D, RopeTable
+
+
+class BlockCache(ABC):
+    """Count latents and hold the rotation of the open block.
+
+    Args:
+        rope: The network's rotary positions.
+        batch: Sequences side by side.
+        height, width: Latent size, even.
+        window: Latents that a token may see, own block and sink included; None for all.
+        sink: First latents of the rollout that stay visible.
+        device: Where keys and values live.
+    """
+
+    keeps_graph: bool = False
+
+    def __init__(
+        self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device
+    ) -> None:
+        doing = "making a cache for a causal network"
+        if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
+            found = f"batch {batch}, latent size {height} x {width}"
+            raise InputError(doing, "batch, height, width", found, "give a positive batch and even latent sizes (pixels / 8)")
+        if window is not None and not 0 <= sink <= window or window is not None and window < 1 or sink < 0:
+            found = f"window {window}, sink {sink}"
+            raise InputError(doing, "window and sink, in latents", found, "use window >= 1 and 0 <= sink <= window")
+        self.rope, self.batch, self.height, self.width = rope, batch, height, width
+        self.window, self.sink, self.device = window, sink, device
+        self.rows, self.columns = height // 2, width // 2
+        self.tokens = self.rows * self.columns
+        self.position = 0  # absolute index of the open block's first latent
+        self.filled = 0  # latents kept since the start; differs from position in a rollout that starts late
+        self.open_latents = 0  # length of the block whose forwards have begun; 0 between blocks
+        self._tables: dict[int, tuple[int, RopeTable]] = {}
+
+    def reset(self, position: int = 0) -> None:
+        """Forget the past and start at an absolute latent index."""
+        self.position, self.filled, self.open_latents = position, 0, 0
+
+    def begin(self, latents: int) -> RopeTable:
+        """Open the block at the current position, or open it again, and return the rotation of its tokens.
+
+        The returned tensors keep their storage from block to block of one length.
+        """
+        self.open_latents = latents
+        at, table = self._tables.get(latents, (-1, None))
+        if table is None:
+            table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
+        elif at != self.position:
+            for kept, fresh in zip(table, self.rope.table(self.position, latents, self.rows, self.columns, self.device), strict=True):
+                kept.copy_(fresh)
+        self._tables[latents] = (self.position, table)
+        return table
+
+    def commit(self) -> None:
+        """Keep the keys and values of the last forward and move on by its block."""
+        self.position += self.open_latents
+        self.filled += self.open_latents
+        self.open_latents = 0
+
+    @abstractmethod
+    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Attend from the open block to itself and the visible past; see `attention.attend` for shapes."""
+
+    @abstractmethod
+    def history(self, layer: int) -> tuple[Tensor, Tensor]:
+        """Return a layer's kept keys and values, oldest first, ``(B, latents * tokens, heads, head_width)``."""
+
+
+class RollingCache(BlockCache):
+    """Hold at most ``window`` latents per layer in buffers that are allocated once.
+
+    Forwards through it run without gradients: its buffers are overwritten in place.
+    """
+
+    def __init__(
+        self,
+        rope: Rope3D,
+        layers: int,
+        heads: int,
+        batch: int,
+        height: int,
+        width: int,
+        window: int,
+        sink: int,
+        device: torch.device,
+        dtype: torch.dtype,
+    ) -> None:
+        super().__init__(rope, batch, height, width, window, sink, device)
+        self.size = window
+        self.layout = (layers, heads, dtype)
+        shape = (layers, batch, window * self.tokens, heads, rope.head_width)
+        self.keys = torch.zeros(shape, device=device, dtype=dtype)
+        self.values = torch.zeros(shape, device=device, dtype=dtype)
+        self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows that the open block's tokens go to
+        self._source: Tensor | None = None  # which of the block's tokens those are; None for all
+        self._fits = True
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the buffers."""
+        return 2 * self.keys.numel() * self.keys.element_size()
+
+    def begin(self, latents: int) -> RopeTable:
+        """Open the block and choose the slots of its latents.
+
+        Raises:
+            InputError: When a block is opened again with fewer latents after its first forward took the oldest latents' slots.
+        """
+        overwritten = self.filled + self.open_latents > self.size
+        if 0 < latents < self.open_latents and overwritten:
+            found = f"{latents} latents after a forward with {self.open_latents} at latent {self.position}"
+            do = "repeat a block with its first length (its forwards share slots), or write it, or reset the cache"
+            raise InputError("opening a block of a rolling cache", f"window {self.window}, sink {self.sink}", found, do)
+        table = super().begin(latents)
+        ring = self.size - self.sink
+        own = range(self.filled, self.filled + latents)
+        rolling = [i for i in own if i >= self.sink]
+        self._fits = len(rolling) <= ring
+        # A block longer than the ring sees itself whole but leaves only its newest latents behind.
+        kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
+        slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
+        self._source = None if self._fits else self._token_rows([i - self.filled for i in kept]).to(self.device)
+        rows = self._token_rows(slots)
+        if self._rows.shape == rows.shape:
+            self._rows.copy_(rows)
+        else:
+            self._rows = rows.to(self.device)
+        return table
+
+    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Write the block's keys and values into their slots and attend to the buffer as it lies."""
+        keys, values = self.keys[layer], self.values[layer]
+        own_k, own_v = (part.to(keys.dtype) for part in (k, v))
+        for buffer, own in ((keys, own_k), (values, own_v)):
+            buffer.index_copy_(1, self._rows, own if self._source is None else own[:, self._source])
+        if self._fits:
+            end = min(self.size, self.filled + self.open_latents) * self.tokens
+            return attend(q, keys[:, :end], values[:, :end])
+        past = min(self.sink, self.filled) * self.tokens
+        return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
+
+    def history(self, layer: int) -> tuple[Tensor, Tensor]:
+        """Return a copy of a layer's kept keys and values, oldest first."""
+        ring = self.size - self.sink
+        rolling = range(max(self.sink, self.filled - ring), self.filled)
+        slots = [*range(min(self.sink, self.filled)), *(self.sink + (i - self.sink) % ring for i in rolling)]
+        rows = self._token_rows(slots).to(self.device)
+        return self.keys[layer][:, rows], self.values[layer][:, rows]
+
+    def _token_rows(self, latents: list[int]) -> Tensor:
+        first = torch.tensor(latents, dtype=torch.long, device="cpu")[:, None] * self.tokens
+        return (first + torch.arange(self.tokens, device="cpu")).flatten()
+
+
+class GraphCache(BlockCache):
+    """Keep every block's keys and values with their gradients; memory grows with the rollout."""
+
+    keeps_graph = True
+
+    def __init__(
+        self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device
+    ) -> None:
+        super().__init__(rope, batch, height, width, window, sink, device)
+        self._kept: dict[int, list[tuple[Tensor, Tensor]]] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
+        self._open: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def reset(self, position: int = 0) -> None:
+        """Forget the past and start at an absolute latent index."""
+        super().reset(position)
+        self._kept, self._open = {}, {}
+
+    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Attend to the visible past and the block, joined anew."""
+        self._open[layer] = (k, v)
+        kept = self._kept.get(layer, [])
+        seen = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
+        return attend(q, torch.cat([*(kept[i][0] for i in seen), k], dim=1), torch.cat([*(kept[i][1] for i in seen), v], dim=1))
+
+    def commit(self) -> None:
+        """Keep the tensors of the last forward."""
+        for layer, (k, v) in self._open.items():
+            pairs = zip(k.split(self.tokens, dim=1), v.split(self.tokens, dim=1), strict=True)
+            self._kept.setdefault(layer, []).extend(pairs)
+        self._open = {}
+        super().commit()
+
+    def detach(self, keep_latents: int = 0) -> None:
+        """Cut the gradients of all kept latents but the newest ``keep_latents``."""
+        for layer, kept in self._kept.items():
+            cut = max(0, len(kept) - keep_latents)
+            self._kept[layer] = [(k.detach(), v.detach()) for k, v in kept[:cut]] + kept[cut:]
+
+    def history(self, layer: int) -> tuple[Tensor, Tensor]:
+        """Return a layer's kept keys and values, oldest first."""
+        kept = self._kept.get(layer, [])
+        newest = len(kept) - (self.window - self.sink) if self.window is not None else 0
+        seen = [pair for i, pair in enumerate(kept) if i < self.sink or i >= newest]
+        return torch.cat([k for k, _ in seen], dim=1), torch.cat([v for _, v in seen], dim=1)

@@ -1,0 +1,85 @@
+"""Small layers shared by the transformer's parts: float32 islands, RMS norm, patch order.
+
+Three places stay in float32 whatever the network's precision: the time embedding, the modulation made from it, and the rotary
+positions. `Float32Linear` keeps the first two there even under autocast or after ``net.to(torch.bfloat16)``.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+NORM_EPS = 1e-6
+PATCH = 2  # latent pixels per token side; one latent frame per token in time
+
+
+class Float32Linear(nn.Linear):
+    """Apply a bias-free linear map in float32, whatever the dtype of its weights and input."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, bias=False)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(..., inputs)`` to ``(..., outputs)`` float32."""
+        with torch.autocast(input.device.type, enabled=False):
+            return F.linear(input.float(), self.weight.float())
+
+
+class RMSNorm(nn.Module):
+    """Divide by the root mean square over the last axis and scale by a learned gain, in float32."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., width)`` to the same shape and dtype."""
+        return F.rms_norm(x.float(), (x.shape[-1],), self.weight.float(), NORM_EPS).to(x.dtype)
+
+
+def layer_norm(x: Tensor) -> Tensor:
+    """Normalise the last axis to zero mean and unit variance; the network's layer norms have no parameters."""
+    return F.layer_norm(x, (x.shape[-1],), eps=NORM_EPS)
+
+
+def patchify(video: Tensor) -> Tensor:
+    """Cut 2x2 patches, channel slowest: the order of the input embeddings.
+
+    Args:
+        video: ``(B, C, T, H, W)``, H and W even.
+
+    Returns:
+        ``(B, T, H/2 * W/2, C * 4)`` with the last axis ordered (channel, row, column).
+    """
+    b, c, t, h, w = video.shape
+    grid = video.reshape(b, c, t, h // PATCH, PATCH, w // PATCH, PATCH)
+    return grid.permute(0, 2, 3, 5, 1, 4, 6).reshape(b, t, (h // PATCH) * (w // PATCH), c * PATCH * PATCH)
+
+
+def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
+    """Lay 2x2 patches out, channel fastest: the order of the output layer, which differs from the input's.
+
+    Args:
+        tokens: ``(B, T, H/2 * W/2, 4 * C)`` with the last axis ordered (row, column, channel).
+        height, width: Latent size.
+
+    Returns:
+        ``(B, C, T, H, W)``.
+    """
+    b, t, _, depth = tokens.shape
+    grid = tokens.reshape(b, t, height // PATCH, width // PATCH, PATCH, PATCH, depth // (PATCH * PATCH))
+    return grid.permute(0, 6, 1, 2, 4, 3, 5).reshape(b, -1, t, height, width)
+
+
+class PatchLinear(nn.Linear):
+    """Embed patches; parts of the input channels may be left out when they are known to be zero."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__(channels * PATCH * PATCH, width, bias=False)
+
+    def part(self, video: Tensor, first_channel: int = 0) -> Tensor:
+        """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B, T, N, width)``."""
+        patches = patchify(video)
+        start = first_channel * PATCH * PATCH
+        return F.linear(patches, self.weight[:, start : start + patches.shape[-1]])
