@@ -29,7 +29,8 @@ from alpasim_plugin.types import Trajectory
 
 EPOCH_US = 1_689_697_803_493_732  # a recorded time stamp: larger than a float32, and than 2^50
 
-unit_quats = st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3).map(lambda q: np.array(q) / np.linalg.norm(q))
+four = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
+unit_quats = four.filter(lambda q: np.linalg.norm(q) > 1e-3).map(lambda q: np.array(q) / np.linalg.norm(q))
 
 
 @settings(deadline=None)

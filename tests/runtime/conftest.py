@@ -41,8 +41,8 @@ def straight_road() -> Scenario:
         return np.stack([x, np.full_like(x, y_m), np.zeros_like(x)], axis=1)
 
     lanes = {
-        "right": Lane("right", line(0.0), line(1.75), line(-1.75), left_neighbour="left", left_paint="dashed_white", right_paint="solid_white"),
-        "left": Lane("left", line(3.5), line(5.25), line(1.75), right_neighbour="right", left_paint="solid_white", right_paint="dashed_white"),
+        "right": Lane("right", line(0.0), line(1.75), line(-1.75), left_neighbour="left", left_paint="dashed_white"),
+        "left": Lane("left", line(3.5), line(5.25), line(1.75), right_neighbour="right", left_paint="solid_white"),
     }
     camera = CameraSpec(
         "front",

@@ -16,10 +16,9 @@ from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
 from alpasim_plugin.types import Frame, Latency, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec
 
 
-def drive(scenario: Scenario, policy: str, renderer: str = "clean", threads: int = 1, seed: int = 0, folder: Path | None = None) -> Recorder:
-    return run_rollout(
-        scenario, make_renderer(renderer, scenario, seed, threads=threads), make_policy(policy, scenario), seed, Recorder(scenario, seed, folder)
-    )
+def drive(scenario: Scenario, policy: str, renderer: str = "clean", threads: int = 1, seed: int = 0) -> Recorder:
+    session = make_renderer(renderer, scenario, seed, threads=threads)
+    return run_rollout(scenario, session, make_policy(policy, scenario), seed, Recorder(scenario, seed))
 
 
 def digest(recorder: Recorder) -> str:
