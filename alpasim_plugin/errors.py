@@ -1,6 +1,6 @@
 """Errors with four parts: doing what, with what, found what, do this.
 
-Every failure a user can meet is a `SimrunError`. The class decides the process exit code (DESIGN section 4) and the failure
+Every failure a user can meet is a `SimrunError`. The class decides the process exit code (docs/cli.md) and the failure
 class written to ``rollouts.parquet``, so the printed text, the table and the exit code cannot disagree.
 """
 

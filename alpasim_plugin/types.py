@@ -1,6 +1,6 @@
 """The only data that crosses from one stage to the next: frozen dataclasses with shapes, units and frames.
 
-Conventions (DESIGN section 7): time is integer microseconds; world is ENU metres in float64 around a local origin; rig is x forward,
+Conventions (docs/architecture.md): time is integer microseconds; world is ENU metres in float64 around a local origin; rig is x forward,
 y left, z up with its origin on the ground under the rear axle; cameras are OpenCV (x right, y down, z forward); a matrix ``T_a_b`` maps
 coordinates in b to coordinates in a; quaternions are ``wxyz``; images are HWC uint8 sRGB.
 """

@@ -44,7 +44,7 @@ class RunResult:
 
     @property
     def exit_code(self) -> int:
-        """Give the process exit code of DESIGN section 4: 4 where rollouts could not be run, 5 where they could not be scored."""
+        """Give the process exit code that docs/cli.md lists: 4 where rollouts could not be run, 5 where they could not be scored."""
         classes = self.summary["failures"]["by_class"]
         if set(classes) == {"evaluator"}:
             return 5

@@ -1,4 +1,4 @@
-"""From manifests to the tables and the summary of a run folder (DESIGN section 5)."""
+"""From manifests to the tables and the summary of a run folder (docs/architecture.md)."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def write_report(run_dir: Path | str) -> Path:
     """Write ``report.html`` into a run folder.
 
     Args:
-        run_dir: A run folder (DESIGN section 5). Nothing else is read.
+        run_dir: A run folder (docs/architecture.md). Nothing else is read.
 
     Returns:
         Path of the report.

@@ -252,7 +252,7 @@ def read_run(run_dir: Path | str) -> Run:
     """Read a run folder.
 
     Args:
-        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json`` (DESIGN section 5).
+        run_dir: Folder with ``run.json``, ``rollouts.parquet`` and ``summary.json`` (docs/architecture.md).
 
     Raises:
         InputError: A file is absent or unreadable, or ``rollouts.parquet`` lacks a key column.
