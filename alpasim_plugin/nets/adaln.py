@@ -1,8 +1,8 @@
 """Adaptive layer norm with low-rank modulation, and its exact removal for one fixed time step.
 
-A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(LN(x) * (1 + scale) + shift)`` where
-``(shift, scale, gate) = B A SiLU(e) + lora`` depends on time alone. For one fixed time step the three vectors are constants: with ``W`` the first and ``V``
-the last linear of ``f``,
+A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(LN(x) * (1 + scale) + shift)`` where ``(shift, scale,
+gate) = B A SiLU(e) + lora`` depends on time alone. For one fixed time step the three vectors are constants: with ``W`` the first and
+``V`` the last linear of ``f``,
 
     W (n * (1 + scale) + shift) = (W diag(1 + scale)) n + W shift         and         gate * (V y) = (diag(gate) V) y,
 
@@ -35,7 +35,7 @@ class LowRankModulation(nn.Sequential):
             emb: ``(B, T, width)``, the normalised sinusoid.
             lora: ``(B, T, 3 * width)``, of which the first ``parts * width`` are added.
         """
-        both = self(emb) + lora[..., : self.parts * emb.shape[-1]]
+        both: Tensor = self(emb) + lora[..., : self.parts * emb.shape[-1]]
         return both[:, :, None].chunk(self.parts, dim=-1)
 
 

@@ -1,8 +1,8 @@
 """Attention over latents: block-causal over a whole clip, over a cache, and over the text.
 
-What a token may see (block-causal rule): every token of its own block in both directions, and every token of earlier blocks. A window narrows
-this to the last ``window - sink`` latents up to the end of the own block, plus the first ``sink`` latents of the rollout; the own block is always
-seen whole, also when the window is smaller than it.
+What a token may see (block-causal rule): every token of its own block in both directions, and every token of earlier blocks. A window
+narrows this to the last ``window - sink`` latents up to the end of the own block, plus the first ``sink`` latents of the rollout; the
+own block is always seen whole, also when the window is smaller than it.
 """
 
 from __future__ import annotations

@@ -87,6 +87,7 @@ def _modulation(layer: LowRankModulation | None, time: TimeSignal | None) -> Mod
 
 
 def _due(layer: LowRankModulation | None, time: TimeSignal | None) -> Modulation:
-    assert layer is not None and time is not None, "modulation and time signal go together"
+    assert layer is not None, "folded twice"
+    assert time is not None, "a network that is not folded needs its time signal"
     shift, scale, gate = layer.split(*time)
     return shift, scale, gate

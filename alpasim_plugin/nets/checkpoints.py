@@ -45,7 +45,8 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     if not path.is_file():
         raise InputError(doing, str(path), "no such file", "give the path of a .safetensors file")
     if sha256 is not None and (found := file_sha256(path)) != sha256.lower():
-        raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", "download the file again or correct the expected digest")
+        do = "download the file again or correct the expected digest"
+        raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
     with path.open("rb") as file:
         head = file.read(4)
     if head.startswith(ZIP_MAGIC) or head.startswith(PICKLE_MAGIC):

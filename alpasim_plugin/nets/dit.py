@@ -1,11 +1,11 @@
 """The causal one-step generator: a diffusion transformer over latents that sees its own block and the past.
 
-One set of weights, two ways to run it. ``net(...)`` takes a whole clip under the block-causal rule (training, reference); ``net.step(...)`` takes one
-block and a cache (streaming). They agree wherever the window covers the history.
+One set of weights, two ways to run it. ``net(...)`` takes a whole clip under the block-causal rule (training, reference);
+``net.step(...)`` takes one block and a cache (streaming). They agree wherever the window covers the history.
 
 Conventions: ``x`` and ``hdmap`` are ``(B, C, T, H, W)`` normalised latents, time steps run from 0 to 1000, the output is the velocity
-``noise - clean`` (source minus target) in the shape and dtype of ``x``. Keys, shapes and order of operations are those of OmniDreams single view
-(the causal student of Cosmos-Predict2.5), so its checkpoints load; docs/nets.md lists them.
+``noise - clean`` (source minus target) in the shape and dtype of ``x``. Keys, shapes and order of operations are those of OmniDreams
+single view (the causal student of Cosmos-Predict2.5), so its checkpoints load; docs/nets.md lists them.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ class CosmosCausalDiT(nn.Module):
         """Build the network whose sizes the tensors show, with a copy of them.
 
         Args:
-            sd: Tensors under the original's keys (docs/nets.md), with or without the prefix ``net.`` and an outer ``model`` or ``state_dict``.
+            sd: Tensors under the original's keys (docs/nets.md), with or without the prefix ``net.`` and an outer
+                ``model`` or ``state_dict``.
             rope_ratios: Height, width, time; not stored in checkpoints.
             dtype: Precision of the weights; half-precision tensors are widened by the default. Time embedding and modulation stay float32.
             time_rounding: See the class.
@@ -183,9 +184,11 @@ class CosmosCausalDiT(nn.Module):
         self._check_cache(x_block, cache)
         with torch.set_grad_enabled(torch.is_grad_enabled() and cache.keeps_graph):
             table = cache.begin(x_block.shape[2])
-            v = self._run(
-                x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, lambda layer: functools.partial(cache.attend, layer)
-            )
+
+            def look(layer: int) -> Attend:
+                return functools.partial(cache.attend, layer)
+
+            v = self._run(x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, look)
         if write:
             cache.commit()
         return v
@@ -252,10 +255,8 @@ class CosmosCausalDiT(nn.Module):
         tokens = tokens + self.additional_patch_embedding.linear.part(hdmap.to(self.dtype))
         for layer, block in enumerate(self.blocks):
             args = (tokens, time, text.keys_values[layer], table, look(layer))
-            if self.checkpoint_blocks and torch.is_grad_enabled():
-                tokens = checkpoint(block, *args, use_reentrant=False)
-            else:
-                tokens = block(*args)
+            recompute = self.checkpoint_blocks and torch.is_grad_enabled()
+            tokens = checkpoint(block, *args, use_reentrant=False) if recompute else block(*args)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal | None:
@@ -289,13 +290,14 @@ class CosmosCausalDiT(nn.Module):
             self._check_text(text, x.shape[0])
 
     def _check_text(self, text: Tensor, batch: int | None = None) -> None:
-        if text.ndim != 3 or text.shape[2] != self.sizes.text_width or text.shape[1] < 1 or batch is not None and text.shape[0] not in (1, batch):
+        alone = batch is None or (text.ndim == 3 and text.shape[0] in (1, batch))
+        if not alone or text.ndim != 3 or text.shape[2] != self.sizes.text_width or text.shape[1] < 1:
             do = f"give (batch or 1, tokens, {self.sizes.text_width})"
             raise InputError("projecting text features", "text", f"shape {list(text.shape)}", do)
 
     def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
-        made = (cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios)
-        due = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
+        made: tuple[object, ...] = (cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios)
+        due: tuple[object, ...] = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
         if isinstance(cache, RollingCache):
             made, due = (*made, *cache.layout), (*due, self.sizes.blocks, self.sizes.heads, self.dtype)
         if made != due:

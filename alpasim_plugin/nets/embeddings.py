@@ -1,8 +1,8 @@
 """What the transformer sees: patch tokens, semantic-map tokens, time and text.
 
-Source: OmniDreams single view (causal HD-map network). Channel order at the input is latent, condition mask, padding mask; the map has its own
-patch embedding and is added to the tokens. The time sinusoid is cosine first; its RMS norm feeds the modulation layers directly, while the
-two-layer map of the raw sinusoid is the additive term that all modulation layers share.
+Source: OmniDreams single view (causal HD-map network). Channel order at the input is latent, condition mask, padding mask; the map has
+its own patch embedding and is added to the tokens. The time sinusoid is cosine first; its RMS norm feeds the modulation layers
+directly, while the two-layer map of the raw sinusoid is the additive term that all modulation layers share.
 """
 
 from __future__ import annotations

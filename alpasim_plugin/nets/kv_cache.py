@@ -1,14 +1,15 @@
 """Keys and values of the past, per layer: a fixed buffer for inference and a list with gradients for training.
 
-Both say what a block sees in the same way (see `attention`): the window counts the sink and the own block; keys are stored rotated to their
-absolute positions and are never rotated again.
+Both say what a block sees in the same way (see `attention`): the window counts the sink and the own block; keys are stored rotated to
+their absolute positions and are never rotated again.
 
-`RollingCache` allocates once. Latent ``i`` lies in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so the newest
-latents overwrite the oldest and nothing is moved. Softmax does not care about the order of keys, so the buffer is used as it lies.
-`GraphCache` keeps every block's tensors as they are: slower, growing, readable, and it lets gradients through. It is the rolling cache's twin.
+`RollingCache` allocates once. Latent ``i`` lies in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so
+the newest latents overwrite the oldest and nothing is moved. Softmax does not care about the order of keys, so the buffer is used as it
+lies. `GraphCache` keeps every block's tensors as they are: slower, growing, readable, and it lets gradients through. It is the rolling
+cache's twin.
 
-A block is a series of forwards at one position: `begin` opens it (again), `attend` answers one layer, `commit` keeps what the last forward wrote
-and moves on.
+A block is a series of forwards at one position: `begin` opens it (again), `attend` answers one layer, `commit` keeps what the last
+forward wrote and moves on.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class BlockCache(ABC):
         if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
             found = f"batch {batch}, latent size {height} x {width}"
             raise InputError(doing, "batch, height, width", found, "give a positive batch and even latent sizes (pixels / 8)")
-        if window is not None and not 0 <= sink <= window or window is not None and window < 1 or sink < 0:
+        if sink < 0 or (window is not None and (window < 1 or sink > window)):
             found = f"window {window}, sink {sink}"
             raise InputError(doing, "window and sink, in latents", found, "use window >= 1 and 0 <= sink <= window")
         self.rope, self.batch, self.height, self.width = rope, batch, height, width
@@ -203,7 +204,7 @@ class GraphCache(BlockCache):
     def commit(self) -> None:
         """Keep the tensors of the last forward."""
         for layer, (k, v) in self._open.items():
-            pairs = zip(k.split(self.tokens, dim=1), v.split(self.tokens, dim=1), strict=True)
+            pairs = zip(torch.split(k, self.tokens, dim=1), torch.split(v, self.tokens, dim=1), strict=True)
             self._kept.setdefault(layer, []).extend(pairs)
         self._open = {}
         super().commit()

@@ -1,11 +1,12 @@
 """Rotary position of a token in (time, height, width), with NTK-stretched frequencies and rotate-half pairing.
 
-Each head's channels are split ``h = w = 2 * (head_width // 6)``, ``t = rest``. An axis of width ``d`` has the frequencies
-``theta ** (-2k / d)`` for ``k < d / 2`` with ``theta = 10000 * ratio ** (d / (d - 2))``. The angles of a token are concatenated in the order
-t, h, w and repeated twice; channel ``j`` is rotated together with channel ``j + head_width / 2``.
+Each head's channels are split ``h = w = 2 * (head_width // 6)``, ``t = rest``. An axis of width ``d`` has the frequencies ``theta **
+(-2k / d)`` for ``k < d / 2`` with ``theta = 10000 * ratio ** (d / (d - 2))``. The angles of a token are concatenated in the order t, h,
+w and repeated twice; channel ``j`` is rotated together with channel ``j + head_width / 2``.
 
 Source: Cosmos-Predict2 rotary embedding as released with OmniDreams. The released table stops at 128 latents; here positions are
-unbounded. Tables are made on the CPU (so also under a default device of ``meta``) and then moved. Angles are made in float64: at position 10,000 float32 would already lose 6e-4 rad.
+unbounded. Tables are made on the CPU (so also under a default device of ``meta``) and then moved. Angles are made in float64: at
+position 10,000 float32 would already lose 6e-4 rad.
 """
 
 from __future__ import annotations

@@ -110,7 +110,8 @@ def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSize
 
     def votes(keys: list[str], known: int, divisor: int = 1, minus: int = 0) -> list[int]:
         """Return what each matrix says about its other side, given one."""
-        rests = [max(shape) if known == min(shape) else min(shape) for shape in map(shapes.__getitem__, keys) if len(shape) == 2 and known in shape]
+        matrices = [shapes[key] for key in keys if len(shapes[key]) == 2 and known in shapes[key]]
+        rests = [sum(shape) - known for shape in matrices]
         return [rest // divisor - minus for rest in rests if rest % divisor == 0 and rest // divisor > minus]
 
     def winner(keys: list[str], cast: list[int], about: str) -> int:

@@ -1,0 +1,167 @@
+"""From a render's latents to clean latents: the paper's Eq. 1 and 2, and their extension to several steps.
+
+Noise is always an argument. Everything works on normalised latents ``(B, C, T, H, W)`` and is differentiable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.dit import TextContext
+from alpasim_plugin.nets.kv_cache import BlockCache
+from alpasim_plugin.nets.schedule import NoiseLevel, context_level
+
+History = Literal["finalise", "last-forward"]
+POOL = (4, 8, 8)  # frames, rows, columns of one latent
+RANGE_SLACK = 1e-3  # opacity beyond [0, 1] by rounding in a renderer is clipped; more is an error
+
+
+class BlockNet(Protocol):
+    """What the sampler needs of a network; `CosmosCausalDiT` and its folded copies have it."""
+
+    def step(
+        self,
+        x_block: Tensor,
+        t_block: Tensor | float,
+        text: Tensor | TextContext,
+        hdmap_block: Tensor,
+        cache: BlockCache,
+        write: bool = True,
+        condition_mask: Tensor | None = None,
+    ) -> Tensor:
+        """Predict the velocity of one block; see `CosmosCausalDiT.step`."""
+        ...
+
+
+def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = None) -> Tensor:
+    """Bring a renderer's opacity to latent size: the mask ``m`` of Eq. 1.
+
+    A latent covers 4 frames of 8 x 8 pixels and takes their largest opacity; the very first frame of a rollout is repeated three times, as
+    the first latent covers it alone.
+
+    Args:
+        opacity: ``(B, 1, frames, H, W)``, 0 to 1; ``1 + 4 n`` frames if ``first``, else ``4 n``; H and W in multiples of 8.
+        first: Whether the rollout starts here.
+        nan_as: Value for opacities that are not numbers; None refuses them.
+
+    Returns:
+        ``(B, 1, latents, H / 8, W / 8)``.
+
+    Raises:
+        InputError: Wrong shape, NaN, or values outside [0, 1].
+    """
+    doing = "pooling opacity to latents"
+    frames = opacity.shape[2] if opacity.ndim == 5 else 0
+    if opacity.ndim != 5 or opacity.shape[1] != 1 or frames < 1 or (frames - first) % 4 or opacity.shape[3] % 8 or opacity.shape[4] % 8:
+        do = f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8"
+        raise InputError(doing, "opacity", f"shape {list(opacity.shape)}", do)
+    unknown = opacity.isnan()
+    count = int(unknown.sum())
+    if count and nan_as is None:
+        found = f"{count} of {opacity.numel()} values are NaN"
+        raise InputError(doing, "opacity", found, "repair the renderer, or name the value to take with nan_as (0 leaves those places to the network)")
+    if count:
+        opacity = opacity.masked_fill(unknown, nan_as if nan_as is not None else 0.0)
+    low, high = float(opacity.min()), float(opacity.max())
+    if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
+        raise InputError(doing, "opacity", f"values from {low:.4g} to {high:.4g}", "give accumulated alpha between 0 and 1")
+    video = opacity.clamp(0, 1)
+    if first:
+        video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
+    return F.max_pool3d(video, POOL, POOL)
+
+
+def mixed_source(z_r: Tensor, m: Tensor, eps: Tensor) -> Tensor:
+    """Keep the render where it is reliable and leave the rest to noise (Eq. 1).
+
+    Args:
+        z_r: ``(B, C, T, H, W)`` latents of the render.
+        m: ``(B, 1, T, H, W)`` mask from `opacity_mask`.
+        eps: Standard normal noise like ``z_r``.
+
+    Returns:
+        ``z_1``, like ``z_r``.
+    """
+    return m * z_r + (1 - m) * eps
+
+
+def interpolant(z_0: Tensor, z_1: Tensor, t: Tensor | float) -> Tensor:
+    """Return ``z_t = (1 - t) z_0 + t z_1``, the straight path from the clean latents to the source."""
+    return (1 - t) * z_0 + t * z_1
+
+
+def flow_step(z_t: Tensor, v: Tensor, t: Tensor | float = 1.0) -> Tensor:
+    """Step along the velocity to the clean latents in one go (Eq. 2): ``z_0 = z_t - t v``; in float32 or wider."""
+    wide = torch.promote_types(z_t.dtype, torch.float32)
+    return (z_t.to(wide) - t * v.to(wide)).to(z_t.dtype)
+
+
+def sources_needed(schedule: Sequence[NoiseLevel], history: History) -> int:
+    """Return how many noise draws one block takes: one per step, and one for the cache write."""
+    return len(schedule) + (history == "finalise")
+
+
+def sample_block(
+    net: BlockNet,
+    sources: Sequence[Tensor],
+    text: Tensor | TextContext,
+    hdmap: Tensor,
+    cache: BlockCache,
+    schedule: Sequence[NoiseLevel],
+    history: History = "finalise",
+    given: Tensor | None = None,
+    finalise_net: BlockNet | None = None,
+) -> Tensor:
+    """Make one block of clean latents and write it into the history.
+
+    Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not Euler).
+    What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents, slightly
+    noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less).
+
+    Args:
+        net: The network; folded copies serve when ``schedule`` has their one step.
+        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each return to noise between steps, then the noise of
+            the cache write. Each ``(B, C, T, H, W)``.
+        text: Prompt, best as a `TextContext`.
+        hdmap: ``(B, map_channels, T, H, W)``.
+        cache: This rollout's history.
+        schedule: Noise levels, the first with sigma 1; see `schedule.steps`.
+        history: What the cache keeps.
+        given: ``(B, C, n, H, W)`` clean latents that are known for the first n of the block: they replace the input before every forward, the
+            cache write included, and the prediction after it.
+        finalise_net: Network for the cache write, when ``net`` is folded for another time step.
+
+    Returns:
+        ``(B, C, T, H, W)`` clean latents.
+
+    Raises:
+        InputError: A wrong number of sources.
+    """
+    if len(sources) != sources_needed(schedule, history) or not schedule:
+        found = f"{len(sources)} sources for {len(schedule)} steps with history {history!r}"
+        do = f"give {sources_needed(schedule, history)}: one per step" + (", one for the cache write" if history == "finalise" else "")
+        raise InputError("sampling a block of latents", "sources", found, do)
+    n = 0 if given is None else given.shape[2]
+    mask = None if given is None else torch.cat([torch.ones_like(given[:, :1]), torch.zeros_like(sources[0][:, :1, n:])], dim=2)
+
+    def fixed(z: Tensor) -> Tensor:
+        return z if given is None else torch.cat([given, z[:, :, n:]], dim=2)
+
+    z = sources[0]
+    for i, level in enumerate(schedule):
+        last = i == len(schedule) - 1
+        v = net.step(fixed(z), level.t, text, hdmap, cache, last and history == "last-forward", mask)
+        z_0 = fixed(flow_step(z, v, level.sigma))
+        if not last:
+            z = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
+    if history == "finalise":
+        level = context_level()
+        noised = interpolant(z_0, sources[-1], level.sigma)
+        (finalise_net or net).step(fixed(noised), level.t, text, hdmap, cache, True, mask)
+    return z_0

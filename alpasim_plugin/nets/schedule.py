@@ -1,0 +1,84 @@
+"""The noise schedule: which time steps a sampler visits and how much noise each stands for.
+
+With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network is told ``1000 sigma``. A *named* step, as in
+"1000, 750, 500, 250", is ``1000 u`` and so passes through the shift. The cache write at 128 does not: it is the time told to the network as it
+stands, and its noise level is that of the nearest entry in the table (0.12993).
+
+Source: OmniDreams' flow-matching scheduler and self-forcing sampler.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+
+SHIFT = 5.0
+TABLE = 1000
+CONTEXT_STEP = 128.0
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """One point of the schedule."""
+
+    t: float  # what the network is told, 0 to 1000
+    sigma: float  # share of noise in the interpolant, 0 to 1
+
+
+def shifted(u: float) -> float:
+    """Return ``sigma`` for a uniform time.
+
+    Example:
+        >>> round(shifted(0.45), 4)
+        0.8036
+    """
+    return SHIFT * u / (1 + (SHIFT - 1) * u)
+
+
+def named(step: float) -> NoiseLevel:
+    """Return the noise level of a named step, 0 < step <= 1000.
+
+    Raises:
+        InputError: A step outside that range.
+    """
+    if not 0 < step <= TABLE:
+        raise InputError("choosing denoising steps", "named step", f"{step:g}", f"use steps above 0 and up to {TABLE}")
+    sigma = shifted(step / TABLE)
+    return NoiseLevel(TABLE * sigma, sigma)
+
+
+def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
+    """Return the noise level of the cache write: told ``t`` itself, noised like the table's nearest entry.
+
+    Example:
+        >>> round(context_level().sigma, 5)
+        0.12993
+    """
+    u = 1 - np.arange(TABLE) / TABLE
+    table = SHIFT * u / (1 + (SHIFT - 1) * u)
+    return NoiseLevel(t, float(table[np.abs(TABLE * table - t).argmin()]))
+
+
+def steps(count: int) -> tuple[NoiseLevel, ...]:
+    """Return the schedule of ``NAME@count``: named steps evenly spaced from 1000 down.
+
+    One, two and four steps are the released lists [1000], [1000, 500] and [1000, 750, 500, 250].
+    """
+    if count < 1:
+        raise InputError("choosing denoising steps", "step count", str(count), "take at least one step")
+    return from_names([TABLE * (count - i) / count for i in range(count)])
+
+
+def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:
+    """Return the schedule of a list of named steps, strictly falling, such as [1000, 450].
+
+    Raises:
+        InputError: An empty or not strictly falling list, or a step out of range.
+    """
+    if not names or any(b >= a for a, b in zip(names, names[1:], strict=False)):
+        raise InputError("choosing denoising steps", "named steps", str(list(names)), "give at least one step, strictly falling from 1000")
+    return tuple(named(step) for step in names)
