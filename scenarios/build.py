@@ -27,7 +27,7 @@ from scenarios.schema_road import (
 )
 from scenarios.ways import Bump, EgoWay, LaneChange, ego_way
 
-TAIL_US = 4_000_000  # the log goes on for so long after the end, so that plans along it have a future
+TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's foresight does not see them freeze
 DEFAULT_DURATION_US = 8_000_000
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _bumps(spec: RoadSpec, way: EgoWay) -> list[Bump]:
 
 def _drive(spec: ScenarioSpec, way: EgoWay, vehicle: Vehicle, cast: Cast, end_us: int, fail: Fail) -> Drive:
     style = ExpertStyle(spec.ego.speed_mps, spec.ego.cruise_mps, spec.ego.max_lateral_accel_mps2, spec.ego.headway_s)
-    run = drive(way.path, spec.ego.start_m, vehicle, style, cast.scripts(), cast.followers, end_us + TAIL_US)
+    run = drive(way.path, spec.ego.start_m, vehicle, style, cast.scripts(), cast.followers, end_us)
     reached = int(run.ego_log.t_us[-1])
     if reached < end_us:
         raise fail(("road", "segments"), _too_short(way.path.length_m, _driven(way.path, run.ego_log), reached, end_us))

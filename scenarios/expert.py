@@ -93,9 +93,10 @@ def drive(
         if expert.front_s + 1.0 > path.length_m:
             break
     t_us = np.array(log_t, dtype=np.int64)
-    xyz, yaw = path.at(np.array(log_s))
     times = t_us[:: DECISION_US // LOG_STEP_US]
-    return Drive(Trajectory(t_us, xyz, quat_from_yaw(yaw)), tuple(car.track(times) for car in cars))
+    keep = t_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
+    xyz, yaw = path.at(np.array(log_s)[keep])
+    return Drive(Trajectory(t_us[keep], xyz, quat_from_yaw(yaw)), tuple(car.track(times) for car in cars))
 
 
 def speed_limits(path: Path, style: ExpertStyle) -> F64:
