@@ -24,7 +24,7 @@ LEAVE_LANE_M = 1.4
 NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
 ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
 LEARN = 0.1
-FILLED, CLEAR = 0.7, 0.35
+FILLED, FILLED_TOP, CLEAR = 0.7, 0.5, 0.35
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,9 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
 
     The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear and what lies behind it on the
     camera's line of sight is filled, up to where a thing of `TALL` times the camera's height would hide the ground: a crosswalk does
-    not reach that far. In a curve the line of sight leaves the lane, and what is seen there says nothing; such a row must be filled by
-    something wider than the bars of a crosswalk, and it is no candidate where even a thing of `LOW` could not be told.
+    not reach that far, so the furthest third must be filled as well. In a curve the line of sight leaves the lane, and what is seen
+    there says nothing; such a row must be filled by something wider than the bars of a crosswalk, and it is no candidate where even
+    a thing of `LOW` could not be told.
 
     Args:
         value: `anomaly` of the frame.
@@ -108,7 +109,9 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     u = np.clip(u, 0, narrow.shape[1] - 1)
     filled = np.where(short[:, None], _box_mean(wide, rows, last, u), _box_mean(narrow, rows, last, u))
     clear = _box_mean(narrow, front, np.maximum(rows - 1, front), u)
-    hit = (filled > FILLED) & (clear < CLEAR) & usable[:, None]
+    top = last - np.maximum((last - rows) // 3, 1)
+    up_to_top = _box_mean(narrow, top, last, u)
+    hit = (filled > FILLED) & (up_to_top > FILLED_TOP) & (clear < CLEAR) & usable[:, None]
     if not hit.any():
         return None
     first = int(np.argmax(hit.any(axis=1)))
@@ -116,7 +119,7 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     behind = np.arange(first, max(int(last[first]), first + 1))
     level = _box_mean(narrow, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, hit[first]].mean(axis=1)
     i = first + int(np.argmax(level > 0.5))
-    return float(grid.x_m[i] - 0.5 * grid.row_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
+    return float(grid.x_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
 
 
 def _bar(width_m: float) -> U8:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.geometry import inverse, se2
-from alpasim_plugin.types import F64, U8, CameraSpec
+from alpasim_plugin.types import F32, F64, U8, CameraSpec
 
 Colour = tuple[int, int, int]
 WHITE, YELLOW = (235, 235, 235), (230, 190, 60)
@@ -101,33 +101,41 @@ class PaintedRoad:
         """Draw the road ``(H, W, 3)`` as the camera sees it from a rig pose."""
         n = supersample
         T = T_world_rig @ camera.T_rig_camera
-        u, v = np.meshgrid((np.arange(camera.width * n) + 0.5) / n, (np.arange(camera.height * n) + 0.5) / n)
-        K = camera.K
-        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1) @ T[:3, :3].T
-        down = np.minimum(rays[..., 2], -1e-6)
-        depth = -T[2, 3] / down
-        ground = (rays[..., 2] < 0) & (depth < 400.0)
-        s, offset = self.coordinates(T[0, 3] + depth * rays[..., 0], T[1, 3] + depth * rays[..., 1])
-        image = np.empty((*u.shape, 3), dtype=np.float32)
+        K, rotation = camera.K, T[:3, :3]
+        u = (np.arange(camera.width * n) + 0.5) / n
+        v = (np.arange(camera.height * n) + 0.5) / n
+        # A ray is linear in the pixel: one outer sum per axis.
+        across, down = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+        ray = [rotation[i, 0] * across[None, :] + (rotation[i, 1] * down + rotation[i, 2])[:, None] for i in range(3)]
+        image = np.empty((len(v), len(u), 3), dtype=np.float32)
         image[:] = self.sky
-        image[ground] = self.grass
-        on_road = ground & (offset > self.road_m[0]) & (offset < self.road_m[1])
-        image[on_road] = self.asphalt
-        for line in self.lines:
-            paint = on_road & (np.abs(offset - line.offset_m) < self.line_width_m / 2)
-            if line.dashed:
-                paint &= np.mod(s, PERIOD_M) < DASH_M
-            image[paint] = line.colour
-        for patch in self.patches:
-            inside = (s > patch.s_m[0]) & (s < patch.s_m[1]) & (offset > patch.offset_m[0]) & (offset < patch.offset_m[1])
-            image[on_road & inside] = patch.colour
+        ground = ray[2] < -T[2, 3] / 400.0
+        depth = -T[2, 3] / ray[2][ground]
+        s, offset = self.coordinates(T[0, 3] + depth * ray[0][ground], T[1, 3] + depth * ray[1][ground])
+        image[ground] = self._colours(s, offset)
         for block in sorted(self.blocks, key=lambda b: -b.s_m):
             self._draw(image, K, T, block, n)
         small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         noise = np.random.Generator(np.random.Philox(key=seed)).normal(0.0, self.noise, small.shape)
         return np.asarray(np.clip(small + noise, 0, 255).astype(np.uint8))
 
-    def _draw(self, image: np.ndarray, K: F64, T_world_camera: F64, block: Block, n: int) -> None:
+    def _colours(self, s_m: F64, offset_m: F64) -> F32:
+        """Return the colours ``(N, 3)`` of ground points in road coordinates."""
+        out = np.empty((len(s_m), 3), dtype=np.float32)
+        out[:] = self.grass
+        on_road = (offset_m > self.road_m[0]) & (offset_m < self.road_m[1])
+        out[on_road] = self.asphalt
+        for line in self.lines:
+            paint = on_road & (np.abs(offset_m - line.offset_m) < self.line_width_m / 2)
+            if line.dashed:
+                paint &= np.mod(s_m, PERIOD_M) < DASH_M
+            out[paint] = line.colour
+        for patch in self.patches:
+            inside = (s_m > patch.s_m[0]) & (s_m < patch.s_m[1]) & (offset_m > patch.offset_m[0]) & (offset_m < patch.offset_m[1])
+            out[on_road & inside] = patch.colour
+        return out
+
+    def _draw(self, image: F32, K: F64, T_world_camera: F64, block: Block, n: int) -> None:
         length, width, height = block.size_m
         ends = [(sx * length / 2, sy * width / 2, z, 1.0) for sx in (-1, 1) for z in (0.0, height) for sy in (-1, 1)]
         T = inverse(T_world_camera) @ self.pose(block.s_m, block.offset_m)

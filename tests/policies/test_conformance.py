@@ -1,0 +1,238 @@
+"""The conformance check on good policies and on ones that are broken on purpose: each fault has its sentence."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.geometry import se2, yaw_of
+from alpasim_plugin.types import Observation, Plan, Route, SensorSpec
+from policies import POLICIES, check_policy
+from policies.conformance import canned_scenario
+from policies.pure_pursuit import PurePursuit
+
+SCENARIO = canned_scenario()
+
+
+class Honest(PurePursuit):
+    """Drives well; the subclasses spoil its plans."""
+
+    def __init__(self) -> None:
+        super().__init__(SCENARIO)
+
+    def act(self, observation: Observation) -> Plan:
+        return self.spoil(super().act(observation), observation)
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return plan
+
+
+class MirroredY(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=plan.xy * [1, -1], yaw=-plan.yaw)
+
+
+class Centimetres(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=plan.xy * 100)
+
+
+class Backwards(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=-plan.xy)
+
+
+class SwappedAxes(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=plan.xy[:, ::-1].copy(), yaw=np.pi / 2 - plan.yaw)
+
+
+class Milliseconds(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, times_us=plan.times_us // 1000)
+
+
+class MillisecondSteps(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, times_us=plan.times_us[0] + (plan.times_us - plan.times_us[0]) // 1000)
+
+
+class RelativeTimes(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, times_us=plan.times_us - plan.times_us[0])
+
+
+class FloatTimes(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, times_us=plan.times_us.astype(np.float32))
+
+
+class Stale(Honest):
+    kept: Plan | None = None
+
+    def reset(self, seed: int, route: Route) -> None:
+        super().reset(seed, route)
+        self.kept = None
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        self.kept = self.kept or plan
+        return self.kept
+
+
+class NotANumber(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        xy = plan.xy.copy()
+        xy[7, 1] = np.nan
+        return replace(plan, xy=xy)
+
+
+class Degrees(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, yaw=np.degrees(plan.yaw))
+
+
+class WorldFrame(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        T = observation.ego.T_world_rig
+        return replace(plan, xy=plan.xy @ T[:2, :2].T + T[:2, 3], yaw=plan.yaw + yaw_of(T))
+
+
+class Rotated(Honest):
+    """Answers in axes that are turned against the rig, the pose staying at the origin."""
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=plan.xy @ se2(0, 0, 1.2)[:2, :2].T)
+
+
+class Short(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, times_us=plan.times_us[:11], xy=plan.xy[:11], yaw=plan.yaw[:11])
+
+
+class Sparse(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, times_us=plan.times_us[::10], xy=plan.xy[::10], yaw=plan.yaw[::10])
+
+
+class WrongShape(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, yaw=plan.yaw[:-1])
+
+
+class BadSample(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, samples=(np.zeros((3, 3)),))
+
+
+class Random(Honest):
+    count = 0
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        self.count += 1  # survives the reset
+        return replace(plan, xy=plan.xy + 0.01 * self.count * np.linspace(0, 1, len(plan.xy))[:, None])
+
+
+class Remembers(Honest):
+    """Its cruising speed survives a reset once it has been slow."""
+
+    slowest = np.inf
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        speed = observation.ego.speed_mps
+        self.slowest = min(self.slowest, speed) if 0 < speed < 8 else self.slowest
+        return replace(plan, xy=plan.xy * (0.9 if self.slowest < 8 else 1.0))
+
+
+class Raises(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        raise ZeroDivisionError("speed")
+
+
+class Scribbles(Honest):
+    sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        observation.frames["front"].rgb[:] = 0
+        return plan
+
+
+class NeedsFreshFrames(Honest):
+    sensors: Sequence[SensorSpec] = (SensorSpec("front"),)
+
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        if observation.frames["front"].t_us != observation.t_us:
+            raise ValueError("the frame is old")
+        return plan
+
+
+class Slow(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        time.sleep(0.01)
+        return plan
+
+
+class OtherCamera(Honest):
+    sensors: Sequence[SensorSpec] = (SensorSpec("roof"),)
+
+
+@pytest.mark.parametrize("name", ["log-replay", "constant-velocity", "pure-pursuit", "lane-camera"])
+def test_shipped_policy_conforms(name: str) -> None:
+    report = check_policy(name, latency_limit_ms=1000.0)
+    assert report.ok, str(report)
+    assert {"sensors", "values", "times", "frame", "units", "determinism", "reset", "latency"} <= {c.name for c in report.checks}
+
+
+def test_every_shipped_policy_is_checked_above() -> None:
+    assert {"log-replay", "constant-velocity", "pure-pursuit", "lane-camera"} <= set(POLICIES.names())
+
+
+@pytest.mark.parametrize(
+    ("broken", "sentence"),
+    [
+        (MirroredY, "y is mirrored"),
+        (Centimetres, "it looks like centimetres"),
+        (Backwards, "it runs backwards"),
+        (SwappedAxes, "it runs sideways"),
+        (Milliseconds, "it looks like milliseconds"),
+        (MillisecondSteps, "the steps look like milliseconds"),
+        (RelativeTimes, "relative to now"),
+        (FloatTimes, "float32, not integer microseconds"),
+        (Stale, "it is stale"),
+        (NotANumber, "first in row 7"),
+        (Degrees, "it looks like degrees"),
+        (WorldFrame, "it looks like world coordinates"),
+        (Rotated, "moves sideways"),
+        (Short, "the plan ends 1.000 s ahead"),
+        (Sparse, "up to 1.00 s apart"),
+        (WrongShape, "yaw (40,)"),
+        (BadSample, "a sampled alternative"),
+        (Random, "the same seed and observations give the same plans: they differ by up to"),
+        (Remembers, "a reset forgets the drive before: plans differ by up to"),
+        (Raises, "raised ZeroDivisionError: speed"),
+        (Scribbles, "read-only"),
+        (NeedsFreshFrames, "in the situation 'old frame' the policy raised ValueError: the frame is old"),
+        (OtherCamera, "asks for cameras ['roof']; the scenario has ['front']"),
+    ],
+)
+def test_broken_policy_gets_its_sentence(broken: type[Honest], sentence: str) -> None:
+    report = check_policy(broken(), SCENARIO)
+    assert not report.ok
+    assert any(sentence in failure for failure in report.failures), str(report)
+    assert sentence in str(report)
+
+
+def test_slow_policy_is_told_its_limit() -> None:
+    report = check_policy(Slow(), SCENARIO, latency_limit_ms=5.0)
+    assert [c.name for c in report.checks if not c.ok] == ["latency"]
+    assert "the limit is 5 ms" in report.failures[0]
+    assert report.latency_ms[0] >= 10.0
+
+
+def test_blind_policy_passes_with_a_note() -> None:
+    report = check_policy("constant-velocity")
+    assert report.ok
+    assert any("depends neither on the route nor on the frames" in note for note in report.notes)

@@ -1,0 +1,270 @@
+"""The parts of the camera policy, each against something simpler: grid, ridges, lane filter, obstacles."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.geometry import inverse
+from policies.ground_grid import make_grid
+from policies.lane_filter import LaneState, predict, search, shift, start, update
+from policies.lane_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint
+from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
+from policies.painted_road import Block, Line, PaintedRoad, pinhole_camera
+
+CAMERA = pinhole_camera()
+GRID = make_grid(CAMERA)
+RIDGES = RidgeFilter(GRID)
+
+
+# --- grid -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", [CAMERA, pinhole_camera(pitch_deg=8.0), pinhole_camera(mount_m=(2.2, -0.3, 1.2), hfov_deg=100)])
+def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera: object) -> None:
+    grid = make_grid(camera)  # type: ignore[arg-type]
+    K, T = camera.K, inverse(camera.T_rig_camera)  # type: ignore[attr-defined]
+    for row in (0, len(grid.x_m) // 2, len(grid.x_m) - 1):
+        for column in (0, 160, 319):
+            x, y, z = (T @ [grid.x_m[row], grid.y_m[column], 0.0, 1.0])[:3]
+            u, v = K[0, 0] * x / z + K[0, 2] - 0.5, K[1, 1] * y / z + K[1, 2] - 0.5
+            assert grid.map_u[row, column] == pytest.approx(u, abs=1e-2)
+            assert grid.map_v[row, column] == pytest.approx(v, abs=1e-2)
+
+
+def test_grid_rows_are_one_image_row_apart() -> None:
+    steps = -np.diff(GRID.map_v[:, 160])
+    assert np.all((steps > 0.7) & (steps < 1.3))
+
+
+def test_column_and_row_lookups_invert_the_axes() -> None:
+    assert np.allclose(GRID.column_of(GRID.y_m), np.arange(len(GRID.y_m)))
+    assert np.allclose(GRID.row_of(GRID.x_m), np.arange(len(GRID.x_m)))
+
+
+# --- ridges -----------------------------------------------------------------------------------------------------------
+
+
+def slow_ridge(value: np.ndarray, row: int, column: int) -> float:
+    """Plain means over the three windows of one cell."""
+    half, gap, flank = (int(w[row]) for w in _windows(GRID))
+    n = value.shape[1]
+
+    def mean(a: int, b: int) -> float:
+        cells = [float(value[row, c]) for c in range(column + a, column + b + 1) if 0 <= c < n]
+        return sum(cells) / len(cells) if cells else 0.0
+
+    centre, left, right = mean(-half, half), mean(-gap - flank, -gap), mean(gap, gap + flank)
+    return max(min(centre - left, centre - right), 0.0)
+
+
+def test_ridge_response_equals_plain_window_means() -> None:
+    value = np.random.default_rng(0).uniform(0, 255, GRID.inside.shape).astype(np.float32)
+    fast = RIDGES.response(value)
+    for row in range(0, len(GRID.x_m), 9):
+        reach = int((_windows(GRID)[1] + _windows(GRID)[2])[row])
+        seen = np.flatnonzero(GRID.inside[row])
+        for column in range(seen[0] + reach, seen[-1] - reach, 23):
+            assert fast[row, column] == pytest.approx(slow_ridge(value, row, column), abs=0.05)
+
+
+def test_step_edge_is_no_paint_but_a_stroke_is() -> None:
+    value = np.full(GRID.inside.shape, 90.0, np.float32)
+    value[:, 200:] = 180.0
+    assert RIDGES.response(value)[:, 150:250].max() == 0.0
+    value[:] = 90.0
+    value[:, 159:162] = 200.0
+    assert RIDGES.response(value)[5:30, 160].min() > 60.0
+
+
+def test_white_and_yellow_are_both_bright() -> None:
+    ground = np.zeros((1, 3, 3), np.uint8)
+    ground[0] = [(235, 235, 235), (230, 190, 60), (95, 95, 98)]
+    white, yellow, asphalt = brightness(ground)[0]
+    assert white > asphalt + 100
+    assert yellow > asphalt + 100
+
+
+def test_bars_of_a_crosswalk_are_not_taken_for_lines() -> None:
+    ground = np.full((*GRID.inside.shape, 3), 90, np.uint8)
+    for y in (1.75, -1.75):
+        c = round(float(GRID.column_of(np.array(y))))
+        ground[:, c - 1 : c + 2] = 220
+    plain = find_paint(ground, GRID, RIDGES)
+    rows = (GRID.x_m > 9.0) & (GRID.x_m < 12.0)
+    for y in np.arange(-4.0, 4.0, 1.0):
+        c = round(float(GRID.column_of(np.array(y))))
+        ground[np.ix_(rows, range(c - 5, c + 5))] = 220
+    with_bars = find_paint(ground, GRID, RIDGES)
+    inside = (with_bars.x_m > 9.1) & (with_bars.x_m < 11.9)
+    assert len(plain.x_m) > 60
+    assert inside.sum() <= 2
+    assert (~inside).sum() > 0.8 * np.sum((plain.x_m < 9.1) | (plain.x_m > 11.9))
+
+
+# --- lane filter ------------------------------------------------------------------------------------------------------
+
+
+def paint_of(offset: float, heading: float, curvature: float, width: float, seed: int = 0, sides: tuple[int, ...] = (-1, 1)) -> PaintPoints:
+    random = np.random.default_rng(seed)
+    x = np.repeat(np.arange(6.0, 30.0, 1.0), len(sides))
+    side = np.tile(sides, len(x) // len(sides))
+    slope = heading + curvature * x
+    y = offset + heading * x + curvature * x**2 / 2 + side * width / 2 * np.sqrt(1 + slope**2) + random.normal(0, 0.04, len(x))
+    return PaintPoints(x, y, np.full(len(x), 3.0), np.full(len(x), 0.06))
+
+
+def settled(points: PaintPoints, lane: LaneState) -> LaneState:
+    for _ in range(15):
+        lane = update(predict(lane, 0.0, 0.0, 0.0), points, np.ones(len(points.x_m)))
+    return lane
+
+
+@settings(deadline=None, max_examples=25)
+@given(offset=st.floats(-0.6, 0.6), heading=st.floats(-0.08, 0.08), curvature=st.floats(-0.015, 0.015), width=st.floats(3.0, 4.0))
+def test_lane_is_recovered_from_its_paint(offset: float, heading: float, curvature: float, width: float) -> None:
+    points = paint_of(offset, heading, curvature, width)
+    found = search(points, np.ones(48), 0.0, 0.0, 0.0)
+    assert found is not None
+    lane = settled(points, found)
+    assert lane.mean[0] == pytest.approx(offset, abs=0.12)
+    assert lane.mean[4] == pytest.approx(width, abs=0.12)
+    x = np.array([5.0, 15.0])
+    assert np.allclose(lane.centre(x), offset + heading * x + curvature * x**2 / 2, atol=0.12)
+
+
+def test_outliers_beside_the_lane_do_not_pull_it() -> None:
+    good = paint_of(0.2, 0.02, 0.0, 3.5)
+    random = np.random.default_rng(1)
+    x = random.uniform(6, 30, 30)
+    stray = PaintPoints(
+        np.concatenate([good.x_m, x]),
+        np.concatenate([good.y_m, random.uniform(-6, 6, 30)]),
+        np.full(len(good.x_m) + 30, 3.0),
+        np.full(len(good.x_m) + 30, 0.06),
+    )
+    assert settled(stray, start(0.0, 0.0, 0.0)).mean[0] == pytest.approx(settled(good, start(0.0, 0.0, 0.0)).mean[0], abs=0.08)
+
+
+def test_more_paint_makes_the_estimate_surer_and_none_makes_it_less_sure() -> None:
+    fresh = start(0.0, 0.0, 0.0)
+    both = update(fresh, paint_of(0, 0, 0, 3.5), np.ones(48))
+    one = update(fresh, paint_of(0, 0, 0, 3.5, sides=(1,)), np.ones(24))
+    blind = fresh
+    for _ in range(20):
+        blind = predict(blind, 1.0, 0.0, 0.0)
+    at = np.array([5.0])
+    assert both.sigma(at)[0] < one.sigma(at)[0] < fresh.sigma(at)[0] < blind.sigma(at)[0]
+    assert blind.blind_m == pytest.approx(20.0)
+
+
+def test_prediction_sees_the_lane_that_a_moved_ego_would_see() -> None:
+    """The same curve, drawn from a pose further along it."""
+    road = PaintedRoad(curvature_1pm=1 / 80)
+    before, after = road.pose(0.0, -0.3), road.pose(3.0, 0.1, 0.05)
+    step = inverse(before) @ after
+    lane = predict(start(0.3, 0.0, 1 / 80), float(step[0, 3]), float(step[1, 3]), float(np.arctan2(step[1, 0], step[0, 0])))
+    for ahead in (4.0, 9.0):
+        x, y = (inverse(after) @ road.pose(3.0 + ahead))[:2, 3]
+        assert lane.centre(np.array([x]))[0] == pytest.approx(y, abs=0.05)
+
+
+def test_search_finds_the_lane_from_a_rough_guess_and_prefers_the_guessed_one_of_two() -> None:
+    left, right = paint_of(0.4, 0.05, 0.01, 3.4), paint_of(-3.0, 0.05, 0.01, 3.4)
+    both = PaintPoints(*(np.concatenate([getattr(left, f), getattr(right, f)]) for f in ("x_m", "y_m", "strength", "sigma_m")))
+    ones = np.ones(len(both.x_m))
+    for guess, truth in ((0.0, 0.4), (-3.2, -3.0)):
+        found = search(both, ones, guess, 0.0, 0.0)
+        assert found is not None
+        x = np.array([6.0, 10.0, 18.0])
+        assert np.allclose(settled(both, found).centre(x), truth + 0.05 * x + 0.01 * x**2 / 2, atol=0.1)
+
+
+def test_search_without_enough_paint_finds_nothing() -> None:
+    assert search(paint_of(0, 0, 0, 3.5), np.full(48, 0.01), 0.0, 0.0, 0.0) is None
+
+
+def test_neighbouring_lane_is_one_width_away() -> None:
+    assert shift(start(0.2, 0.0, 0.0, 3.4), 1).mean[0] == pytest.approx(3.6)
+
+
+# --- obstacles --------------------------------------------------------------------------------------------------------
+
+
+def foot_in(road: PaintedRoad, seed: int = 0) -> tuple[float, float] | None:
+    centre = np.zeros(len(GRID.x_m))
+    empty = cv2.cvtColor(GRID.warp(PaintedRoad().image(CAMERA, np.eye(4), seed=9)), cv2.COLOR_RGB2LAB)
+    colour = learn_road(None, empty, GRID, centre, np.inf)
+    assert colour is not None
+    lab = cv2.cvtColor(GRID.warp(road.image(CAMERA, np.eye(4), seed)), cv2.COLOR_RGB2LAB)
+    return find_foot(anomaly(lab, colour, GRID), GRID, centre, float(GRID.x_m[0]), 50.0)
+
+
+@pytest.mark.parametrize("distance", [8.0, 12.0, 20.0, 30.0, 40.0])
+@pytest.mark.parametrize("colour", [(150, 30, 30), (235, 235, 235), (25, 25, 30), (30, 60, 160)])
+def test_foot_of_a_car_gives_its_distance(distance: float, colour: tuple[int, int, int]) -> None:
+    found = foot_in(PaintedRoad(blocks=(Block(distance + 2.25, colour=colour),)))
+    assert found is not None
+    assert found[0] == pytest.approx(distance, abs=0.35 + 2.0 * found[1])
+    assert found[1] < 0.15 * distance
+
+
+def test_pedestrian_in_the_corridor_is_seen_and_beside_it_is_not() -> None:
+    person = (0.4, 0.5, 1.75)
+    assert foot_in(PaintedRoad(blocks=(Block(15.0, 0.3, person, (40, 40, 90)),))) is not None
+    assert foot_in(PaintedRoad(blocks=(Block(15.0, 2.2, person, (40, 40, 90)),))) is None
+
+
+def test_free_road_has_no_foot() -> None:
+    assert all(foot_in(PaintedRoad(), seed) is None for seed in range(5))
+
+
+def test_low_kerb_stone_is_not_taken_for_a_car() -> None:
+    assert foot_in(PaintedRoad(blocks=(Block(20.0, 0.0, (0.5, 1.8, 0.15), (200, 200, 200)),))) is None
+
+
+def test_road_colour_is_not_learned_from_the_car_in_front() -> None:
+    road = PaintedRoad(lines=(Line(1.75), Line(-1.75)), blocks=(Block(9.0),))
+    lab = cv2.cvtColor(GRID.warp(road.image(CAMERA, np.eye(4))), cv2.COLOR_RGB2LAB)
+    centre = np.zeros(len(GRID.x_m))
+    assert learn_road(None, lab, GRID, centre, free_to_m=6.5) is None
+
+
+def test_closing_speed_is_learned_from_the_feet() -> None:
+    track = None
+    random = np.random.default_rng(0)
+    for k in range(40):
+        truth = 40.0 + (6.0 - 10.0) * k * 0.1
+        track = track_obstacle(track, (truth + random.normal(0, 0.4), 0.5), 10.0, 0.1)
+    assert track is not None
+    assert track.confirmed
+    assert track.distance_m == pytest.approx(40.0 - 4.0 * 3.9, abs=0.6)
+    assert track.speed_mps == pytest.approx(6.0, abs=1.0)
+
+
+def test_track_needs_three_sightings_and_ends_after_nine_misses() -> None:
+    track = track_obstacle(None, (20.0, 0.5), 5.0, 0.1)
+    assert track is not None
+    assert not track.confirmed
+    for k in range(5):
+        track = track_obstacle(track, (20.0 - 0.5 * (k + 1), 0.5), 5.0, 0.1)
+    assert track is not None
+    assert track.confirmed
+    for _ in range(8):
+        track = track_obstacle(track, None, 0.0, 0.1)
+        assert track is not None
+    assert track_obstacle(track, None, 0.0, 0.1) is None
+
+
+def test_thing_nearer_than_the_image_reaches_keeps_its_distance() -> None:
+    track = None
+    for k in range(12):
+        track = track_obstacle(track, (max(8.0 - 0.3 * k, 5.5), 0.3), 3.0, 0.1, 5.5)
+    assert track is not None
+    for _ in range(10):
+        track = track_obstacle(track, (5.5, 0.3), 0.0, 0.1, 5.5)
+        assert track is not None
+    assert track.distance_m < 5.5
