@@ -1,0 +1,69 @@
+"""Fill a video codec with weights: from a checkpoint, every key and shape checked, or at random from a keyed stream."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from alpasim_plugin import seeding
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.checkpoints import convert
+
+LISTED = 6  # keys named in one error before the rest is only counted
+
+
+def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dtype, doing: str, source: str, do: str) -> None:
+    """Give ``net`` (built on the meta device) copies of ``tensors`` in one precision.
+
+    Args:
+        net: Its state dict names every key and shape that is due.
+        tensors: Half, single or double precision, also mixed.
+        dtype: Precision of the network.
+        doing, source, do: For the message.
+
+    Raises:
+        InputError: Missing, unexpected, mis-shaped (also transposed), non-floating keys, all in one message; or a value that
+            overflows ``dtype``.
+    """
+    due = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+    wrong = [_describe(key, tensors[key], due[key]) for key in sorted(due.keys() & tensors.keys()) if tuple(tensors[key].shape) != due[key]]
+    other = [f"{key} ({tensors[key].dtype})" for key in sorted(tensors) if not tensors[key].is_floating_point()]
+    found = [
+        *_listing("missing", sorted(due.keys() - tensors.keys())),
+        *_listing("unexpected", sorted(tensors.keys() - due.keys())),
+        *_listing("wrong shape", wrong),
+        *_listing("not floating point", other),
+    ]
+    if found:
+        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} due)", "; ".join(found), do)
+    net.load_state_dict({key: convert(key, tensors[key], dtype, source) for key in due}, assign=True)
+
+
+def fill_random(net: nn.Module, seed: int, component: str) -> None:
+    """Fill ``net`` with weights that depend on nothing but the key names, the seed and the component.
+
+    Matrices are normal with standard deviation 1/sqrt(fan-in), vectors that multiply (``gamma``) are 1, biases 0.
+    """
+    filled = {}
+    for key, value in net.state_dict().items():
+        if value.ndim > 1 and not key.endswith("gamma"):
+            numbers = seeding.stream("nets", seed, f"{component}/{key}").standard_normal(tuple(value.shape))
+            filled[key] = torch.from_numpy(numbers / (value[0].numel()) ** 0.5).float()
+        else:
+            filled[key] = torch.ones(value.shape) if key.endswith("gamma") else torch.zeros(value.shape)
+    net.load_state_dict(filled, assign=True)
+
+
+def _describe(key: str, value: Tensor, due: tuple[int, ...]) -> str:
+    shape = tuple(value.shape)
+    hint = ", transposed" if sorted(shape) == sorted(due) else ""
+    return f"{key} is {list(shape)} for {list(due)}{hint}"
+
+
+def _listing(what: str, items: list[str]) -> list[str]:
+    if not items:
+        return []
+    rest = f" and {len(items) - LISTED} more" if len(items) > LISTED else ""
+    return [f"{what}: {', '.join(items[:LISTED])}{rest}"]

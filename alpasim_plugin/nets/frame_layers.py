@@ -1,0 +1,101 @@
+"""Layers that treat every frame alone, on videos ``(B, T, H, W, C)``, and the loop over a mix of such layers and causal ones.
+
+Channels last: norms and 1x1 convolutions act on contiguous vectors, a frame is a contiguous slice, and a CPU's 2D convolutions are fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol, runtime_checkable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.nets.carry import Carry
+
+
+@runtime_checkable
+class Causal(Protocol):
+    """A layer that looks back."""
+
+    def next(self, x: Tensor, carry: Carry) -> Tensor:
+        """Map the next frames, taking the past from ``carry`` and leaving there what the frames after will need."""
+
+
+def run(layers: Iterable[nn.Module], x: Tensor, carry: Carry) -> Tensor:
+    """Apply layers one after another, causal ones with their past."""
+    for layer in layers:
+        x = layer.next(x, carry) if isinstance(layer, Causal) else layer(x)
+    return x
+
+
+def to_layers(video: Tensor) -> Tensor:
+    """Map ``(B, C, T, H, W)`` to contiguous ``(B, T, H, W, C)``."""
+    return video.permute(0, 2, 3, 4, 1).contiguous()
+
+
+def from_layers(x: Tensor) -> Tensor:
+    """Undo `to_layers`."""
+    return x.permute(0, 4, 1, 2, 3).contiguous()
+
+
+def split_last(x: Tensor, parts: int) -> Tensor:
+    """Map ``(..., parts * C)`` to ``(..., parts, C)``."""
+    return x.view(*x.shape[:-1], parts, x.shape[-1] // parts)
+
+
+def halves_to_frames(x: Tensor, parts: int) -> Tensor:
+    """Lay ``parts`` groups of channels out as consecutive frames: ``(B, T, H, W, parts * C)`` to ``(B, parts * T, H, W, C)``."""
+    return split_last(x, parts).movedim(-2, 2).flatten(1, 2)
+
+
+def conv_frames(x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1, padding: int = 0) -> Tensor:
+    """Convolve every frame of ``(B, T, H, W, C)`` with a 2D kernel ``(O, C, kh, kw)``."""
+    b, t = x.shape[:2]
+    out = F.conv2d(x.flatten(0, 1).permute(0, 3, 1, 2), weight.contiguous(memory_format=torch.channels_last), bias, stride, padding)
+    out = out.permute(0, 2, 3, 1)
+    return out.reshape(b, t, *out.shape[1:])
+
+
+class FrameConv(nn.Conv2d):
+    """3x3 convolution of every frame, zero padding."""
+
+    def __init__(self, inputs: int, outputs: int, bias: bool = True) -> None:
+        super().__init__(inputs, outputs, 3, bias=bias)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
+        return conv_frames(input, self.weight, self.bias, padding=1)
+
+
+class HalvingConv(nn.Conv2d):
+    """3x3 convolution with stride 2; the zero row and column are at the bottom and right only."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 3, stride=2)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H/2, W/2, outputs)``."""
+        return conv_frames(F.pad(input, (0, 0, 0, 1, 0, 1)), self.weight, self.bias, stride=2)
+
+
+class DoublingConv(FrameConv):
+    """Repeat every pixel 2x2, then a 3x3 convolution."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, 2H, 2W, outputs)``."""
+        return super().forward(input.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3))
+
+
+class Pointwise(nn.Module):
+    """1x1 convolution whose stored kernel has ``axes`` trailing axes of size 1."""
+
+    def __init__(self, inputs: int, outputs: int, axes: int, bias: bool = True) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(outputs, inputs, *(1,) * axes))
+        self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., inputs)`` to ``(..., outputs)``."""
+        return F.linear(x, self.weight.flatten(1), self.bias)

@@ -1,0 +1,65 @@
+"""Per-channel mean and standard deviation of a video latent, and the two ways to use them.
+
+A diffusion network works on normalised latents, ``(mu - mean) / std`` per channel. The Wan 2.1 numbers are the ones published with that
+autoencoder; LightVAE and the tiny decoders share its latent space and therefore its numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from alpasim_plugin.errors import InputError
+
+WAN_MEAN = (
+    -0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508,
+    0.4134, -0.0715, 0.5517, -0.3632, -0.1922, -0.9497, 0.2503, -0.2921,
+)  # fmt: skip
+WAN_STD = (
+    2.8184, 1.4541, 2.3275, 2.6558, 1.2196, 1.7708, 2.6052, 2.0743,
+    3.2687, 2.1526, 2.8652, 1.5579, 1.6382, 1.1253, 2.8251, 1.9160,
+)  # fmt: skip
+
+
+class LatentStats(nn.Module):
+    """Normalise and de-normalise latents; the numbers stay float32 whatever the precision of the latents.
+
+    Args:
+        mean: One value a channel.
+        std: One positive value a channel.
+        stored: Whether the numbers belong to the module's state dict (they do not in Wan checkpoints).
+
+    Raises:
+        InputError: Lengths differ or a deviation is not positive.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD, stored: bool = False) -> None:
+        super().__init__()
+        if len(mean) != len(std) or not all(s > 0 for s in std):
+            raise InputError(
+                "setting latent statistics",
+                f"{len(mean)} means and {len(std)} standard deviations",
+                f"standard deviations {list(std)}",
+                "give one mean and one positive standard deviation for each latent channel",
+            )
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32), persistent=stored)
+        self.register_buffer("std", torch.tensor(std, dtype=torch.float32), persistent=stored)
+
+    def normalise(self, mu: Tensor) -> Tensor:
+        """Map encoder means ``(B, C, t, h, w)`` to latents of about unit variance; same dtype."""
+        mean, std = self._broadcast(mu)
+        return ((mu.float() - mean) / std).to(mu.dtype)
+
+    def denormalise(self, z: Tensor) -> Tensor:
+        """Undo `normalise`."""
+        mean, std = self._broadcast(z)
+        return (z.float() * std + mean).to(z.dtype)
+
+    def _broadcast(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        shape = (1, -1) + (1,) * (z.ndim - 2)
+        return self.mean.float().view(shape), self.std.float().view(shape)

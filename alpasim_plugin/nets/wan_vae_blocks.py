@@ -1,0 +1,182 @@
+"""Layers of the Wan 2.1 video autoencoder, with its parameter names and shapes.
+
+Inside, a video is ``(B, T, H, W, C)``. Every layer is causal in time. The first frame of a video is special in the two layers that change
+the frame rate: it passes alone, and the frames after it are handled as groups.
+
+Source: Wan 2.1 ``wan/modules/vae.py`` (graph, keys, cache rules).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.nets.carry import Carry
+from alpasim_plugin.nets.frame_layers import DoublingConv, HalvingConv, Pointwise, conv_frames, halves_to_frames, run
+
+TAPS = 3  # of every temporal kernel: the frame itself and two before it
+
+
+def causal_conv(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:
+    """Convolve the last ``frames`` of ``joined`` in space and time.
+
+    One 3D convolution, except on a CPU: there the three temporal taps are 2D convolutions that are added up, up to six times faster
+    on the small frames of the inner stages, and taps that would only see frames before the video are left out.
+
+    Args:
+        joined: ``(B, k + frames, H, W, C)`` with k <= 2 frames of the past; missing ones count as zero.
+        weight: ``(O, C, 3, kh, kw)``, odd kernel sides, zero padding in space.
+        bias: ``(O,)``.
+        frames: Frames of the result.
+
+    Returns:
+        ``(B, frames, H, W, O)``.
+    """
+    if joined.device.type != "cpu":
+        return causal_conv_reference(joined, weight, bias, frames)
+    past = joined.shape[1] - frames
+    pad = weight.shape[-1] // 2
+    out = conv_frames(joined[:, past:], weight[:, :, -1], bias, padding=pad)
+    for back in range(1, TAPS):
+        start = max(0, back - past)  # first output frame that has a frame ``back`` steps before it
+        if start < frames:
+            seen = joined[:, past + start - back : past + frames - back]
+            out[:, start:] += conv_frames(seen, weight[:, :, -1 - back], None, padding=pad)
+    return out
+
+
+def causal_conv_reference(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:
+    """Do the same with one 3D convolution: the readable twin of `causal_conv`, and the path on an accelerator."""
+    pad = weight.shape[-1] // 2
+    missing = frames + TAPS - 1 - joined.shape[1]
+    padded = F.pad(joined, (0, 0, 0, 0, 0, 0, missing, 0)).permute(0, 4, 1, 2, 3)
+    return F.conv3d(padded, weight, bias, padding=(0, pad, pad)).permute(0, 2, 3, 4, 1)
+
+
+class CausalConv(nn.Module):
+    """3x3x3 or 3x1x1 convolution that sees its own frame and two before it."""
+
+    def __init__(self, inputs: int, outputs: int, side: int = 3) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(outputs, inputs, TAPS, side, side))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def next(self, x: Tensor, carry: Carry) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
+        return causal_conv(carry.extend(x, TAPS - 1), self.weight, self.bias, x.shape[1])
+
+
+class PairingConv(nn.Module):
+    """3x1x1 convolution with stride 2 in time: every output sees two frames and the one before them."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(width, width, TAPS, 1, 1))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def next(self, x: Tensor, carry: Carry) -> Tensor:
+        """Halve the frames of ``(B, T, H, W, C)``; the first frame of a video passes unchanged and is the past of the second."""
+        joined = carry.extend(x, 1)
+        taps = self.weight.flatten(2).unbind(2)
+        seen = [joined[:, back : joined.shape[1] - (TAPS - 1) + back : 2] for back in range(TAPS)]
+        out = F.linear(seen[0], taps[0], self.bias) + F.linear(seen[1], taps[1]) + F.linear(seen[2], taps[2])
+        return torch.cat([x[:, :1], out], dim=1) if carry.first else out
+
+
+class ChannelNorm(nn.Module):
+    """Scale every pixel's channel vector to length sqrt(C), then by a learned gain; in float32.
+
+    Args:
+        width: Channels C.
+        axes: Trailing axes of the stored gain: 3 in video layers, 2 in the attention layer.
+    """
+
+    def __init__(self, width: int, axes: int = 3) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(width, *(1,) * axes))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., C)`` to the same shape and dtype; a zero vector stays zero."""
+        wide = x.float()
+        length: Tensor = torch.linalg.vector_norm(wide, dim=-1, keepdim=True).clamp_min(1e-12)
+        gain = self.gamma.flatten().float() * math.sqrt(x.shape[-1])
+        return (wide / length * gain).to(x.dtype)
+
+
+class ResidualBlock(nn.Module):
+    """Norm, SiLU, convolution, twice, added to the input (through a 1x1x1 convolution if the width changes)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        # Position 5 is a dropout in the checkpoint's numbering.
+        self.residual = nn.ModuleList(
+            [
+                ChannelNorm(inputs), nn.SiLU(), CausalConv(inputs, outputs),
+                ChannelNorm(outputs), nn.SiLU(), nn.Identity(), CausalConv(outputs, outputs),
+            ]
+        )  # fmt: skip
+        self.shortcut = Pointwise(inputs, outputs, axes=3) if inputs != outputs else nn.Identity()
+
+    def next(self, x: Tensor, carry: Carry) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
+        skipped: Tensor = self.shortcut(x)
+        return run(self.residual, x, carry) + skipped
+
+
+class FrameAttention(nn.Module):
+    """Single-head attention among the pixels of each frame, added to the input."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = ChannelNorm(width, axes=2)
+        self.to_qkv = Pointwise(width, 3 * width, axes=2)
+        self.proj = Pointwise(width, width, axes=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, C)`` to the same shape."""
+        pixels = self.norm(x).flatten(0, 1).flatten(1, 2)[:, None]  # (B * T, one head, H * W, C)
+        q, k, v = self.to_qkv(pixels).chunk(3, dim=-1)
+        seen: Tensor = self.proj(F.scaled_dot_product_attention(q, k, v))
+        return x + seen.view(x.shape)
+
+
+class Down(nn.Module):
+    """Halve height and width, and with ``time`` then the frame rate."""
+
+    def __init__(self, width: int, time: bool) -> None:
+        super().__init__()
+        self.resample = nn.ModuleList([nn.Identity(), HalvingConv(width, width)])  # position 0 is the padding
+        self.time_conv = PairingConv(width) if time else None
+
+    def next(self, x: Tensor, carry: Carry) -> Tensor:
+        """Map ``(B, T, H, W, C)`` to ``(B, T', H/2, W/2, C)``: T' = T, or T/2 not counting a first frame."""
+        x = run(self.resample, x, carry)
+        return x if self.time_conv is None else self.time_conv.next(x, carry)
+
+
+class Up(nn.Module):
+    """Double height and width and change the width; with ``time`` first double the frame rate.
+
+    The frame-rate step is a causal temporal convolution to twice the channels; the halves become consecutive frames. The first latent of
+    a video skips it, and the history of that convolution starts, with zeros, after it.
+    """
+
+    def __init__(self, inputs: int, outputs: int, time: bool) -> None:
+        super().__init__()
+        self.resample = nn.ModuleList([nn.Identity(), DoublingConv(inputs, outputs)])  # position 0 is the repetition of pixels
+        self.time_conv = CausalConv(inputs, 2 * inputs, side=1) if time else None
+
+    def next(self, x: Tensor, carry: Carry) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T', 2H, 2W, outputs)``: T' = T, or 2T not counting a first latent."""
+        if self.time_conv is not None:
+            first = 1 if carry.first else 0
+            alone, rest = x[:, :first], x[:, first:]
+            if rest.shape[1]:
+                rest = halves_to_frames(self.time_conv.next(rest, carry), 2)
+            else:
+                carry.extend(rest, TAPS - 1)  # nothing but the first latent: an empty history, so that the slot exists
+            x = torch.cat([alone, rest], dim=1)
+        return run(self.resample, x, carry)

@@ -1,0 +1,62 @@
+"""Sizes of a Wan 2.1 autoencoder, read off its tensors.
+
+The graph is fixed: four stages, two residual blocks a stage in the encoder and three in the decoder, time halved after the second and third
+encoder stage. What varies is the width of each stage: 96, 192, 384, 384 in the published network, a quarter of that in LightVAE.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+
+ENCODER_TIME = (False, True, True)  # which of the three halvings also halve the frame rate
+DECODER_TIME = (True, True, False)
+DOING = "loading Wan VAE weights"
+DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix; docs/vae.md lists shapes)"
+
+
+@dataclass(frozen=True)
+class WanLayout:
+    """Widths of one autoencoder.
+
+    Args:
+        colours: Channels of the video.
+        latent: Channels of the latent.
+        stem: Channels after the encoder's first convolution.
+        encoder: Channels of the four encoder stages.
+        decoder_in: Channels that enter each of the four decoder stages.
+        decoder_out: Channels that leave the residual blocks of each decoder stage.
+    """
+
+    colours: int
+    latent: int
+    stem: int
+    encoder: tuple[int, ...]
+    decoder_in: tuple[int, ...]
+    decoder_out: tuple[int, ...]
+
+
+def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLayout:
+    """Read the widths off vectors (biases and norm gains), which a transposed matrix cannot falsify.
+
+    Raises:
+        InputError: A key that gives a width is missing.
+    """
+    return WanLayout(
+        colours=_length(sd, source, "decoder.head.2.bias"),
+        latent=_length(sd, source, "conv2.bias"),
+        stem=_length(sd, source, "encoder.conv1.bias"),
+        encoder=tuple(_length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in (0, 3, 6, 9)),
+        decoder_in=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in (0, 4, 8, 12)),
+        decoder_out=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.3.gamma") for i in (2, 6, 10, 14)),
+    )
+
+
+def _length(sd: Mapping[str, Tensor], source: str, key: str) -> int:
+    if key not in sd:
+        raise InputError(DOING, f"{source} ({len(sd)} tensors)", f"missing: {key}", DO)
+    return sd[key].numel()
