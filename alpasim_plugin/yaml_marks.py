@@ -17,7 +17,7 @@ import yaml
 
 from alpasim_plugin.errors import InputError
 
-MAX_NODES = 500_000
+MAX_NODES = 200_000
 MAX_DEPTH = 40
 
 Key = tuple[str | int, ...]

@@ -13,10 +13,10 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
-from alpasim_plugin.types import F64, Actor, EgoState, HeightField, LaneMap, Scenario, Vehicle
+from alpasim_plugin.types import F64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
 from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.ground import ground_pose
-from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, wanted_gap_m
+from alpasim_plugin.world.idm import Bodies, IdmParams, Spans, find_leader, idm_acceleration, nearest_ahead, spans, wanted_gap_m
 from alpasim_plugin.world.lane_map import LaneIndex
 from alpasim_plugin.world.path import Path, polyline_path
 from alpasim_plugin.world.state import bodies_from, concatenate
@@ -48,6 +48,7 @@ class Actors:
         index = LaneIndex(lane_map) if lane_map is not None and any(a.behaviour.kind == "idm" for a in actors) else None
         self.drivers = [_Driver(a, index, ground) for a in actors if a.behaviour.kind == "idm"]
         self.replay = _Replay([a for a in actors if a.behaviour.kind != "idm"])
+        self.standing = _Standing([a for a in actors if a.behaviour.kind != "idm" and a.is_static])
         self.reset()
 
     def reset(self) -> None:
@@ -86,9 +87,10 @@ class Actors:
             driver.close(from_us, to_us)
         for _ in range(n):
             driving = [d for d in self.drivers if d.motion is not None]
+            present = self.standing.present(to_us)
             everybody = concatenate([fixed, *(d.bodies() for d in driving)])
             for row, driver in enumerate(driving, start=len(fixed.xy)):
-                driver.decide(everybody, row)
+                driver.decide(everybody, row, self.standing, present)
             for driver in driving:
                 driver.advance(dt_s)
 
@@ -145,8 +147,8 @@ class _Replay:
         return {self.actors[k].actor_id: poses[n] for n, k in enumerate(rows)}
 
     def bodies(self, poses: Mapping[str, F64]) -> Bodies:
-        """Return the bodies present, with the velocity of the track's current piece."""
-        rows = [k for k, a in enumerate(self.actors) if a.actor_id in poses]
+        """Return the moving bodies present, with the velocity of the track's current piece."""
+        rows = [k for k, a in enumerate(self.actors) if not a.is_static and a.actor_id in poses]
         T = np.array([poses[self.actors[k].actor_id] for k in rows]).reshape(-1, 4, 4)
         i = self.cursor[rows]
         j = np.minimum(i + 1, self.end[rows])
@@ -156,6 +158,26 @@ class _Replay:
         else:
             velocity = np.zeros((0, 2))
         return bodies_from(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]), [self.boxes[k] for k in rows], velocity)
+
+
+class _Standing:
+    """Bodies that never move: where they lie on a driver's line is worked out once."""
+
+    def __init__(self, actors: Sequence[Actor]) -> None:
+        poses = np.array([se3(a.track.xyz[0], a.track.quat[0]) for a in actors]).reshape(-1, 4, 4)
+        self.bodies = bodies_from(
+            poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0]), [a.box for a in actors], np.zeros((len(actors), 2))
+        )
+        self.first = np.array([int(a.track.t_us[0]) for a in actors], dtype=np.int64)
+        self.last = np.array([int(a.track.t_us[-1]) for a in actors], dtype=np.int64)
+
+    def present(self, t_us: int) -> Bool:
+        """Return which of them are there."""
+        return np.asarray((self.first <= t_us) & (t_us <= self.last))
+
+    def on(self, path: Path) -> Spans | None:
+        """Return their places on a line."""
+        return spans(path, 0.0, self.bodies, path.length_m + 100.0, window=False)
 
 
 @dataclass
@@ -177,6 +199,8 @@ class _Driver:
         self.path = _driving_line(actor, index)
         self.motion: _Motion | None = None
         self.present = True
+        self.standing: Spans | None = None
+        self.knows_standing = False
 
     def reset(self) -> None:
         self.motion, self.present = None, True
@@ -204,16 +228,20 @@ class _Driver:
         direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
         return bodies_from(xyz[:2], yaw, [self.actor.box], m.speed_mps * direction)
 
-    def decide(self, everybody: Bodies, own_row: int) -> None:
+    def decide(self, everybody: Bodies, own_row: int, standing: _Standing, present: Bool) -> None:
         """Choose the acceleration for the next step."""
         m = self.motion
         if m is None or self.path is None:
             return
-        front = m.s_m + self.actor.box.length_m / 2
+        if not self.knows_standing:
+            self.standing, self.knows_standing = standing.on(self.path), True
+        front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
         # Twice the wanted gap behind a standing leader: beyond it the interaction is below a quarter of the own acceleration.
         horizon_m = 20.0 + 2.0 * wanted_gap_m(m.speed_mps, m.speed_mps, self.params)
-        leader = find_leader(self.path, front, self.actor.box.width_m / 2, everybody, horizon_m, own_row=own_row)
-        m.accel_mps2 = idm_acceleration(m.speed_mps, leader.gap_m, m.speed_mps - leader.speed_mps, self.params)
+        leaders = [find_leader(self.path, front, half, everybody, horizon_m, own_row=own_row)]
+        if self.standing is not None:
+            leaders.append(nearest_ahead(self.standing.only(present[self.standing.index]), front, half, horizon_m))
+        m.accel_mps2 = min(idm_acceleration(m.speed_mps, o.gap_m, m.speed_mps - o.speed_mps, self.params) for o in leaders)
 
     def advance(self, dt_s: float) -> None:
         m = self.motion

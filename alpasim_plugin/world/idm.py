@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.types import F64, I64, Bool
 from alpasim_plugin.world.path import Path
 
 
@@ -92,6 +92,10 @@ class Spans:
     low: F64  # (m,) rightmost distance from the path
     high: F64  # (m,) leftmost
     speed: F64  # (m,) along the path, >= 0
+
+    def only(self, keep: Bool) -> Spans:
+        """Return the rows ``(m,)`` that are kept."""
+        return Spans(self.index[keep], self.rear[keep], self.front[keep], self.low[keep], self.high[keep], self.speed[keep])
 
 
 def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True) -> Spans | None:

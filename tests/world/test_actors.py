@@ -114,6 +114,18 @@ def test_reactive_driver_follows_a_replayed_leader_that_stops() -> None:
     assert x[-1] + BOX.length_m / 2 < 45 - BOX.length_m / 2 - 0.5
 
 
+def test_reactive_driver_stops_behind_a_parked_car_only_while_it_is_there() -> None:
+    def parked(last_us: int) -> Actor:
+        t = np.array([0, last_us])
+        track = Trajectory(t, np.array([[50.0, 0.5, 0.75]] * 2), quat_from_yaw(np.zeros(2)))
+        return Actor("parked", "car", BOX, track, is_static=True)
+
+    stays = run(Actors([idm("a", 0, 10), parked(20_000_000)], Vehicle(), 500_000, ground=flat()), FAR_AWAY, 9_000_000)["a"]
+    assert stays[-1] + BOX.length_m / 2 < 50 - BOX.length_m / 2 - 0.5
+    leaves = run(Actors([idm("a", 0, 10), parked(1_000_000)], Vehicle(), 500_000, ground=flat()), FAR_AWAY, 9_000_000)["a"]
+    assert leaves[-1] > 60
+
+
 def test_a_column_of_reactive_drivers_stays_in_order() -> None:
     column = [idm(f"c{i}", -12.0 * i, 9, desired_speed_mps=6.0 + 2 * i) for i in range(4)]
     x = run(Actors(column, Vehicle(), 0, ground=flat()), FAR_AWAY, 9_000_000)
