@@ -55,6 +55,8 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     """
     path = find(path_or_name)
     document = _document(path)
+    if isinstance(document.data, dict) and "scenarios" in document.data:
+        raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "load it with scenarios.suite.load_suite, or run it with simrun")
     document = apply_overrides(document, overrides, DOING)
     own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
     if seed is not None:
@@ -114,7 +116,7 @@ def _document(path: Path) -> Document:
 
 def _default_id(path: Path) -> str:
     resolved = path.resolve()
-    if path.suffix == ".yaml":
+    if path.suffix in (".yaml", ".yml"):
         return f"{resolved.parent.name}-{resolved.stem}"
     return resolved.stem if resolved.is_file() else resolved.name
 
@@ -146,7 +148,7 @@ def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenari
     return Scenario(
         scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
         _rates(spec), start, last_us(spec), spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us),
-        _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, ()),
+        _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, scene_id),
     )  # fmt: skip
 
 
@@ -179,7 +181,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
         _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
         _rates(spec), start, end, spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
-        _hash(document, spec, (record.content_hash,)), record.notes,
+        _hash(document, spec, chosen_id, record.content_hash), record.notes,
     )  # fmt: skip
 
 
@@ -243,17 +245,18 @@ def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None
     return BackgroundFile(str(path), matrix)
 
 
-def _hash(document: Document, spec: ScenarioSpec, parts: Sequence[str]) -> str:
-    """Hash the resolved specification and the bytes of every data file it uses; where those files lie does not matter."""
-    content = spec.model_dump(mode="json")
+def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: str = "") -> str:
+    """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of every data file.
+
+    Words for people and the places where data files lie do not matter.
+    """
+    content = spec.model_dump(mode="json", exclude={"description", "tags"})
     if spec.log is not None:
         kind, _ = spec.log.source
         content["log"][kind] = "given by its content"
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
-    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
-    for part in parts:
-        digest.update(part.encode())
+    digest = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
     if spec.background is not None:
         file = document.folder_of(("background", "file")) / spec.background.file
         digest.update(hashlib.sha256(file.read_bytes()).digest())

@@ -79,6 +79,7 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
         (GOOD + "seed: -1\n", ":8:1", "seed = -1", "greater than or equal to 0"),
         (GOOD + "seed: 1.5\n", ":8:1", "seed = 1.5", "integer"),
         ("", ":1:1", "nothing", "object"),
+        ("version: 1\nscenarios: [a.yaml]\n", ":2:1", "a suite, not a scenario", "load_suite"),
         ("just words\n", ":1:1", "'just words' (text)", "object"),
     ],
 )

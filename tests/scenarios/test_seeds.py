@@ -138,6 +138,16 @@ def test_a_variation_of_an_unknown_key_names_the_variation(tmp_path: Path) -> No
     assert "did you mean 'cruise_mps'" in e.value.do_this
 
 
+def test_words_for_people_and_places_of_files_do_not_change_the_hash(tmp_path: Path) -> None:
+    plain = load_scenario(write(tmp_path))
+    assert load_scenario(write(tmp_path, "description: Something else.\ntags: [x]\n")).content_hash == plain.content_hash
+    assert load_scenario(write(tmp_path, "environment: {sky: dusk}\n")).content_hash != plain.content_hash
+    (tmp_path / "one.ply").write_bytes(b"ply")
+    (tmp_path / "two.ply").write_bytes(b"ply")
+    one = load_scenario(write(tmp_path, "background: {file: one.ply}\n"))
+    assert load_scenario(write(tmp_path, "background: {file: two.ply}\n")).content_hash == one.content_hash
+
+
 def test_hash_depends_on_the_bytes_of_data_files(tmp_path: Path) -> None:
     (tmp_path / "bg.ply").write_bytes(b"ply one")
     path = write(tmp_path, "background: {file: bg.ply}\n")
