@@ -56,7 +56,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     path = find(path_or_name)
     document = _document(path)
     if isinstance(document.data, dict) and "scenarios" in document.data:
-        raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "load it with scenarios.suite.load_suite, or run it with simrun")
+        raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "use load_suite, or run it with simrun")
     document = apply_overrides(document, overrides, DOING)
     own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
     if seed is not None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, I64, Bool
 from alpasim_plugin.world.path import Path
 
@@ -28,7 +29,16 @@ class IdmParams:
 
     @staticmethod
     def from_mapping(params: Mapping[str, float]) -> IdmParams:
-        """Read the parameters of a `Behaviour`; absent ones take their defaults."""
+        """Read the parameters of a `Behaviour`; absent ones take their defaults.
+
+        Raises:
+            InputError: A parameter that the model does not have, or one that is not positive.
+        """
+        known = IdmParams.__dataclass_fields__
+        for key, value in params.items():
+            if key not in known or not value > 0:
+                found = f"{value} is not positive" if key in known else "no such parameter"
+                raise InputError("reading a driver's behaviour", f"idm parameter {key!r}", found, f"use positive {', '.join(known)}")
         return IdmParams(**{k: float(v) for k, v in params.items()})
 
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import Box
 from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, nearest_ahead, spans
 from alpasim_plugin.world.path import polyline_path
@@ -45,6 +46,12 @@ def test_closing_in_brakes_harder_and_is_cut_off_at_what_the_vehicle_can_do() ->
 @given(st.floats(0, 40), st.floats(0.1, 200), st.floats(-20, 40), st.floats(0.5, 100))
 def test_a_larger_gap_never_brakes_harder(speed: float, gap: float, closing: float, more: float) -> None:
     assert idm_acceleration(speed, gap + more, closing, P) >= idm_acceleration(speed, gap, closing, P)
+
+
+@pytest.mark.parametrize("params", [{"headway": 1.0}, {"headway_s": 0.0}, {"accel_mps2": float("nan")}])
+def test_unknown_or_senseless_parameters_are_refused(params: dict[str, float]) -> None:
+    with pytest.raises(InputError, match="use positive desired_speed_mps, headway_s"):
+        IdmParams.from_mapping(params)
 
 
 def test_a_platoon_behind_a_stopped_car_stops_without_contact() -> None:
