@@ -3,8 +3,9 @@
 Nothing is trained here. A reconstruction from one drive is right where its cameras were and wrong elsewhere, and this module models the
 causes one by one (fact sheet on splatting, section 9): surfaces that no log camera saw are missing; depth along the log cameras' rays is
 uncertain, so Gaussians slide along those rays, with their size, and look right from the log only; some slide far and hang in the air as
-floaters; Gaussians are too large, lose view dependence and change colour; moving actors are blurred, incomplete and doubled; exposure and
-white balance wander from frame to frame.
+floaters; the log's poses are centimetres off, so the road sways; thin things such as lane paint are fitted late, so stretches of them are
+lost; Gaussians are too large, lose view dependence and change colour; moving actors are blurred, incomplete and doubled; exposure and white
+balance wander from frame to frame.
 
 Every amount is ``severity * (on + off * w)``: a small part that is there on the path (mild softness) and a part that grows with
 ``w``, 0 within ``onset_m`` of the path and 1 beyond ``full_m``. ``w`` is quantised to `STEPS` so that clouds are prepared once per step.
@@ -17,48 +18,25 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.log_views import LogView, LogViews
 from alpasim_plugin.gaussians.nodes import SceneNode
 from alpasim_plugin.gaussians.sh import C0, C1
 from alpasim_plugin.geometry import arc_lengths, interpolate, project, resample, se3
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F32, F64, Bool, Degradation, Scenario
+from alpasim_plugin.types import F32, F64, Degradation, Scenario
 
 STEPS = 8
 BEHIND_M = 6.0  # a Gaussian's log camera is the one this far before it
 KNOT_US = 400_000  # spacing of the wandering of exposure and poses
-SEEN_TOLERANCE = 0.06  # share of depth by which a Gaussian may lie behind the surface a log camera saw
-EDGE_SHARE = 0.05
+SWAY_M, SWAY_ON = 0.32, 0.35  # sideways error of the log's poses when full, and its share on the path
+THIN_M = 0.075  # Gaussians thinner than this are detail that is fitted late: lane paint, poles, rails
+LOST_ABOVE, LOST_OFF = 0.5, 0.7  # thin things are lost where a field of unit spread exceeds the first, less the second times w
 GHOST = "~ghost"
-
-
-class LogView:
-    """Depth as one log camera saw it."""
-
-    def __init__(self, camera: PinholeCamera, depth: F32, alpha: F32) -> None:
-        # The farthest surface of the neighbouring pixels: what shows beside an occluder's edge from a metre on counts as seen.
-        self.camera, self.depth, self.solid = camera, cv2.dilate(depth, np.ones((3, 3), dtype=np.uint8)), alpha > 0.5
-
-    def sees(self, points: F64, size_m: F64) -> Bool:
-        """Return which points ``(N, 3)`` of radius ``size_m (N,)`` lie in view and not behind what was seen."""
-        camera = self.camera
-        x, y, z = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).T
-        ahead = z > 0.2
-        safe = np.where(ahead, z, 1.0)
-        u = np.floor(camera.fx * x / safe + camera.cx)
-        v = np.floor(camera.fy * y / safe + camera.cy)
-        edge = EDGE_SHARE * camera.width  # a Gaussian just outside the image still shows in it
-        inside = ahead & (u >= -edge) & (u < camera.width + edge) & (v >= -edge) & (v < camera.height + edge)
-        row = np.clip(np.where(inside, v, 0), 0, camera.height - 1).astype(np.int64)
-        column = np.clip(np.where(inside, u, 0), 0, camera.width - 1).astype(np.int64)
-        limit = self.depth[row, column] * (1 + SEEN_TOLERANCE) + 0.3 + size_m
-        return np.asarray(inside & (~self.solid[row, column] | (z < limit)))
 
 
 class _Recipe(NamedTuple):
@@ -68,6 +46,7 @@ class _Recipe(NamedTuple):
     ray: F32  # (N, 3) from the log camera, metres
     shift_on: F32  # (N,) share of the ray
     shift_off: F32
+    sway: F32  # (N, 3) sideways error of the log's poses, metres at full amount
     grow_on: F32  # (N,) logarithm of the size factor
     grow_off: F32
     fade: F32  # (N,) 0..1
@@ -85,13 +64,14 @@ class Surrogate:
     """
 
     def __init__(self, scenario: Scenario, views: Sequence[LogView]) -> None:
-        self.scenario, self.views = scenario, tuple(views)
+        self.scenario, self.views = scenario, LogViews(views)
         self.amount: Degradation = scenario.degradation
         path = scenario.ego_log.xyz
         length = float(arc_lengths(path)[-1])
         camera = scenario.cameras[0].T_rig_camera[:3, 3] if scenario.cameras else np.array([1.5, 0.0, 1.5])
         self._line = resample(path, np.linspace(0.0, length, max(2, int(length) + 1))) if length > 0 else np.repeat(path[:1], 2, axis=0)
         self._eyes = self._line + np.array([0.0, 0.0, camera[2]])
+        self._sway = _sway(scenario, self._line)
         self._tree = KDTree(self._line[:, :2])
         self._reach = extended(path, scenario.ego_log.quat[0])
         self._recipes: dict[tuple[str, int], _Recipe] = {}
@@ -110,7 +90,7 @@ class Surrogate:
         kept, shift = r.cloud.take(keep), np.clip((r.shift_on + w * r.shift_off)[keep], -0.75, 1.5)[:, None]
         grow = (1 + shift) * np.exp(r.grow_on + w * r.grow_off)[keep, None]
         return GaussianCloud(
-            kept.means + r.ray[keep] * shift,
+            kept.means + r.ray[keep] * shift + (SWAY_ON + (1 - SWAY_ON) * w) * r.sway[keep],
             kept.quats,
             kept.scales * grow,
             kept.opacities * (1 - np.float32(min(s * w, 1.5)) * 0.25 * r.fade[keep]),
@@ -126,7 +106,7 @@ class Surrogate:
         rng = stream(self.scenario.scene_id, self.scenario.seed, f"degrade/{node.name}/{level}")
         draw, normal = rng.random((n, 5), dtype=np.float32), rng.standard_normal((n, 3), dtype=np.float32)
         # Depth errors: an own part per Gaussian, a part shared by a neighbourhood, and a few that slide far and become floaters.
-        ray, place = self._rays(cloud.means.astype(np.float64))
+        ray, place, sway = self._rays(cloud.means.astype(np.float64))
         smooth = _wave(place, self.scenario, "degrade/depth-field")
         own = 0.35 * normal[:, 0] + np.where(draw[:, 0] < 0.12, normal[:, 1], 0.0)
         floater = draw[:, 1] < 0.02 * min(s, 2.0)
@@ -137,7 +117,11 @@ class Surrogate:
         tint_on, tint_off = (s * (a * rgb * normal[:, 2:3] + b * blotch) for a, b in ((0.03, 0.008), (0.05, 0.022)))
         patchy = _wave(place * 0.6 + 77.0, self.scenario, "degrade/missing-field")
         missing_from = draw[:, 3] / np.maximum(s * np.clip(0.10 + 0.30 * patchy, 0.02, 0.7), 1e-9)
-        unseen = ~self._seen_by_log(cloud) & (draw[:, 2] < 0.95 * min(s, 1.0))
+        thin = np.sort(cloud.scales, axis=1)[:, 1] < THIN_M
+        lost_from = (LOST_ABOVE / s - _wave(place * 0.5, self.scenario, "degrade/thin-field") - 0.2 * normal[:, 0]) / LOST_OFF
+        missing_from = np.where(thin, np.minimum(missing_from, lost_from), missing_from)
+        seen = self.views.see(cloud.means.astype(np.float64), cloud.scales.max(axis=1).astype(np.float64))
+        unseen = ~seen & (draw[:, 2] < 0.95 * min(s, 1.0))
         keep = np.flatnonzero(~unseen)
         sh = ((np.clip(rgb + tint_on, 0, 1) - 0.5) / C0)[:, None, :].astype(np.float32)
         flat = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh)
@@ -145,6 +129,7 @@ class Surrogate:
             ray,
             shift_on,
             shift_off,
+            s * sway,
             s * (0.14 + 0.10 * draw[:, 4]),
             s * (0.25 * draw[:, 4] + 0.12) + np.where(floater, 0.6, 0.0),
             draw[:, 2],
@@ -194,24 +179,12 @@ class Surrogate:
         off = wander(self.scenario.scene_id, seed, "degrade/exposure", t_us, 4)
         return np.asarray(np.exp(s * ((0.02 + 0.07 * w) * off[0] + (0.006 + 0.022 * w) * off[1:])), dtype=np.float32)
 
-    def _rays(self, means: F64) -> tuple[F64, F64]:
-        """Return, per Gaussian, the vector from its log camera ``(N, 3)`` and its plan position in metres ``(N, 2)``."""
+    def _rays(self, means: F64) -> tuple[F64, F64, F64]:
+        """Return, per Gaussian, the vector from its log camera ``(N, 3)``, its plan position ``(N, 2)`` and its sway ``(N, 3)``, metres."""
         distance, i = self._tree.query(means[:, :2])
         back = np.round(np.maximum(BEHIND_M, 0.8 * distance)).astype(np.int64)
         eye = self._eyes[np.clip(i - back, 0, len(self._eyes) - 1)]
-        return means - eye, means[:, :2] - self._line[0, :2]
-
-    def _seen_by_log(self, cloud: GaussianCloud) -> Bool:
-        if not self.views:
-            return np.ones(len(cloud), dtype=bool)
-        seen = np.zeros(len(cloud), dtype=bool)
-        size = cloud.scales.max(axis=1).astype(np.float64)
-        for view in self.views:
-            rest = np.flatnonzero(~seen)
-            if len(rest) == 0:
-                break
-            seen[rest] = view.sees(cloud.means[rest].astype(np.float64), size[rest])
-        return seen
+        return means - eye, means[:, :2] - self._line[0, :2], self._sway[i]
 
 
 def flattened(sh: npt.NDArray[np.floating]) -> F32:
@@ -250,14 +223,28 @@ def _knot(scene_id: str, seed: int, component: str, knot: int, n: int) -> F64:
     return stream(scene_id, seed, component, knot).standard_normal(n)
 
 
-def _wave(at: F64, scenario: Scenario, component: str) -> F64:
+def _wave(at: F64, scenario: Scenario, component: str) -> F32:
     """Return a smooth random field of about unit spread at plan points ``(N, 2)``: waves of 3 to 12 m in random directions."""
     rng = stream(scenario.scene_id, scenario.seed, component)
-    total = np.zeros(len(at))
+    x, y = at.astype(np.float32).T
+    total = np.zeros(len(at), dtype=np.float32)
     for _ in range(8):
         angle, length, phase = rng.uniform(0, 2 * np.pi), rng.uniform(3.0, 12.0), rng.uniform(0, 2 * np.pi)
-        total += np.sin(2 * np.pi * (at[:, 0] * np.cos(angle) + at[:, 1] * np.sin(angle)) / length + phase)
-    return total / 2.0
+        k = 2 * np.pi / length
+        total += np.sin(np.float32(k * np.cos(angle)) * x + np.float32(k * np.sin(angle)) * y + np.float32(phase))
+    return total * np.float32(0.5)
+
+
+def _sway(scenario: Scenario, line: F64) -> F64:
+    """Return the sideways error ``(M, 3)`` of the log's poses at points 1 m apart: smooth, waves of 18 to 50 m, `SWAY_M` spread."""
+    rng = stream(scenario.scene_id, scenario.seed, "degrade/log-poses")
+    s = arc_lengths(line)
+    total = np.zeros(len(line))
+    for _ in range(6):
+        total += np.sin(2 * np.pi * s / rng.uniform(18.0, 50.0) + rng.uniform(0, 2 * np.pi))
+    d = np.gradient(line[:, :2], axis=0)
+    d /= np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
+    return np.asarray(SWAY_M / np.sqrt(3.0) * total[:, None] * np.column_stack([-d[:, 1], d[:, 0], np.zeros(len(d))]))
 
 
 def log_times(scenario: Scenario, spacing_m: float, most: int) -> list[int]:

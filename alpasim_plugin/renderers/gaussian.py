@@ -19,8 +19,9 @@ from alpasim_plugin.errors import InputError, RendererError
 from alpasim_plugin.gaussians.builder import build_scene, with_background
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.degrade import GHOST, LogView, Surrogate, log_actors, log_times
+from alpasim_plugin.gaussians.degrade import GHOST, Surrogate, log_actors, log_times
 from alpasim_plugin.gaussians.formats import read_gaussians
+from alpasim_plugin.gaussians.log_views import LogView
 from alpasim_plugin.gaussians.nodes import SceneNode
 from alpasim_plugin.gaussians.output import RasterOutput
 from alpasim_plugin.gaussians.rasterize import Backend

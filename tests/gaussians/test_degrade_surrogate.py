@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.degrade import KNOT_US, STEPS, LogView, Surrogate, extended, flattened, log_actors, log_times, wander
+from alpasim_plugin.gaussians.degrade import KNOT_US, STEPS, SWAY_M, SWAY_ON, Surrogate, extended, flattened, log_actors, log_times, wander
+from alpasim_plugin.gaussians.log_views import LogView, LogViews
 from alpasim_plugin.gaussians.nodes import Level, SceneNode
 from alpasim_plugin.gaussians.sh import dc_from_rgb, sh_colours
 from alpasim_plugin.gaussians.surfels import cloud_of, with_sheen
@@ -78,9 +79,46 @@ def test_gaussians_slide_along_the_ray_of_their_log_camera_with_their_size() -> 
     moved = s.background(node(), 0, original, 0.0)
     eye = original.means - recipe.ray
     assert np.ptp(eye[:, 1]) < 1e-3  # all log cameras are on the path
-    a, b = recipe.ray / np.linalg.norm(recipe.ray, axis=1, keepdims=True), moved.means - eye
+    a = recipe.ray / np.linalg.norm(recipe.ray, axis=1, keepdims=True)
+    b = moved.means - SWAY_ON * recipe.sway - eye
     b /= np.linalg.norm(b, axis=1, keepdims=True)
     assert np.sum(a * b, axis=1).min() > 1 - 1e-6
+
+
+def test_the_road_sways_sideways_smoothly_by_centimetres_on_the_path() -> None:
+    s = Surrogate(SCENARIO, [])
+    sway = s._sway
+    assert np.abs(sway[:, [0, 2]]).max() < 1e-6  # the path runs along x
+    assert np.abs(np.diff(sway[:, 1])).max() < 0.5 * SWAY_M
+    assert 0.3 * SWAY_M < sway[:, 1].std() < 2.0 * SWAY_M
+
+
+def test_stretches_of_thin_paint_are_lost_and_more_of_them_farther_away() -> None:
+    n = 600
+    rng = np.random.default_rng(2)
+    means = np.column_stack([np.linspace(2, 90, n), np.full(n, -3.6), np.full(n, 0.02)])
+    line = cloud_of(means, rng.normal(size=(n, 4)), np.tile([0.2, 0.06, 0.004], (n, 1)), np.full((n, 3), 0.9))
+    s = Surrogate(SCENARIO, [])
+    left = [len(s.background(node(c=line), 0, line, w)) / n for w in (0.0, 0.5, 1.0)]
+    assert 0.45 < left[0] < 0.9
+    assert left[0] > left[1] > left[2]
+    thick = cloud_of(means, rng.normal(size=(n, 4)), np.tile([0.2, 0.12, 0.004], (n, 1)), np.full((n, 3), 0.9))
+    assert len(s.background(node("m", thick), 0, thick, 0.0)) == n
+
+
+def test_all_views_at_once_agree_with_one_after_the_other() -> None:
+    rng = np.random.default_rng(3)
+    views = []
+    for i, (w, h) in enumerate(((64, 36), (40, 52), (64, 36))):
+        spec = camera_spec(w, h)
+        camera = PinholeCamera.from_pose(w, h, spec.K, se2(8.0 * i, rng.normal(), 0.2 * rng.normal()) @ spec.T_rig_camera)
+        views.append(LogView(camera, rng.uniform(3, 40, (h, w)).astype(np.float32), rng.random((h, w)).astype(np.float32)))
+    points = np.column_stack([rng.uniform(-20, 80, 5000), rng.uniform(-30, 30, 5000), rng.uniform(-1, 9, 5000)])
+    size = rng.uniform(0, 1, 5000)
+    slow = np.any([v.sees(points, size) for v in views], axis=0)
+    np.testing.assert_array_equal(LogViews(views).see(points, size), slow)
+    assert 0.02 < slow.mean() < 0.9
+    assert LogViews([]).see(points, size).all()
 
 
 def test_faults_grow_in_place_and_are_not_drawn_anew() -> None:
@@ -95,7 +133,7 @@ def test_faults_grow_in_place_and_are_not_drawn_anew() -> None:
     assert len(start) == len(original)
     assert set(far) <= set(near)  # what is missing nearer to the path is missing farther away as well
     growth = [np.linalg.norm(far[q] - start[q]) - np.linalg.norm(near[q] - start[q]) for q in far]
-    assert np.mean(np.array(growth) > 0) > 0.9
+    assert np.mean(np.array(growth) > 0) > 0.85
 
 
 def test_severity_scales_the_faults() -> None:
