@@ -38,7 +38,7 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
     ]
     if found:
         raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} due)", "; ".join(found), do)
-    net.load_state_dict({key: convert(key, tensors[key], dtype, source) for key in due}, assign=True)
+    net.load_state_dict({key: _packed(convert(key, tensors[key], dtype, source)) for key in due}, assign=True)
 
 
 def fill_random(net: nn.Module, seed: int, component: str) -> None:
@@ -50,10 +50,17 @@ def fill_random(net: nn.Module, seed: int, component: str) -> None:
     for key, value in net.state_dict().items():
         if value.ndim > 1 and not key.endswith("gamma"):
             numbers = seeding.stream("nets", seed, f"{component}/{key}").standard_normal(tuple(value.shape))
-            filled[key] = torch.from_numpy(numbers / (value[0].numel()) ** 0.5).float()
+            filled[key] = _packed(torch.from_numpy(numbers / value[0].numel() ** 0.5).float())
         else:
             filled[key] = torch.ones(value.shape) if key.endswith("gamma") else torch.zeros(value.shape)
     net.load_state_dict(filled, assign=True)
+
+
+def _packed(value: Tensor) -> Tensor:
+    """Lay a kernel out in memory as the convolutions read it: input channels innermost, taps outermost; shape and values unchanged."""
+    if value.ndim == 4:
+        return value.contiguous(memory_format=torch.channels_last)
+    return value.permute(2, 0, 3, 4, 1).contiguous().permute(1, 4, 0, 2, 3) if value.ndim == 5 else value
 
 
 def _describe(key: str, value: Tensor, due: tuple[int, ...]) -> str:

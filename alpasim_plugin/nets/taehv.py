@@ -62,23 +62,23 @@ class MemoryBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         convs = [FrameConv(inputs, width) for inputs in (2 * width, width, width)]
-        self.conv = nn.ModuleList([convs[0], nn.ReLU(), convs[1], nn.ReLU(), convs[2]])
+        self.conv = nn.ModuleList([convs[0], nn.ReLU(inplace=True), convs[1], nn.ReLU(inplace=True), convs[2]])
 
     def next(self, x: Tensor, carry: Carry) -> Tensor:
         """Map ``(B, T, H, W, C)`` to the same shape; before the first frame is a zero one."""
-        before = carry.shift(x)
-        return (run(self.conv, torch.cat([x, before], dim=-1), carry) + x).relu()
+        out = run(self.conv, torch.cat([x, carry.shift(x)], dim=-1), carry)
+        return out.add_(x).relu_()
 
 
 def decoder_layers(latent: int, widths: Sequence[int]) -> nn.ModuleList:
     """Return the decoder's layers under their checkpoint positions 0 to 22."""
-    layers: list[nn.Module] = [SoftClamp(), FrameConv(latent, widths[0]), nn.ReLU()]
+    layers: list[nn.Module] = [SoftClamp(), FrameConv(latent, widths[0]), nn.ReLU(inplace=True)]
     for inputs, outputs, growth in zip(widths[:-1], widths[1:], GROWTH, strict=True):
         layers += [MemoryBlock(inputs) for _ in range(3)]
         # The original repeats pixels at the first of these positions; growing acts on each pixel alone, so repeating after it is the same
         # at a quarter of the work.
         layers += [nn.Identity(), Grow(inputs, growth), DoublingConv(inputs, outputs, bias=False)]
-    return nn.ModuleList([*layers, nn.ReLU(), FrameConv(widths[-1], COLOURS)])
+    return nn.ModuleList([*layers, nn.ReLU(inplace=True), FrameConv(widths[-1], COLOURS)])
 
 
 class TinyDecoder(nn.Module):

@@ -1,0 +1,249 @@
+"""A causal video autoencoder for CPUs: 4x8x8 compression to 16 channels, as the Wan autoencoder, at a small part of its work.
+
+What makes it fast: 2D convolutions only, with one frame of memory; none above a quarter of the resolution (pixels are folded into
+channels); the encoder and half of the decoder run once per latent, not once per frame; channels last throughout.
+
+What makes it faithful from the start: around the networks runs a fixed transform (`CosineTransform`). The latent is 16 cosine components of
+each 4x8x8 group plus what the encoder adds; the picture is their synthesis plus what the decoder adds. Untrained, both additions are zero
+and the round trip is a blurred copy.
+
+The decoder may see the render's own frames. With P the projection on the components, s the synthesised picture, r the render and a its
+opacity, it starts from
+
+    s + g (1 - P) a (r - s),
+
+the latent's picture with the detail of the render where the render is opaque; the gate g (a number a pixel, 1 when untrained) and an
+additive correction are learned. If the latent is the render's own, untrained decoding returns an opaque render exactly.
+
+Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times; decoding it gives one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.carry import Carry, State, Stream, in_passes
+from alpasim_plugin.nets.checkpoints import load_weights, save_weights, unwrap
+from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
+from alpasim_plugin.nets.codec_weights import fill_random, load_checked
+from alpasim_plugin.nets.frame_layers import from_layers, halves_to_frames, split_last, to_layers
+from alpasim_plugin.nets.latent_stats import LatentStats
+from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinyEncoder, TinyPainter, TinySizes
+from alpasim_plugin.nets.tiny_vae_transform import COLOURS, CosineTransform, from_grid, to_grid
+
+DOING = "loading tiny VAE weights"
+DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
+
+
+class TinyVAE(nn.Module):
+    """Encode video to latents of about unit variance and back, on a CPU in a few milliseconds a frame.
+
+    ``latents_per_pass`` (1; None for all) is how many latents are made at once: it bounds memory and changes results by rounding only.
+
+    Example:
+        >>> vae = TinyVAE.random()
+        >>> video = torch.zeros(1, 3, 5, 16, 24)
+        >>> z = vae.encode(video)
+        >>> tuple(z.shape), tuple(vae.decode(z).shape), tuple(vae.decode(z, render=video).shape)
+        ((1, 16, 2, 2, 3), (1, 3, 5, 16, 24), (1, 3, 5, 16, 24))
+    """
+
+    def __init__(self, sizes: TinySizes = TinySizes()) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.encoder = TinyEncoder(sizes)
+        self.decoder = TinyPainter(sizes)
+        self.stats = LatentStats([0.0] * LATENT, [1.0] * LATENT, stored=True)
+        self.transform = CosineTransform()
+        self.latents_per_pass: int | None = 1
+        self.eval()
+
+    @classmethod
+    def random(cls, sizes: TinySizes = TinySizes(), seed: int = 0) -> Self:
+        """Build an untrained, trainable network whose round trip is the cosine transform's blurred copy."""
+        vae = cls(sizes)
+        for name, part in (("encoder", vae.encoder), ("decoder", vae.decoder)):
+            fill_random(part, seed, f"tiny_vae.{name}")
+            nn.init.zeros_(part.head.weight)
+        return vae
+
+    @classmethod
+    def from_state_dict(cls, sd: Mapping[str, Tensor], *, dtype: torch.dtype = torch.float32, source: str = "a state dict") -> Self:
+        """Build the network that ``sd`` holds, at whatever widths it has, frozen.
+
+        Raises:
+            InputError: Missing, unexpected, mis-shaped or transposed keys.
+        """
+        tensors = unwrap(sd, source)
+        sizes = TinySizes.read(tensors, DOING, source, DO)
+        with torch.device("meta"):
+            vae = cls(sizes)
+        load_checked(vae, tensors, dtype, DOING, source, DO)
+        vae.transform = CosineTransform()
+        vae.requires_grad_(False)
+        return vae
+
+    @classmethod
+    def load(cls, path: str | Path, *, dtype: torch.dtype = torch.float32) -> Self:
+        """Read a safetensors file.
+
+        Raises:
+            InputError: No such file, not safetensors, or other keys.
+        """
+        return cls.from_state_dict(load_weights(path), dtype=dtype, source=str(path))
+
+    def save(self, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
+        """Write a safetensors file, whole or not at all."""
+        save_weights(path, self.state_dict(), metadata)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the weights, and of every result."""
+        return self.encoder.stem.weight.dtype
+
+    def encode(self, video: Tensor) -> Tensor:
+        """Encode a whole clip.
+
+        Args:
+            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` brings any clip there).
+
+        Returns:
+            ``(B, 16, 1 + k, H/8, W/8)``, normalised.
+
+        Raises:
+            InputError: Another shape.
+        """
+        return self.encode_next(video, None)[0]
+
+    def decode(self, z: Tensor, *, render: Tensor | None = None, opacity: Tensor | None = None, clamp: bool = True) -> Tensor:
+        """Decode a whole clip.
+
+        Args:
+            z: ``(B, 16, t, h, w)``, normalised.
+            render: ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1]: frames whose detail may be used, or None.
+            opacity: ``(B, 1, ...)`` of the render's size, 0 to 1: where the render shows something; None is everywhere.
+            clamp: Whether to cut the result to [-1, 1].
+
+        Returns:
+            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)``.
+
+        Raises:
+            InputError: Another shape.
+        """
+        return self.decode_next(z, None, render=render, opacity=opacity, clamp=clamp)[0]
+
+    def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
+        """Encode the next frames of a stream; a pure function, with the same rules as `WanVAE.encode_next`."""
+        check_frames(frames, "encoding video frames with the tiny VAE", first=state is None)
+        ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
+        return in_passes(partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends)
+
+    def decode_next(
+        self,
+        z: Tensor,
+        state: State | None,
+        *,
+        render: Tensor | None = None,
+        opacity: Tensor | None = None,
+        clamp: bool = True,
+        detach: bool = False,
+    ) -> tuple[Tensor, State]:
+        """Decode the next latents of a stream; a pure function, with the same rules as `WanVAE.decode_next`.
+
+        Args:
+            z: ``(B, 16, m, h, w)``, any m.
+            state: What the call before returned, None at the start of the video.
+            render, opacity: See `decode`; as many frames as are returned.
+            clamp: Whether to cut the result to [-1, 1].
+            detach: Whether to cut gradients after every pass.
+
+        Returns:
+            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for the next call.
+
+        Raises:
+            InputError: Another shape, or an opacity without a render.
+        """
+        check_latents(z, "decoding latents with the tiny VAE", LATENT)
+        b, _, m, h, w = z.shape
+        frames = GROUP * m - (DROPPED if state is None else 0)
+        _check_seen(render, opacity, (b, frames, h * SIDE, w * SIDE))
+        latent_ends, frame_ends = pass_ends(m, self.latents_per_pass), group_ends(frames, state is None, self.latents_per_pass)
+        parts, start, first = [], 0, 0
+        for end, last in zip(latent_ends, frame_ends, strict=True):
+            seen = [None if x is None else x[:, :, first:last].to(self.dtype) for x in (render, opacity)]
+            part, state = self._decode_pass(z[:, :, start:end].to(self.dtype), seen[0], seen[1], state, detach)
+            parts.append(part)
+            start, first = end, last
+        assert state is not None
+        video = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
+        return video.clamp(-1, 1) if clamp else video, state
+
+    def encoder_stream(self, *, detach: bool = True) -> Stream:
+        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
+        return Stream(partial(self.encode_next, detach=detach))
+
+    def decoder_stream(self, *, detach: bool = True) -> Stream:
+        """Start a stream: ``push(latents, render=...) -> frames`` as `decode_next`; its ``state`` is all it holds."""
+        return Stream(partial(self.decode_next, detach=detach))
+
+    def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
+        carry = Carry(state, detach)
+        grid = to_grid(_whole_groups(frames, carry.first))
+        mu = self.transform.analyse(grid) + self.encoder.next(grid, carry)
+        return self.stats.normalise(from_layers(mu)), carry.state
+
+    def _decode_pass(
+        self, z: Tensor, render: Tensor | None, opacity: Tensor | None, state: State | None, detach: bool
+    ) -> tuple[Tensor, State]:
+        carry = Carry(state, detach)
+        mu = to_layers(self.stats.denormalise(z))
+        grid = self.transform.synthesise(mu)
+        skipped = DROPPED if carry.first else 0
+
+        def as_frames(x: Tensor) -> Tensor:
+            return halves_to_frames(x, GROUP)[:, skipped:]
+
+        frames = as_frames(grid)
+        if render is None:
+            correction, _ = self.decoder.next(mu, None, carry)
+            return from_grid(frames + correction), carry.state
+        shown, cover = to_grid(_whole_groups(render, carry.first)), None
+        difference = shown - grid
+        if opacity is not None:
+            cover = to_grid(_whole_groups(opacity, carry.first))
+            shown, difference = (_per_pixel(x, cover) for x in (shown, difference))
+        seen = as_frames(shown), None if cover is None else as_frames(cover)
+        correction, gate = self.decoder.next(mu, seen, carry)
+        assert gate is not None
+        return from_grid(frames + correction + _per_pixel(as_frames(self.transform.residue(difference)), gate)), carry.state
+
+
+def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:
+    """Multiply ``(..., n * 3)`` by one number a pixel ``(..., n)``."""
+    return (split_last(colours, factor.shape[-1]) * factor[..., None]).flatten(-2)
+
+
+def _whole_groups(frames: Tensor, first: bool) -> Tensor:
+    """Put three copies of the video's first frame before it, so that the first latent has a group of four as well."""
+    return torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2) if first else frames
+
+
+def _check_seen(render: Tensor | None, opacity: Tensor | None, due: tuple[int, int, int, int]) -> None:
+    b, *size = due
+    for name, given, channels in (("render", render, COLOURS), ("opacity", opacity, 1)):
+        if given is not None and tuple(given.shape) != (b, channels, *size):
+            raise InputError(
+                "decoding latents with the tiny VAE",
+                f"a {name} of shape {list(given.shape)}",
+                f"these latents decode to {[b, channels, *size]}",
+                f"give the {name} of exactly the frames that come out",
+            )
+    if render is None and opacity is not None:
+        raise InputError("decoding latents with the tiny VAE", "an opacity", "no render with it", "give both, or the render alone")
