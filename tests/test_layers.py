@@ -16,6 +16,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.gaussians": set(),
     "scenarios": {"alpasim_plugin.world"},
     "alpasim_plugin.renderers": {"alpasim_plugin.gaussians", "alpasim_plugin.world"},
+    "alpasim_plugin.nets": set(),
+    "alpasim_plugin.fixers": {"alpasim_plugin.gaussians", "alpasim_plugin.nets", "alpasim_plugin.world"},
     "alpasim_plugin.control": set(),
     "policies": set(),
     "alpasim_plugin.alpasim": set(),

@@ -8,6 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.plan import Cell, RunOptions
@@ -30,6 +32,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[
     """
     folder = root / cell.folder
     began = time.perf_counter()
+    cv2.setNumThreads(1)  # its pool is outside the thread budget, and frames are too small to gain from it
     manifest: dict[str, Any] = {
         "renderer": cell.renderer,
         "policy": cell.policy,
