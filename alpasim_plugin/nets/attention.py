@@ -151,8 +151,14 @@ class CrossAttention(nn.Module):
         return self.k_norm(k), v
 
     def forward(self, x: Tensor, keys_values: tuple[Tensor, Tensor]) -> Tensor:
-        """Attend from ``x (B, T, N, width)`` to the text."""
-        q = self.q_norm(self.q_proj(x.flatten(1, 2)).unflatten(-1, (-1, self.head_width)))
+        """Attend from ``x (B, T, N, width)`` to the text.
+
+        With a single text token the softmax is one whatever the query, so the token's value is the answer for every query.
+        """
         k, v = (part.expand(x.shape[0], *part.shape[1:]) for part in keys_values)
+        if k.shape[1] == 1:
+            alone: Tensor = self.output_proj(v.flatten(2))
+            return alone[:, :, None].expand(x.shape)
+        q = self.q_norm(self.q_proj(x.flatten(1, 2)).unflatten(-1, (-1, self.head_width)))
         out: Tensor = self.output_proj(attend(q, k, v))
         return out.view(x.shape)

@@ -6,6 +6,7 @@ Precision: by default tensors come back as they are stored; ``dtype`` converts t
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import pickle
 from collections.abc import Mapping
@@ -48,8 +49,9 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         do = "download the file again or correct the expected digest"
         raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
     with path.open("rb") as file:
-        head = file.read(4)
-    if head.startswith(ZIP_MAGIC) or head.startswith(PICKLE_MAGIC):
+        head = file.read(9)
+    # A safetensors file is a length of 8 bytes and a JSON object; that length may itself begin like a pickle.
+    if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path, device)
     else:
         try:
@@ -149,10 +151,12 @@ def _is_bookkeeping(key: str) -> bool:
 
 def _load_pickle(path: Path, device: str) -> object:
     try:
-        return torch.load(path, map_location=device, weights_only=True)
+        # As an open file, for torch would choose its reader by the suffix. Byte buffers hold transformer-engine states, which are dropped.
+        with path.open("rb") as file, torch.serialization.safe_globals([io.BytesIO]):
+            return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
-        reason = str(error).split("WeightsUnpickler error:")[-1].strip().splitlines()
-        found = f"a pickle that holds more than tensors ({reason[0] if reason else 'unknown content'}); loading it could run code"
+        reason = str(error).split("WeightsUnpickler error:")[-1].strip().split(". ")[0].split("\n")[0]
+        found = f"a pickle that holds more than tensors ({reason}); loading it could run code"
         raise InputError("reading network weights", str(path), found, "save the tensors alone, best as safetensors") from error
     except (RuntimeError, EOFError, OSError) as error:
         found = f"a truncated or damaged torch file: {str(error).splitlines()[0]}"

@@ -50,7 +50,7 @@ class CosmosCausalDiT(nn.Module):
         time_rounding: ``torch.bfloat16`` rounds time steps as the original's training code does; float32 leaves them exact.
 
     Attributes:
-        checkpoint_blocks: Recompute blocks in the backward pass of whole clips, to save memory.
+        checkpoint_blocks: Recompute blocks in the backward pass to save memory; whole clips only, for a cache has moved on by then.
         folded_t: The one time step that this network is good for, when it came from `folded`.
     """
 
@@ -153,7 +153,7 @@ class CosmosCausalDiT(nn.Module):
         look = functools.partial(
             block_causal_attention, tokens=rows * columns, block_latents=block_latents or frames, window=window, sink=sink
         )
-        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: look)
+        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: look, self.checkpoint_blocks)
 
     def step(
         self,
@@ -248,6 +248,7 @@ class CosmosCausalDiT(nn.Module):
         padding_mask: Tensor | None,
         table: RopeTable,
         look: Callable[[int], Attend],
+        recompute: bool = False,
     ) -> Tensor:
         time = self._time(t)
         text = text if isinstance(text, TextContext) else self.encode_text(text)
@@ -255,8 +256,7 @@ class CosmosCausalDiT(nn.Module):
         tokens = tokens + self.additional_patch_embedding.linear.part(hdmap.to(self.dtype))
         for layer, block in enumerate(self.blocks):
             args = (tokens, time, text.keys_values[layer], table, look(layer))
-            recompute = self.checkpoint_blocks and torch.is_grad_enabled()
-            tokens = checkpoint(block, *args, use_reentrant=False) if recompute else block(*args)
+            tokens = checkpoint(block, *args, use_reentrant=False) if recompute and torch.is_grad_enabled() else block(*args)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal | None:

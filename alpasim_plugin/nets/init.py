@@ -15,8 +15,8 @@ CUT = 3.0  # standard deviations
 def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:
     """Draw a state dict.
 
-    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations; norm gains are one, the bias is zero, and so is
-    the final layer's second modulation (the original's initialisation).
+    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations; norm gains are one, the bias is zero, and
+    so is the final layer's second modulation (the original's initialisation).
 
     Args:
         sizes: The network.

@@ -64,15 +64,17 @@ class BlockCache(ABC):
     def begin(self, latents: int) -> RopeTable:
         """Open the block at the current position, or open it again, and return the rotation of its tokens.
 
-        The returned tensors keep their storage from block to block of one length.
+        In a rolling cache the returned tensors keep their storage from block to block of one length.
         """
         self.open_latents = latents
         at, table = self._tables.get(latents, (-1, None))
-        if table is None:
-            table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
-        elif at != self.position:
-            for kept, fresh in zip(table, self.rope.table(self.position, latents, self.rows, self.columns, self.device), strict=True):
-                kept.copy_(fresh)
+        if table is None or at != self.position:
+            fresh = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
+            if table is None or self.keeps_graph:  # gradients of earlier blocks still need their own rotation
+                table = fresh
+            else:
+                for kept, new in zip(table, fresh, strict=True):
+                    kept.copy_(new)
         self._tables[latents] = (self.position, table)
         return table
 
@@ -209,11 +211,10 @@ class GraphCache(BlockCache):
         self._open = {}
         super().commit()
 
-    def detach(self, keep_latents: int = 0) -> None:
-        """Cut the gradients of all kept latents but the newest ``keep_latents``."""
+    def detach(self) -> None:
+        """Cut the gradients of everything kept so far: blocks that follow send none beyond this point."""
         for layer, kept in self._kept.items():
-            cut = max(0, len(kept) - keep_latents)
-            self._kept[layer] = [(k.detach(), v.detach()) for k, v in kept[:cut]] + kept[cut:]
+            self._kept[layer] = [(k.detach(), v.detach()) for k, v in kept]
 
     def history(self, layer: int) -> tuple[Tensor, Tensor]:
         """Return a layer's kept keys and values, oldest first."""

@@ -6,6 +6,8 @@ positions. `Float32Linear` keeps the first two there even under autocast or afte
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -22,7 +24,8 @@ class Float32Linear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """Map ``(..., inputs)`` to ``(..., outputs)`` float32."""
-        with torch.autocast(input.device.type, enabled=False):
+        kind = input.device.type
+        with torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext():
             return F.linear(input.float(), self.weight.float())
 
 

@@ -65,7 +65,8 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
     count = int(unknown.sum())
     if count and nan_as is None:
         found = f"{count} of {opacity.numel()} values are NaN"
-        raise InputError(doing, "opacity", found, "repair the renderer, or name the value to take with nan_as (0 leaves those places to the network)")
+        do = "repair the renderer, or name the value to take with nan_as (0 leaves those places to the network)"
+        raise InputError(doing, "opacity", found, do)
     if count:
         opacity = opacity.masked_fill(unknown, nan_as if nan_as is not None else 0.0)
     low, high = float(opacity.min()), float(opacity.max())
@@ -120,21 +121,21 @@ def sample_block(
 ) -> Tensor:
     """Make one block of clean latents and write it into the history.
 
-    Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not Euler).
-    What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents, slightly
+    Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not
+    Euler). What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents, slightly
     noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less).
 
     Args:
         net: The network; folded copies serve when ``schedule`` has their one step.
-        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each return to noise between steps, then the noise of
-            the cache write. Each ``(B, C, T, H, W)``.
+        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each return to noise between steps (mixed again
+            with fresh noise, or noise), then the noise of the cache write. Each ``(B, C, T, H, W)``.
         text: Prompt, best as a `TextContext`.
         hdmap: ``(B, map_channels, T, H, W)``.
         cache: This rollout's history.
         schedule: Noise levels, the first with sigma 1; see `schedule.steps`.
         history: What the cache keeps.
-        given: ``(B, C, n, H, W)`` clean latents that are known for the first n of the block: they replace the input before every forward, the
-            cache write included, and the prediction after it.
+        given: ``(B, C, n, H, W)`` clean latents that are known for the first n of the block: they replace the input before every forward,
+            the cache write included, and the prediction after it.
         finalise_net: Network for the cache write, when ``net`` is folded for another time step.
 
     Returns:

@@ -1,8 +1,8 @@
 """The noise schedule: which time steps a sampler visits and how much noise each stands for.
 
-With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network is told ``1000 sigma``. A *named* step, as in
-"1000, 750, 500, 250", is ``1000 u`` and so passes through the shift. The cache write at 128 does not: it is the time told to the network as it
-stands, and its noise level is that of the nearest entry in the table (0.12993).
+With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network is told ``1000 sigma``. A *named*
+step, as in "1000, 750, 500, 250", is ``1000 u`` and so passes through the shift. The cache write at 128 does not: it is the time told to
+the network as it stands, and its noise level is that of the nearest entry in the table (0.12993).
 
 Source: OmniDreams' flow-matching scheduler and self-forcing sampler.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -79,6 +80,6 @@ def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:
     Raises:
         InputError: An empty or not strictly falling list, or a step out of range.
     """
-    if not names or any(b >= a for a, b in zip(names, names[1:], strict=False)):
+    if not names or any(b >= a for a, b in pairwise(names)):
         raise InputError("choosing denoising steps", "named steps", str(list(names)), "give at least one step, strictly falling from 1000")
     return tuple(named(step) for step in names)
