@@ -11,7 +11,7 @@ import numpy as np
 from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, U8, CameraSpec, Frame, Observation, Plan, Route, Scenario, SensorSpec
+from alpasim_plugin.types import F64, CameraSpec, Frame, Observation, Plan, Route, Scenario, SensorSpec
 from policies.base import POLICIES, plan_times, seconds
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
@@ -21,8 +21,10 @@ from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_fo
 from policies.paths import curve_speeds, follow
 from policies.pure_pursuit import has_route, route_points
 
+NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it
 MIN_CRUISE_MPS = 8.0
 MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
+DOUBTFUL_M, DOUBTFUL_PAINT_M = 1.2, 3.0
 LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
 OTHER_LANE = 0.55  # the route asks for the next lane when it lies this share of a width off the centre
 OTHER_LANE_FRAMES = 5
@@ -71,6 +73,8 @@ class LaneCamera:
     def reset(self, seed: int, route: Route) -> None:
         """Forget everything of the drive before."""
         self.seed, self.step = seed, 0
+        error_m = NAVIGATION_SIGMA_M * float(stream(self.scene_id, seed, "policy/navigation").normal())
+        self.navigation_error_m = float(np.clip(error_m, -NAVIGATION_LIMIT_M, NAVIGATION_LIMIT_M))
         self.noise: F64 | None = None  # the samples' errors, which last for seconds
         self.acted_us = 0
         self.cruise_mps: float | None = None
@@ -88,7 +92,7 @@ class LaneCamera:
             PolicyError: The observation has no frame of the camera, or one of another size.
         """
         frame = self._frame(observation)
-        route = route_points(observation.route_rig) if has_route(observation.route_rig) else None
+        route = self._navigation(route_points(observation.route_rig)) if has_route(observation.route_rig) else None
         speed = observation.ego.speed_mps
         if self.cruise_mps is None:
             self.cruise_mps = max(speed, MIN_CRUISE_MPS)
@@ -116,6 +120,12 @@ class LaneCamera:
         debug = self._debug(lane, route, blended)
         return Plan(observation.t_us, times, chosen[:, :2].copy(), chosen[:, 2].copy(), tuple(others), debug)
 
+    def _navigation(self, route: F64) -> F64:
+        """Return the route ``(M, 2)`` as the car's navigation has it: beside the true one by an error that lasts the whole drive."""
+        step = np.gradient(route, axis=0)
+        normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+        return np.asarray(route + self.navigation_error_m * normal)
+
     def _frame(self, observation: Observation) -> Frame:
         frame = observation.frames.get(self.camera.name)
         expected = (self.camera.height, self.camera.width, 3)
@@ -136,21 +146,23 @@ class LaneCamera:
             self.lane = _moved(self.lane, self.seen_pose, pose)
         self.seen_us, self.seen_pose = frame.t_us, pose
         ground = self.grid.warp(frame.rgb)
+        lab = cv2.cvtColor(ground, cv2.COLOR_RGB2LAB)
+        not_road = None if self.road is None else anomaly(lab, self.road, self.grid)
+        points, crosswalk = find_paint(ground, self.grid, self.ridges, not_road)
         there = None if route is None else _points_in(route, pose_now, pose)
-        self._look_for_lane(ground, there, speed)
+        self._look_for_lane(points, there, speed)
         path = blend(self.lane, there, speed).path
         centre_y = np.interp(self.grid.x_m, *_increasing(path.xy))
-        lab = cv2.cvtColor(ground, cv2.COLOR_RGB2LAB)
+        foot = None
+        if not_road is not None:
+            not_road[crosswalk] = 0
+            reach = min(OBSTACLE_RANGE_M, _range_of(path.xy))
+            foot = find_foot(not_road, self.grid, centre_y, float(self.grid.x_m[0]), reach)
+        self.obstacle = track_obstacle(self.obstacle, foot, speed, dt_s, float(self.grid.x_m[0]))
         free_m = self.obstacle.distance_m if self.obstacle is not None else np.inf
         self.road = learn_road(self.road, lab, self.grid, centre_y, free_m)
-        foot = None
-        if self.road is not None:
-            reach = min(OBSTACLE_RANGE_M, _range_of(path.xy))
-            foot = find_foot(anomaly(lab, self.road, self.grid), self.grid, centre_y, float(self.grid.x_m[0]), reach)
-        self.obstacle = track_obstacle(self.obstacle, foot, speed, dt_s, float(self.grid.x_m[0]))
 
-    def _look_for_lane(self, ground: U8, route: F64 | None, speed: float) -> None:
-        points = find_paint(ground, self.grid, self.ridges)
+    def _look_for_lane(self, points: PaintPoints, route: F64 | None, speed: float) -> None:
         row_m = np.interp(points.x_m, self.grid.x_m, self.grid.row_m)
         guess = guess_from_route(np.array([[0.0, 0.0], [20.0, 0.0]]) if route is None else route)
         if self.lane is not None:
@@ -161,6 +173,8 @@ class LaneCamera:
             self.lane = search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm)
             if self.lane is not None:
                 self.lane = update(self.lane, points, row_m)
+                if self._is_lost(self.lane, guess if route is not None else None):
+                    self.lane = None
         if self.lane is not None and route is not None:
             self.lane = self._choose_lane(self.lane, route, points, row_m, speed)
 
@@ -186,13 +200,17 @@ class LaneCamera:
 
     def _is_lost(self, lane: LaneState, route: RouteGuess | None) -> bool:
         if route is not None:
-            at = 5.0
+            at = 6.0
             turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(np.array([at]))[0])
             if abs(turn) > TURN_OFF_RAD:
                 return True
+            # Beside the route a lane must be well seen, on both sides: one line may be anything.
+            beside_m = route.offset_m + at * route.heading_rad + at**2 / 2 * route.curvature_1pm - float(lane.centre(np.array([at]))[0])
+            if abs(beside_m) > DOUBTFUL_M and min(lane.left_m, lane.right_m) < DOUBTFUL_PAINT_M:
+                return True
         sigma = float(lane.sigma(np.array([5.0]))[0])
         heading, width = float(lane.mean[1]), float(lane.mean[4])
-        return sigma > LOST_SIGMA_M or lane.blind_m > LOST_BLIND_M or abs(heading) > MAX_HEADING_RAD or not 2.2 < width < 5.5
+        return sigma > LOST_SIGMA_M or lane.blind_m > LOST_BLIND_M or abs(heading) > MAX_HEADING_RAD or not 2.4 < width < 4.8
 
     def _obstacle_now(self, observation: Observation) -> ObstacleTrack | None:
         """Return the confirmed thing ahead, moved from the frame's time to now."""

@@ -15,6 +15,9 @@ PAINT_WIDTH_M = 0.15
 MIN_CONTRAST = 7.0  # grey levels
 NOISE_FACTOR = 4.0
 BAR_M = (0.4, 2.3)  # how far bars of a crosswalk stand from the next and the next but one
+SIDE_NOT_ROAD = 0.8
+BAR_HALF_M = 0.45
+CROSSWALK_M = 2.5  # wider than a car, whose lights and plate are bright spots in a row as well
 MERGE_M = 0.3  # ridges closer than this are one line (both strokes of a double line)
 
 
@@ -51,6 +54,8 @@ class RidgeFilter:
             return start + a, start + b, (1.0 / np.maximum(b - a, 1)).astype(np.float32)
 
         self._windows = window(-half, half), window(-gap - flank, -gap), window(gap, gap + flank)
+        beside = np.maximum(np.rint(flank / 2), 1.0)
+        self._beside = window(-gap - beside, -gap), window(gap, gap + beside)
         self._seen = _erode_rows(grid.inside, gap + flank)
 
     def response(self, value: F32) -> F32:
@@ -60,9 +65,24 @@ class RidgeFilter:
         centre, left, right = ((np.take(total, b) - np.take(total, a)) * scale for a, b, scale in self._windows)
         return np.asarray(np.where(self._seen, np.maximum(centre - np.maximum(left, right), 0.0), 0.0), dtype=np.float32)
 
+    def worse_side(self, value: U8, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> F32:
+        """Return the larger mean ``(N,)`` of a map ``(R, C)`` over the near halves of the two flanks of cells."""
+        total = np.zeros((value.shape[0], value.shape[1] + 1), dtype=np.float32)
+        np.cumsum(value, axis=1, dtype=np.float32, out=total[:, 1:])
+        flat = total.reshape(-1)
+        left, right = ((flat[b[rows, columns]] - flat[a[rows, columns]]) * scale[rows, columns] for a, b, scale in self._beside)
+        return np.asarray(np.maximum(left, right))
 
-def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter) -> PaintPoints:
-    """Return the ridge points of a warped frame ``(R, C, 3)``: local maxima of the response above each row's noise."""
+
+def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 | None = None) -> tuple[PaintPoints, Bool]:
+    """Return the points of lines in a warped frame ``(R, C, 3)``, and the cells ``(R, C)`` that bars of a crosswalk cover.
+
+    Where it is known what does not look like the road, 0..255 in ``not_road`` (R, C), a line must have road on both sides: kerbs and the
+    edges of cars have it on one.
+
+    Points are local maxima of the ridge response above each row's noise. A row of three and more that stand closer than any lane is wide
+    are bars and no lines; they are taken for a crosswalk where they are at least four and reach further than a car is wide.
+    """
     response = ridges.response(brightness(ground))
     # Paint is long and noise is not: average over three rows before looking for maxima.
     smooth = cv2.blur(response, (1, 3))
@@ -79,9 +99,13 @@ def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter) -> PaintPoints
     shift = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
     y = np.asarray(grid.y_m[cols] - shift * CELL_M)
     strength = here / threshold[rows]
-    line = ~_is_bar(rows, y)
+    bar = _is_bar(rows, y)
+    crosswalk = _cells_around(rows[bar], cols[bar], y[bar], smooth.shape)
+    line = ~bar
+    if not_road is not None:
+        line &= ridges.worse_side(not_road, rows, cols) < 255 * SIDE_NOT_ROAD
     rows = rows[line]
-    return PaintPoints(grid.x_m[rows], y[line], strength[line], np.hypot(0.05, 0.5 * grid.pixel_m[rows]))
+    return PaintPoints(grid.x_m[rows], y[line], strength[line], np.hypot(0.05, 0.5 * grid.pixel_m[rows])), crosswalk
 
 
 def _is_bar(rows: npt.NDArray[np.intp], y: F64) -> Bool:
@@ -89,6 +113,20 @@ def _is_bar(rows: npt.NDArray[np.intp], y: F64) -> Bool:
     apart = np.abs(y[:, None] - y[None, :])
     beside = (rows[:, None] == rows[None, :]) & (apart > BAR_M[0]) & (apart < BAR_M[1])
     return np.asarray(beside.sum(axis=1) >= 2)
+
+
+def _cells_around(rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], y: F64, shape: tuple[int, ...]) -> Bool:
+    """Return the cells ``(R, C)`` within `BAR_HALF_M` of bars, on rows where they make a crosswalk."""
+    mask = np.zeros(shape, dtype=np.uint8)
+    if len(rows):
+        count = np.bincount(rows, minlength=shape[0])
+        high, low = np.full(shape[0], -np.inf), np.full(shape[0], np.inf)
+        np.maximum.at(high, rows, y)
+        np.minimum.at(low, rows, y)
+        wide = (count >= 4) & (high - low > CROSSWALK_M)
+        mask[rows[wide[rows]], columns[wide[rows]]] = 1
+        mask = np.asarray(cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8)))
+    return np.asarray(mask > 0)
 
 
 def _windows(grid: GroundGrid) -> tuple[F64, F64, F64]:

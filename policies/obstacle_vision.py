@@ -17,14 +17,14 @@ from alpasim_plugin.types import F64, U8
 from policies.ground_grid import CELL_M, GroundGrid
 
 STRIPS = 4
-CORRIDOR_HALF_M = 0.95  # half the ego's width: what stands outside can be passed
+CORRIDOR_HALF_M = 1.05  # half the ego's width: what stands outside can be passed
 TALL = 0.8  # how high to look, as a share of the camera's height
-LOW = 0.45  # the least that is asked where a curve ends the look
-LEAVE_LANE_M = 1.4
+LOW = 0.25  # the least that is asked where a curve ends the look
+LEAVE_LANE_M = 1.9
 NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
 ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
 LEARN = 0.1
-FILLED, FILLED_TOP, CLEAR = 0.7, 0.5, 0.35
+FILLED, FILLED_TOP, CLEAR = 0.7, 0.4, 0.35
 
 
 @dataclass(frozen=True)

@@ -93,14 +93,16 @@ def test_bars_of_a_crosswalk_are_not_taken_for_lines() -> None:
     for y in (1.75, -1.75):
         c = round(float(GRID.column_of(np.array(y))))
         ground[:, c - 1 : c + 2] = 220
-    plain = find_paint(ground, GRID, RIDGES)
+    plain, none = find_paint(ground, GRID, RIDGES)
     rows = (GRID.x_m > 9.0) & (GRID.x_m < 12.0)
     for y in np.arange(-4.0, 4.0, 1.0):
         c = round(float(GRID.column_of(np.array(y))))
         ground[np.ix_(rows, range(c - 5, c + 5))] = 220
-    with_bars = find_paint(ground, GRID, RIDGES)
+    with_bars, crosswalk = find_paint(ground, GRID, RIDGES)
     inside = (with_bars.x_m > 9.1) & (with_bars.x_m < 11.9)
     assert len(plain.x_m) > 60
+    assert not none.any()
+    assert crosswalk[np.ix_(np.flatnonzero(rows)[1:-1], range(120, 200))].mean() > 0.6
     assert inside.sum() <= 2
     assert (~inside).sum() > 0.8 * np.sum((plain.x_m < 9.1) | (plain.x_m > 11.9))
 
