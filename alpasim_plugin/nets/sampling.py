@@ -122,13 +122,13 @@ def sample_block(
     """Make one block of clean latents and write it into the history.
 
     Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not
-    Euler). What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents, slightly
-    noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less).
+    Euler). What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents,
+    slightly noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less).
 
     Args:
         net: The network; folded copies serve when ``schedule`` has their one step.
-        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each return to noise between steps (mixed again
-            with fresh noise, or noise), then the noise of the cache write. Each ``(B, C, T, H, W)``.
+        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each return to noise between steps (mixed
+            again with fresh noise, or noise), then the noise of the cache write. Each ``(B, C, T, H, W)``.
         text: Prompt, best as a `TextContext`.
         hdmap: ``(B, map_channels, T, H, W)``.
         cache: This rollout's history.
