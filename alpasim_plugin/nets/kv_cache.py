@@ -79,7 +79,14 @@ class BlockCache(ABC):
         return table
 
     def commit(self) -> None:
-        """Keep the keys and values of the last forward and move on by its block."""
+        """Keep the keys and values of the last forward and move on by its block.
+
+        Raises:
+            InputError: When no forward has been made since the last commit or reset.
+        """
+        if not self.open_latents:
+            do = "run the block first, with write=False to look before it is kept"
+            raise InputError("keeping a block in a cache", f"latent {self.position}", "no forward to keep", do)
         self.position += self.open_latents
         self.filled += self.open_latents
         self.open_latents = 0

@@ -118,6 +118,7 @@ def sample_block(
     history: History = "finalise",
     given: Tensor | None = None,
     finalise_net: BlockNet | None = None,
+    commit: bool = True,
 ) -> Tensor:
     """Make one block of clean latents and write it into the history.
 
@@ -137,6 +138,8 @@ def sample_block(
         given: ``(B, C, n, H, W)`` clean latents that are known for the first n of the block: they replace the input before every forward,
             the cache write included, and the prediction after it.
         finalise_net: Network for the cache write, when ``net`` is folded for another time step.
+        commit: False leaves the block open: run it again (for example once its true poses are known), or keep it as it is with
+            ``cache.commit()``, which costs nothing.
 
     Returns:
         ``(B, C, T, H, W)`` clean latents.
@@ -157,12 +160,12 @@ def sample_block(
     z = sources[0]
     for i, level in enumerate(schedule):
         last = i == len(schedule) - 1
-        v = net.step(fixed(z), level.t, text, hdmap, cache, last and history == "last-forward", mask)
+        v = net.step(fixed(z), level.t, text, hdmap, cache, commit and last and history == "last-forward", mask)
         z_0 = fixed(flow_step(z, v, level.sigma))
         if not last:
             z = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
     if history == "finalise":
         level = context_level()
         noised = interpolant(z_0, sources[-1], level.sigma)
-        (finalise_net or net).step(fixed(noised), level.t, text, hdmap, cache, True, mask)
+        (finalise_net or net).step(fixed(noised), level.t, text, hdmap, cache, commit, mask)
     return z_0

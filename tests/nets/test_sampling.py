@@ -133,6 +133,23 @@ def test_one_step_is_equation_two_and_folding_changes_nothing():
     assert furthest(two.history(1)[0], three.history(1)[0]) < 1e-5
 
 
+@pytest.mark.parametrize("history", ["finalise", "last-forward"])
+def test_block_left_open_can_be_guessed_again_and_then_kept_for_nothing(history):
+    net, (z_1, _, text, hdmap) = network(), clip(2)
+    eps = noise(*z_1.shape)
+    sources = [z_1, eps][: sources_needed(steps(1), history)]
+    kept, guessed = net.new_cache(1, 4, 6, window=4), net.new_cache(1, 4, 6, window=4)
+    for _ in range(4):
+        truth = sample_block(net, sources, text, hdmap, kept, steps(1), history)
+        sample_block(net, sources, text, hdmap + 1, guessed, steps(1), history, commit=False)
+        assert torch.equal(sample_block(net, sources, text, hdmap, guessed, steps(1), history, commit=False), truth)
+        guessed.commit()
+    assert guessed.position == kept.position == 8
+    assert torch.equal(guessed.keys, kept.keys)
+    with pytest.raises(InputError, match=r"latent 8[\s\S]*no forward to keep"):
+        guessed.commit()
+
+
 def test_given_latents_pass_through_untouched():
     net, (z_1, _, text, hdmap) = network(), clip(2)
     given = noise(1, 4, 1, 4, 6, seed=9)
