@@ -150,6 +150,7 @@ def test_folded_copy_does_not_follow_its_original():
     assert torch.equal(folded(x, 1000.0, text, hdmap), before)
 
 
+@pytest.mark.filterwarnings("ignore")
 def test_int8_linears_leave_the_islands_alone():
     x, t, text, hdmap = clip(4, WIDE)
     net = network(WIDE)
