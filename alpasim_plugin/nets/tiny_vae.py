@@ -60,7 +60,7 @@ class TinyVAE(nn.Module):
         self.sizes = sizes
         self.encoder = TinyEncoder(sizes)
         self.decoder = TinyPainter(sizes)
-        self.stats = LatentStats([0.0] * LATENT, [1.0] * LATENT, stored=True)
+        self.stats = _untrained_stats()
         self.transform = CosineTransform()
         self.latents_per_pass: int | None = 1
         self.eval()
@@ -68,10 +68,12 @@ class TinyVAE(nn.Module):
     @classmethod
     def random(cls, sizes: TinySizes = TinySizes(), seed: int = 0) -> Self:
         """Build an untrained, trainable network whose round trip is the cosine transform's blurred copy."""
-        vae = cls(sizes)
+        with torch.device("meta"):  # layers draw their own initial values from the global generator otherwise
+            vae = cls(sizes)
         for name, part in (("encoder", vae.encoder), ("decoder", vae.decoder)):
             fill_random(part, seed, f"tiny_vae.{name}")
             nn.init.zeros_(part.head.weight)
+        vae.stats, vae.transform = _untrained_stats(), CosineTransform()
         return vae
 
     @classmethod
@@ -223,6 +225,10 @@ class TinyVAE(nn.Module):
         correction, gate = self.decoder.next(mu, seen, carry)
         assert gate is not None
         return from_grid(frames + correction + _per_pixel(as_frames(self.transform.residue(difference)), gate)), carry.state
+
+
+def _untrained_stats() -> LatentStats:
+    return LatentStats([0.0] * LATENT, [1.0] * LATENT, stored=True)
 
 
 def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:

@@ -56,6 +56,19 @@ class TinySizes:
         return cls(**{field.name: tensors[keys[field.name]].numel() for field in fields(cls)})
 
 
+def bend(x: Tensor) -> Tensor:
+    """Apply a leaky ReLU to ``x`` itself; units that die under a plain one do not come back in a network this small."""
+    return nn.functional.leaky_relu_(x, 0.1)
+
+
+class Bend(nn.Module):
+    """`bend` as a layer; only after layers that make a new tensor."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map any shape to the same."""
+        return bend(x)
+
+
 class Memory(nn.Module):
     """Two convolutions over a frame and the one before it, added to the frame."""
 
@@ -66,9 +79,8 @@ class Memory(nn.Module):
 
     def next(self, x: Tensor, carry: Carry) -> Tensor:
         """Map ``(B, T, H, W, C)`` to the same shape; before the first frame is a zero one."""
-        inner: Tensor = self.first(torch.cat([x, carry.shift(x)], dim=-1)).relu_()
-        out: Tensor = self.last(inner)
-        return out.add_(x).relu_()
+        out: Tensor = self.last(bend(self.first(torch.cat([x, carry.shift(x)], dim=-1))))
+        return bend(out.add_(x))
 
 
 class Fold(nn.Conv2d):
@@ -111,7 +123,7 @@ class TinyEncoder(nn.Module):
 
     def next(self, grid: Tensor, carry: Carry) -> Tensor:
         """Map ``(B, t, H/4, W/4, 192)`` to ``(B, t, H/8, W/8, 16)``."""
-        return run((self.stem, nn.ReLU(inplace=True), self.near, self.fold, nn.ReLU(inplace=True), *self.far, self.head), grid, carry)
+        return run((self.stem, Bend(), self.near, self.fold, Bend(), *self.far, self.head), grid, carry)
 
 
 class TinyPainter(nn.Module):
@@ -143,12 +155,12 @@ class TinyPainter(nn.Module):
             What to add to the frames, ``(B, T, H/4, W/4, 48)``, and the gate of the render's detail ``(B, T, H/4, W/4, 16)`` if it is seen;
             T is 4t, or 4t - 3 at the start of a video.
         """
-        latent_rate = (self.stem, nn.ReLU(inplace=True), *self.far, self.quarter, nn.ReLU(inplace=True), self.near, self.grow)
+        latent_rate = (self.stem, Bend(), *self.far, self.quarter, Bend(), self.near, self.grow)
         x = halves_to_frames(run(latent_rate, z, carry), GROUP)[:, DROPPED if carry.first else 0 :]
         if seen is not None:
             covered = self.see_opacity.weight.sum(1) if seen[1] is None else self.see_opacity(seen[1])
             x = x + self.see_colour(seen[0]) + covered
-        x = self.mix.next(x.relu_(), carry)
+        x = self.mix.next(bend(x), carry)
         if seen is None:
             assert self.head.bias is not None
             return conv_frames(x, self.head.weight[:PIXELS], self.head.bias[:PIXELS], padding=1), None

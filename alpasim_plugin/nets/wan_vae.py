@@ -76,7 +76,7 @@ class WanVAE(nn.Module):
     once: it bounds memory and changes results by rounding only.
 
     Example:
-        >>> vae = WanVAE.random(WanLayout(3, 16, 8, (8, 16, 32, 32), (32, 16, 16, 8), (32, 32, 16, 8)))
+        >>> vae = WanVAE.random(WanLayout.of_base(8))
         >>> z = vae.encode(torch.zeros(1, 3, 5, 16, 24))
         >>> tuple(z.shape), tuple(vae.decode(z).shape)
         ((1, 16, 2, 2, 3), (1, 3, 5, 16, 24))

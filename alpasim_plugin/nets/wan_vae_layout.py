@@ -39,6 +39,17 @@ class WanLayout:
     decoder_in: tuple[int, ...]
     decoder_out: tuple[int, ...]
 
+    @classmethod
+    def of_base(cls, base: int, latent: int = 16) -> WanLayout:
+        """Return the published proportions: base 96 is the Wan 2.1 autoencoder, 24 is LightVAE.
+
+        Example:
+            >>> WanLayout.of_base(96).encoder
+            (96, 192, 384, 384)
+        """
+        one, two, four = base, 2 * base, 4 * base
+        return cls(3, latent, one, (one, two, four, four), (four, two, two, one), (four, four, two, one))
+
 
 def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLayout:
     """Read the widths off vectors (biases and norm gains), which a transposed matrix cannot falsify.

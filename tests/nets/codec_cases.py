@@ -1,0 +1,34 @@
+"""Networks and clips shared by the tests of the video codecs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from alpasim_plugin import seeding
+from alpasim_plugin.nets.wan_vae_layout import WanLayout
+
+SMALL = WanLayout.of_base(8)
+UNEVEN = WanLayout(colours=3, latent=16, stem=4, encoder=(8, 12, 20, 24), decoder_in=(28, 12, 8, 6), decoder_out=(20, 16, 10, 4))
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    """Return standard normal numbers, the same every time."""
+    return torch.from_numpy(seeding.stream("tests", seed, f"codec{shape}").standard_normal(shape)).float()
+
+
+def clip(frames: int, height: int, width: int, batch: int = 1, seed: int = 0) -> Tensor:
+    """Return a random video in [-1, 1]."""
+    return noise(batch, 3, frames, height, width, seed=seed).tanh()
+
+
+def golden(shared_data: Path, stem: str) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
+    """Return weights, inputs and outputs, and settings of one network's golden tensors."""
+    folder = shared_data / "golden-nets"
+    config = json.loads((folder / f"{stem}.config.json").read_text())
+    return load_file(folder / f"{stem}.weights.safetensors"), load_file(folder / f"{stem}.io.safetensors"), config
