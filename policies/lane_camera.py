@@ -15,10 +15,10 @@ from alpasim_plugin.types import F64, CameraSpec, Frame, Observation, Plan, Rout
 from policies.base import POLICIES, plan_times, seconds
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
-from policies.lane_plan import Blend, RouteGuess, blend, cruise, guess_from_route, progress_behind, sampled, wander
+from policies.lane_plan import NOISE_SPEED, Blend, RouteGuess, blend, guess_from_route, progress_behind, sampled, spread_m, wander
 from policies.lane_vision import PaintPoints, RidgeFilter, find_paint
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
-from policies.paths import curve_speeds, follow
+from policies.paths import beside, curve_speeds, follow
 from policies.pure_pursuit import has_route, route_points
 
 NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it
@@ -104,7 +104,7 @@ class LaneCamera:
         random = stream(self.scene_id, self.seed, "policy", self.step)
         self.noise = wander(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
         self.step, self.acted_us = self.step + 1, observation.t_us
-        wanted_mps = cruise(self.cruise_mps, self.noise)
+        wanted_mps = self.cruise_mps * (1.0 + NOISE_SPEED * float(self.noise[0, 1]))
         times = plan_times(observation.t_us)
         progress = progress_behind(
             speed,
@@ -114,11 +114,12 @@ class LaneCamera:
             self.bumper_m,
             wanted_mps,
         )
-        xy, yaw = follow(blended.path, progress, max(speed, 0.0))
         doubt_m = 0.0 if lane is None else float(lane.sigma(np.array([DOUBT_AT_M]))[0])
-        chosen, *others = sampled(xy, yaw, self.noise, doubt_m)
+        sigma_m = spread_m(doubt_m)
+        xy, yaw = follow(beside(blended.path, sigma_m * float(self.noise[0, 0])), progress, max(speed, 0.0))
+        others = sampled(xy, yaw, self.noise, sigma_m)[1:]
         debug = self._debug(lane, route, blended)
-        return Plan(observation.t_us, times, chosen[:, :2].copy(), chosen[:, 2].copy(), tuple(others), debug)
+        return Plan(observation.t_us, times, xy, yaw, tuple(others), debug)
 
     def _navigation(self, route: F64) -> F64:
         """Return the route ``(M, 2)`` as the car's navigation has it: beside the true one by an error that lasts the whole drive."""
@@ -187,8 +188,8 @@ class LaneCamera:
         at = np.array([max(CHOOSE_AT_M, CHOOSE_AT_S * speed)])
         beside_m = float((np.interp(at, x, y) - lane.centre(at))[0])
         turn = float(np.arctan2(np.interp(at + 2, x, y) - np.interp(at - 2, x, y), 4.0)[0] - np.arctan(lane.slope(at))[0])
-        beside = abs(beside_m) > OTHER_LANE * lane.mean[4] and abs(turn) < SAME_HEADING_RAD and x[-1] > at[0] + 2
-        self.other_lane_frames = self.other_lane_frames + 1 if beside else 0
+        runs_beside = abs(beside_m) > OTHER_LANE * lane.mean[4] and abs(turn) < SAME_HEADING_RAD and x[-1] > at[0] + 2
+        self.other_lane_frames = self.other_lane_frames + 1 if runs_beside else 0
         if self.other_lane_frames < OTHER_LANE_FRAMES:
             return lane
         self.other_lane_frames = 0

@@ -139,31 +139,34 @@ def wander(before: F64 | None, dt_s: float, random: np.random.Generator) -> F64:
     return np.asarray(keep * before + np.sqrt(1 - keep**2) * fresh)
 
 
-def cruise(speed_mps: float, noise: F64) -> float:
-    """Return the speed that the first sample wants to cruise at."""
-    return speed_mps * (1.0 + NOISE_SPEED * float(noise[0, 1]))
+def spread_m(doubt_m: float) -> float:
+    """Return the standard deviation of the samples to the side: what is seen badly is also driven badly.
+
+    Args:
+        doubt_m: Standard deviation of the lane's centre.
+    """
+    return min(float(np.hypot(NOISE_LATERAL_M, doubt_m)), MAX_NOISE_M)
 
 
-def sampled(xy: F64, yaw: F64, noise: F64, doubt_m: float) -> list[F64]:
-    """Return `N_SAMPLES` noisy versions ``(T, 3)`` of a plan: shifted to a side over the first metres, and faster or slower.
+def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
+    """Return `N_SAMPLES` versions ``(T, 3)`` of a plan; the first is the plan, which was made with the first sample's errors.
 
-    Each has one lateral shift and one speed factor, so it is as drivable as the plan itself. The first sample's speed is in the plan
-    already (see `cruise`), the others differ from it.
+    The others differ from it as their errors do: shifted to a side over the first metres, and drifting ahead or back over the horizon, so
+    that each is as drivable as the plan itself.
 
     Args:
         xy: ``(T, 2)`` the plan.
         yaw: ``(T,)`` its headings.
         noise: ``(N_SAMPLES, 2)`` from `wander`.
-        doubt_m: Standard deviation of the lane's centre: what is seen badly is also driven badly.
+        sigma_m: From `spread_m`.
     """
     s = arc_lengths(xy)
     ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
     ramp_slope = np.where(s < NOISE_RAMP_M, 6 * ramp * (1 - ramp) / NOISE_RAMP_M, 0.0)
     ramp = ramp * ramp * (3 - 2 * ramp)
-    sigma_m = min(float(np.hypot(NOISE_LATERAL_M, doubt_m)), MAX_NOISE_M)
-    out = []
-    ahead = np.linspace(0.0, 1.0, len(s))  # the speed drifts apart over the horizon; it does not jump
-    for lateral, faster in zip(noise[:, 0], noise[:, 1] - noise[0, 1], strict=True):
+    ahead = np.linspace(0.0, 1.0, len(s))
+    out = [np.column_stack([xy, yaw])]
+    for lateral, faster in noise[1:] - noise[0]:
         shift_m = sigma_m * float(lateral)
         shifted = xy + shift_m * ramp[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
         line = np.column_stack([shifted, yaw + np.arctan(shift_m * ramp_slope)])

@@ -54,6 +54,13 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
     return Path(xy, np.gradient(smooth, Path.SPACING_M))
 
 
+def beside(path: Path, left_m: float) -> Path:
+    """Return the path shifted to the left."""
+    step = np.gradient(path.xy, axis=0)
+    normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
+    return Path(path.xy + left_m * normal, path.curvature)
+
+
 def curve_speeds(path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral_mps2: float = MAX_LATERAL_MPS2) -> F64:
     """Return the speed limit ``(N,)`` along the path: comfort in curves, reached with a comfortable brake."""
     curve = np.sqrt(lateral_mps2 / np.maximum(np.abs(path.curvature), 1e-4))
