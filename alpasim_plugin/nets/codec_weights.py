@@ -20,7 +20,7 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
     Args:
         net: Its state dict names every key and shape that is due.
         tensors: Half, single or double precision, also mixed.
-        dtype: Precision of the network.
+        dtype: Precision of the network's parameters; its constants are float32.
         doing, source, do: For the message.
 
     Raises:
@@ -38,7 +38,9 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
     ]
     if found:
         raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} due)", "; ".join(found), do)
-    net.load_state_dict({key: _packed(convert(key, tensors[key], dtype, source)) for key in due}, assign=True)
+    constants = {key for key, _ in net.named_buffers()}
+    precision = {key: torch.float32 if key in constants else dtype for key in due}
+    net.load_state_dict({key: _packed(convert(key, tensors[key], precision[key], source)) for key in due}, assign=True)
 
 
 def fill_random(net: nn.Module, seed: int, component: str) -> None:

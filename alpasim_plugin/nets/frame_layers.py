@@ -5,8 +5,8 @@ Channels last: norms and 1x1 convolutions act on contiguous vectors, a frame is 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Iterable
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 import torch.nn.functional as F
@@ -63,6 +63,19 @@ def deconv_frames(x: Tensor, weight: Tensor, stride: int) -> Tensor:
     b, t = x.shape[:2]
     out = F.conv_transpose2d(x.flatten(0, 1).permute(0, 3, 1, 2), weight, stride=stride).permute(0, 2, 3, 1)
     return out.reshape(b, t, *out.shape[1:])
+
+
+class Float32Buffers(nn.Module):
+    """A module whose constants stay float32, and exact, when the network around it changes precision (``net.to(torch.bfloat16)``)."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        before = dict(self._buffers)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        for name, old in before.items():
+            new = self._buffers[name]
+            if old is not None and new is not None and new.dtype != old.dtype:
+                self._buffers[name] = old.to(new.device)
+        return self
 
 
 class FrameConv(nn.Conv2d):

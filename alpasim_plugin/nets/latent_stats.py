@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.frame_layers import Float32Buffers
 
 WAN_MEAN = (
     -0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508,
@@ -23,7 +24,7 @@ WAN_STD = (
 )  # fmt: skip
 
 
-class LatentStats(nn.Module):
+class LatentStats(Float32Buffers):
     """Normalise and de-normalise latents; the numbers stay float32 whatever the precision of the latents.
 
     Args:
@@ -62,4 +63,4 @@ class LatentStats(nn.Module):
 
     def _broadcast(self, z: Tensor) -> tuple[Tensor, Tensor]:
         shape = (1, -1) + (1,) * (z.ndim - 2)
-        return self.mean.float().view(shape), self.std.float().view(shape)
+        return self.mean.view(shape), self.std.view(shape)

@@ -107,7 +107,7 @@ class TinyVAE(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Precision of the weights, and of every result."""
+        """Precision of the learned parts and of every result; the fixed transform always works in float32."""
         return self.encoder.stem.weight.dtype
 
     def encode(self, video: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ class TinyVAE(nn.Module):
         """Encode the next frames of a stream; a pure function, with the same rules as `WanVAE.encode_next`."""
         check_frames(frames, "encoding video frames with the tiny VAE", first=state is None)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
-        return in_passes(partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends)
+        return in_passes(partial(self._encode_pass, detach=detach), frames.float(), state, ends)
 
     def decode_next(
         self,
@@ -179,8 +179,8 @@ class TinyVAE(nn.Module):
         latent_ends, frame_ends = pass_ends(m, self.latents_per_pass), group_ends(frames, state is None, self.latents_per_pass)
         parts, start, first = [], 0, 0
         for end, last in zip(latent_ends, frame_ends, strict=True):
-            seen = [None if x is None else x[:, :, first:last].to(self.dtype) for x in (render, opacity)]
-            part, state = self._decode_pass(z[:, :, start:end].to(self.dtype), seen[0], seen[1], state, detach)
+            seen = [None if x is None else x[:, :, first:last].float() for x in (render, opacity)]
+            part, state = self._decode_pass(z[:, :, start:end].float(), seen[0], seen[1], state, detach)
             parts.append(part)
             start, first = end, last
         assert state is not None
@@ -198,8 +198,8 @@ class TinyVAE(nn.Module):
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
         carry = Carry(state, detach)
         grid = to_grid(_whole_groups(frames, carry.first))
-        mu = self.transform.analyse(grid) + self.encoder.next(grid, carry)
-        return self.stats.normalise(from_layers(mu)), carry.state
+        mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), carry)
+        return self.stats.normalise(from_layers(mu)).to(self.dtype), carry.state
 
     def _decode_pass(
         self, z: Tensor, render: Tensor | None, opacity: Tensor | None, state: State | None, detach: bool
@@ -214,17 +214,18 @@ class TinyVAE(nn.Module):
 
         frames = as_frames(grid)
         if render is None:
-            correction, _ = self.decoder.next(mu, None, carry)
-            return from_grid(frames + correction), carry.state
+            correction, _ = self.decoder.next(mu.to(self.dtype), None, carry)
+            return from_grid(frames + correction).to(self.dtype), carry.state
         shown, cover = to_grid(_whole_groups(render, carry.first)), None
         difference = shown - grid
         if opacity is not None:
             cover = to_grid(_whole_groups(opacity, carry.first))
             shown, difference = (_per_pixel(x, cover) for x in (shown, difference))
-        seen = as_frames(shown), None if cover is None else as_frames(cover)
-        correction, gate = self.decoder.next(mu, seen, carry)
+        seen = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
+        correction, gate = self.decoder.next(mu.to(self.dtype), seen, carry)
         assert gate is not None
-        return from_grid(frames + correction + _per_pixel(as_frames(self.transform.residue(difference)), gate)), carry.state
+        detail = _per_pixel(as_frames(self.transform.residue(difference)), gate)
+        return from_grid(frames + correction + detail).to(self.dtype), carry.state
 
 
 def _untrained_stats() -> LatentStats:

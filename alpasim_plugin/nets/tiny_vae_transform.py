@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from alpasim_plugin.nets.clips import GROUP, SIDE
-from alpasim_plugin.nets.frame_layers import conv_frames, deconv_frames
+from alpasim_plugin.nets.frame_layers import Float32Buffers, conv_frames, deconv_frames
 
 COLOURS = 3
 QUARTER = 4  # pixels of a grid cell's side
@@ -43,10 +43,11 @@ def from_grid(grid: Tensor) -> Tensor:
     return cells.permute(0, 6, 1, 2, 4, 3, 5).reshape(b, depth // CELL, frames, rows * QUARTER, columns * QUARTER)
 
 
-class CosineTransform(nn.Module):
+class CosineTransform(Float32Buffers):
     """Analyse grids of 4 frames into the 16 components of every 8x8 square, and synthesise them back.
 
-    Both directions are one convolution with the same fixed orthonormal kernel, computed in code and not stored in weights.
+    Both directions are one convolution with the same fixed orthonormal kernel, computed in code and not stored in weights. Everything here
+    is float32: half precision would cost a grey level.
     """
 
     kernel: Tensor
@@ -61,21 +62,21 @@ class CosineTransform(nn.Module):
 
     def analyse(self, grid: Tensor) -> Tensor:
         """Map ``(B, t, H/4, W/4, 192)`` to normalised components ``(B, t, H/8, W/8, 16)``."""
-        return (self._coefficients(grid) - self.mean.to(grid.dtype)) / self.std.to(grid.dtype)
+        return (self._coefficients(grid) - self.mean) / self.std
 
     def synthesise(self, components: Tensor) -> Tensor:
         """Map normalised components back to ``(B, t, H/4, W/4, 192)``."""
-        return self._sum(components * self.std.to(components.dtype) + self.mean.to(components.dtype))
+        return self._sum(components * self.std + self.mean)
 
     def residue(self, grid: Tensor) -> Tensor:
         """Return what the components leave of ``(B, t, H/4, W/4, 192)``: the detail that a latent alone cannot carry."""
         return grid - self._sum(self._coefficients(grid))
 
     def _coefficients(self, grid: Tensor) -> Tensor:
-        return conv_frames(grid, self.kernel.to(grid.dtype), None, stride=SIDE // QUARTER)
+        return conv_frames(grid, self.kernel, None, stride=SIDE // QUARTER)
 
     def _sum(self, coefficients: Tensor) -> Tensor:
-        return deconv_frames(coefficients, self.kernel.to(coefficients.dtype), stride=SIDE // QUARTER)
+        return deconv_frames(coefficients, self.kernel, stride=SIDE // QUARTER)
 
 
 def _kernel() -> Tensor:

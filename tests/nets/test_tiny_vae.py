@@ -217,6 +217,11 @@ def test_untrained_round_trip_keeps_black_black_and_white_white(value: float) ->
     torch.testing.assert_close(untrained.decode(untrained.encode(video)), video, atol=1e-5, rtol=0)
 
 
+def test_bfloat16_returns_an_opaque_render_within_half_a_grey_level() -> None:
+    half, video = TinyVAE.random(SIZES).to(torch.bfloat16), clip(5, 16, 24)
+    assert (half.decode(half.encode(video), render=video).float() - video).abs().max() < 1 / 255
+
+
 def test_a_render_of_another_length_is_refused(vae: TinyVAE) -> None:
     with pytest.raises(InputError, match=r"these latents decode to \[1, 3, 5, 16, 16\]"):
         vae.decode(noise(1, 16, 2, 2, 2), render=clip(8, 16, 16))
@@ -224,8 +229,14 @@ def test_a_render_of_another_length_is_refused(vae: TinyVAE) -> None:
         vae.decode(noise(1, 16, 1, 2, 2), opacity=torch.ones(1, 1, 1, 16, 16))
 
 
-def test_running_in_bfloat16_stays_close(vae: TinyVAE) -> None:
-    half = TinyVAE.from_state_dict(vae.state_dict(), dtype=torch.bfloat16)
+@pytest.mark.parametrize("way", ["loaded", "converted"])
+def test_running_in_bfloat16_stays_close_and_keeps_constants_exact(vae: TinyVAE, way: str) -> None:
+    if way == "loaded":
+        half = TinyVAE.from_state_dict(vae.state_dict(), dtype=torch.bfloat16)
+    else:
+        half = TinyVAE.from_state_dict(vae.state_dict()).to(torch.bfloat16)
+    assert torch.equal(half.stats.mean, vae.stats.mean)
+    assert torch.equal(half.transform.kernel, vae.transform.kernel)
     video = clip(5, 16, 16)
     out = half.decode(half.encode(video), render=video)
     assert out.dtype == torch.bfloat16
