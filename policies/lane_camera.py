@@ -18,7 +18,7 @@ from policies.lane_filter import LaneState, predict, search, shift, update
 from policies.lane_plan import NOISE_SPEED, Blend, RouteGuess, blend, guess_from_route, progress_behind, sampled, spread_m, wander
 from policies.lane_vision import PaintPoints, RidgeFilter, find_paint
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
-from policies.paths import beside, curve_speeds, follow
+from policies.paths import beside, curve_speeds, follow, smooth_line
 from policies.pure_pursuit import has_route, route_points
 
 NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it
@@ -92,7 +92,7 @@ class LaneCamera:
             PolicyError: The observation has no frame of the camera, or one of another size.
         """
         frame = self._frame(observation)
-        route = self._navigation(route_points(observation.route_rig)) if has_route(observation.route_rig) else None
+        route = self._navigation(smooth_line(route_points(observation.route_rig))) if has_route(observation.route_rig) else None
         speed = observation.ego.speed_mps
         if self.cruise_mps is None:
             self.cruise_mps = max(speed, MIN_CRUISE_MPS)

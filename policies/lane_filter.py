@@ -17,6 +17,8 @@ from policies.lane_vision import PaintPoints
 
 OFFSET, HEADING, CURVATURE, BEND, WIDTH = range(5)
 MEAN_WIDTH_M = 3.5
+WIDTH_MEMORY_M = 40.0  # a border that is not seen is assumed at the mean width again after some such lengths
+ONE_SIDED_M = 1.0
 START_SIGMA = np.array([0.3, 0.05, 0.02, 1e-3, 0.3])
 # Standard deviations per square root of a metre driven: how fast roads change.
 DRIFT_PER_SQRT_M = np.array([0.03, 0.01, 0.004, 4e-4, 0.03])
@@ -75,6 +77,7 @@ def predict(lane: LaneState, forward_m: float, left_m: float, turn_rad: float) -
     mean = transition @ lane.mean
     mean[OFFSET] -= left_m
     mean[HEADING] -= turn_rad
+    mean[WIDTH] = MEAN_WIDTH_M + (mean[WIDTH] - MEAN_WIDTH_M) * np.exp(-abs(d) / WIDTH_MEMORY_M)
     noise = DRIFT_PER_SQRT_M**2 * abs(d) + np.array([0.003, 0.0005, 0, 0, 0]) ** 2
     cov = transition @ lane.cov @ transition.T + np.diag(noise)
     return replace(
@@ -165,7 +168,12 @@ def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float,
     i, j = np.unravel_index(int(np.argmax(score)), score.shape)
     if left[i, j] + right[i, j] < 3.0 or abs(centres[i] - offset_m) > 2.0:
         return None
-    return start(float(centres[i]), float(shapes[best, 0]), float(shapes[best, 1]), float(widths[j]))
+    centre, width = float(centres[i]), float(widths[j])
+    if min(left[i, j], right[i, j]) < ONE_SIDED_M:
+        # One border says nothing about the width: a usual one, measured from the border that is seen.
+        side = 1.0 if left[i, j] > right[i, j] else -1.0
+        centre, width = centre + side * (width - MEAN_WIDTH_M) / 2, MEAN_WIDTH_M
+    return start(centre, float(shapes[best, 0]), float(shapes[best, 1]), width)
 
 
 def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:

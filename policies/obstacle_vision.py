@@ -19,12 +19,12 @@ from policies.ground_grid import CELL_M, GroundGrid
 STRIPS = 4
 CORRIDOR_HALF_M = 1.05  # half the ego's width: what stands outside can be passed
 TALL = 0.8  # how high to look, as a share of the camera's height
-LOW = 0.25  # the least that is asked where a curve ends the look
-LEAVE_LANE_M = 1.9
+LOW = 0.35  # the least that is asked where a curve ends the look
+LEAVE_LANE_M = 2.6
 NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
 ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
 LEARN = 0.1
-FILLED, FILLED_TOP, CLEAR = 0.7, 0.4, 0.35
+FILLED, FILLED_TOP, CLEAR = 0.7, 0.55, 0.35
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
 
     The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear and what lies behind it on the
     camera's line of sight is filled, up to where a thing of `TALL` times the camera's height would hide the ground: a crosswalk does
-    not reach that far, so the furthest third must be filled as well. In a curve the line of sight leaves the lane, and what is seen
+    not reach that far, so the furthest quarter must be filled as well. In a curve the line of sight leaves the lane, and what is seen
     there says nothing; such a row must be filled by something wider than the bars of a crosswalk, and it is no candidate where even
     a thing of `LOW` could not be told.
 
@@ -97,27 +97,29 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     narrow, wide = (_sums_along_sight(cv2.morphologyEx(value, cv2.MORPH_OPEN, _bar(width)), grid) for width in (NARROW_M, WIDE_M))
     full = np.searchsorted(distance, distance / (1 - TALL))
     least = np.searchsorted(distance, distance / (1 - LOW))
-    # The line of sight through the path at row i, and where it has left the path at a later row k.
-    sight = (centre_y[:, None] - grid.camera_y) * (distance[None, :] / distance[:, None]) + grid.camera_y
-    left_lane = (np.abs(sight - centre_y[None, :]) > LEAVE_LANE_M) & (rows[None, :] > rows[:, None])
-    last = np.minimum(full, np.where(left_lane.any(axis=1), np.argmax(left_lane, axis=1), len(rows)))
-    short = last < full
-    usable = (grid.x_m >= min_x_m) & (grid.x_m <= max_x_m) & (last >= np.minimum(least, len(rows))) & (last - rows >= 3)
-    front = np.searchsorted(distance, 0.82 * distance)
+    # Where the line of sight through each strip at row i leaves the lane, at a later row k: in a curve, and to the sides.
     edges = np.linspace(CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1)
-    u = np.rint(grid.sight_column((centre_y[:, None] + edges[None, :]), rows)).astype(np.intp)
+    middle = centre_y[:, None] + 0.5 * (edges[1:] + edges[:-1]) - grid.camera_y
+    sight = middle[:, :, None] * (distance[None, None, :] / distance[:, None, None]) + grid.camera_y
+    has_left = (np.abs(sight - centre_y) > LEAVE_LANE_M) & (rows > rows[:, None, None])
+    last = np.minimum(full[:, None], np.where(has_left.any(axis=2), np.argmax(has_left, axis=2), len(rows)))
+    candidate = ((grid.x_m >= min_x_m) & (grid.x_m <= max_x_m))[:, None]
+    usable = candidate & (last >= np.minimum(least, len(rows))[:, None]) & (last - rows[:, None] >= 3)
+    u = np.rint(grid.sight_column(centre_y[:, None] + edges[None, :], rows)).astype(np.intp)
     u = np.clip(u, 0, narrow.shape[1] - 1)
-    filled = np.where(short[:, None], _box_mean(wide, rows, last, u), _box_mean(narrow, rows, last, u))
-    clear = _box_mean(narrow, front, np.maximum(rows - 1, front), u)
-    top = last - np.maximum((last - rows) // 3, 1)
-    up_to_top = _box_mean(narrow, top, last, u)
-    hit = (filled > FILLED) & (up_to_top > FILLED_TOP) & (clear < CLEAR) & usable[:, None]
+    begin = np.broadcast_to(rows[:, None], last.shape)
+    filled = np.where(last < full[:, None], _box_mean(wide, begin, last, u), _box_mean(narrow, begin, last, u))
+    front = np.broadcast_to(np.searchsorted(distance, 0.82 * distance)[:, None], last.shape)
+    clear = _box_mean(narrow, front, np.maximum(begin - 1, front), u)
+    up_to_top = _box_mean(narrow, last - np.maximum((last - begin) // 4, 1), last, u)
+    hit = (filled > FILLED) & (up_to_top > FILLED_TOP) & (clear < CLEAR) & usable
     if not hit.any():
         return None
     first = int(np.argmax(hit.any(axis=1)))
+    strips = np.flatnonzero(hit[first])
     # A box that is mostly filled may begin before the thing does: the foot is where its rows become anomalous.
-    behind = np.arange(first, max(int(last[first]), first + 1))
-    level = _box_mean(narrow, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, hit[first]].mean(axis=1)
+    behind = np.repeat(np.arange(first, int(last[first, strips].max()))[:, None], STRIPS, axis=1)
+    level = _box_mean(narrow, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, strips].mean(axis=1)
     i = first + int(np.argmax(level > 0.5))
     return float(grid.x_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
 
@@ -133,8 +135,8 @@ def _sums_along_sight(value: U8, grid: GroundGrid) -> F64:
 
 
 def _box_mean(table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp], u: npt.NDArray[np.intp]) -> F64:
-    """Return the means ``(N, STRIPS)`` over rows first..last-1 and the columns between neighbouring edges ``u`` (N, STRIPS + 1)."""
-    a, b = first[:, None], last[:, None]
+    """Return the means ``(N, STRIPS)`` over rows first..last-1 (N, STRIPS) and columns between neighbouring edges ``u`` (N, STRIPS + 1)."""
+    a, b = first, last
     left, right = u[:, :-1], np.maximum(u[:, 1:], u[:, :-1] + 1)
     right = np.minimum(right, table.shape[1] - 1)
     total = table[b, right] - table[a, right] - table[b, left] + table[a, left]

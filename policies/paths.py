@@ -6,12 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from alpasim_plugin.geometry import arc_lengths, resample
 from alpasim_plugin.types import F64
 
 MAX_LATERAL_MPS2 = 2.5  # comfort in curves
-MIN_LOOKAHEAD_M = 4.0
+MIN_LOOKAHEAD_M = 3.0
+CUT_M = 0.15
 LOOKAHEAD_S = 0.7
 SMOOTH_S = 0.8
 MAX_CURVATURE_1PM = 0.2  # turning radius 5 m
@@ -26,6 +28,19 @@ class Path:
 
     xy: F64  # (N, 2) metres
     curvature: F64  # (N,) 1/m, left positive
+
+
+def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
+    """Return the cubic spline through points ``(M, 2)``, at every ``spacing_m`` of chord length.
+
+    A route comes as points 4.2 m apart; on a bend of 10 m radius its polyline runs 0.2 m inside the road.
+    """
+    s = arc_lengths(points)
+    keep = np.concatenate([[True], np.diff(s) > 1e-6])
+    at = np.arange(0.0, max(float(s[-1]), spacing_m) + 1e-9, spacing_m)
+    if keep.sum() < 3:
+        return resample(points, at)
+    return np.asarray(CubicSpline(s[keep], points[keep])(np.minimum(at, s[-1])))
 
 
 def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> Path:
@@ -91,6 +106,9 @@ def follow(path: Path, progress: F64, speed_mps: float) -> tuple[F64, F64]:
     an exact arc, so the plan starts at the car's pose and heading and can be driven.
     """
     lookahead = max(MIN_LOOKAHEAD_M, LOOKAHEAD_S * speed_mps)
+    # On an arc of curvature k the chord of a lookahead cuts the corner by lookahead^2 k / 8.
+    tightest = float(np.abs(path.curvature[: round(15.0 / Path.SPACING_M)]).max())
+    lookahead = min(lookahead, max((8 * CUT_M / max(tightest, 1e-6)) ** 0.5, MIN_LOOKAHEAD_M))
     limit = min(MAX_CURVATURE_1PM, MAX_PURSUIT_MPS2 / max(speed_mps**2, 1.0))
     xs, ys = path.xy[:, 0].tolist(), path.xy[:, 1].tolist()
     x = y = yaw = 0.0

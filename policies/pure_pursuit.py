@@ -8,7 +8,7 @@ import numpy as np
 
 from alpasim_plugin.types import F64, Observation, Plan, Route, Scenario, SensorSpec
 from policies.base import POLICIES, plan_times, seconds
-from policies.paths import curve_speeds, follow, make_path, speed_profile
+from policies.paths import curve_speeds, follow, make_path, smooth_line, speed_profile
 
 MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
 
@@ -37,7 +37,7 @@ class PurePursuit:
         if self.cruise_mps is None:
             self.cruise_mps = max(speed, MIN_CRUISE_MPS)
         times = plan_times(observation.t_us)
-        path = make_path(route_points(observation.route_rig), speed_mps=speed)
+        path = make_path(smooth_line(route_points(observation.route_rig)), speed_mps=speed)
         progress = speed_profile(speed, curve_speeds(path, self.cruise_mps), seconds(times))
         xy, yaw = follow(path, progress, speed)
         return Plan(observation.t_us, times, xy, yaw, debug={"cruise_mps": self.cruise_mps})
