@@ -206,9 +206,9 @@ class Degradation:
     """How the renderer ``3dgs`` differs from the scene as built. ``surrogate``: seeded stand-ins for a bad reconstruction."""
 
     kind: Literal["surrogate", "none"] = "surrogate"
-    severity: float = 1.0  # scales all terms; 0 leaves the scene as built
-    onset_m: float = 0.3  # lateral distance from the logged path where the error starts to grow
-    full_m: float = 3.0  # lateral distance where it is full
+    severity: float = 1.5  # scales all terms; 0 leaves the scene as built
+    onset_m: float = 0.1  # lateral distance from the logged path where the error starts to grow
+    full_m: float = 2.0  # lateral distance where it is full
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,8 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
             DOING, ("timing", "duration_us"), f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long",
             "shorten timing.duration_us or leave it out",
         )  # fmt: skip
-    chosen_id = spec.scene_id or (record.scene_id if not document.marks else scene_id)
+    is_file = Path(document.path).suffix in (".yaml", ".yml")
+    chosen_id = spec.scene_id or (scene_id if is_file else record.scene_id)  # a bare log keeps its id whatever is overridden
     return Scenario(
         chosen_id, record.source, spec.seed, record.lane_map, record.ground, record.ego_log,
         _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,

@@ -97,9 +97,9 @@ class DegradationSpec(Part):
     """How the renderer 3dgs differs from the scene as built."""
 
     kind: Literal["surrogate", "none"] = Field(default="surrogate", description="Seeded stand-ins for a bad reconstruction, or nothing.")
-    severity: NonNegative = Field(default=1.0, description="Scales all terms; 0 leaves the scene as built.")
-    onset_m: NonNegative = Field(default=0.3, description="Distance from the logged path where the error starts to grow.")
-    full_m: Positive = Field(default=3.0, description="Distance where it is full.")
+    severity: NonNegative = Field(default=1.5, description="Scales all terms; 0 leaves the scene as built.")
+    onset_m: NonNegative = Field(default=0.1, description="Distance from the logged path where the error starts to grow.")
+    full_m: Positive = Field(default=2.0, description="Distance where it is full.")
 
     @model_validator(mode="after")
     def _ordered(self) -> DegradationSpec:
