@@ -19,7 +19,8 @@ from alpasim_plugin.geometry import se2
 from alpasim_plugin.types import Degradation, Scenario
 from tests.gaussians.scene_maps import camera_spec, curve, parked, straight
 
-SCENARIO = straight()
+UNIT = Degradation(severity=1.0, onset_m=0.3, full_m=3.0)  # the amounts that the expectations below are written for
+SCENARIO = straight(degradation=UNIT)
 
 
 def cloud(n: int = 400) -> GaussianCloud:
@@ -33,7 +34,7 @@ def node(name: str = "n", c: GaussianCloud | None = None, kind: str = "backgroun
 
 
 def degraded(w: float, severity: float = 1.0, scenario: Scenario = SCENARIO) -> GaussianCloud:
-    s = Surrogate(replace(scenario, degradation=Degradation(severity=severity)), [])
+    s = Surrogate(replace(scenario, degradation=replace(UNIT, severity=severity)), [])
     return s.background(node(), 0, cloud(), w)
 
 
@@ -63,7 +64,7 @@ def test_weight_of_a_log_that_stands_still_is_measured_from_its_heading_line() -
 @settings(deadline=None, max_examples=50)
 @given(st.floats(-3.0, 3.0), st.floats(0.05, 0.9))
 def test_weight_follows_the_lateral_offset_along_a_curve(offset_m: float, share: float) -> None:
-    scenario = curve()
+    scenario = curve(degradation=UNIT)
     i = int(share * len(scenario.ego_log))
     q = scenario.ego_log.quat[i]
     yaw = 2 * np.arctan2(q[3], q[0])

@@ -74,7 +74,7 @@ def test_error_of_3dgs_grows_with_the_distance_from_the_logged_path(scenario: Sc
     clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
     frames = range(4, 36, 8)
     curve = [np.mean([psnr(clean.render(r), bad.render(r)) for r in (request(scenario, i, d) for i in frames)]) for d in OFFSETS_M]
-    assert all(a > b + 0.5 for a, b in pairwise(curve)), curve
+    assert all(a > b + 0.2 for a, b in pairwise(curve)), curve  # slower beyond full_m, where parallax alone goes on
     assert 22 < curve[0] < 34, curve  # mildly soft on the path
     assert curve[-1] < curve[0] - 5, curve
 
