@@ -24,6 +24,11 @@ from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Down, Fr
 from alpasim_plugin.nets.wan_vae_layout import DECODER_TIME, DO, DOING, ENCODER_TIME, WanLayout, read_layout
 
 
+def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:
+    """Return one stage's blocks; the first changes the width."""
+    return [ResidualBlock(inputs if i == 0 else outputs, outputs) for i in range(count)]
+
+
 class Coder(nn.Module):
     """What encoder and decoder share: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
 
@@ -41,7 +46,7 @@ class Encoder(Coder):
         super().__init__((layout.colours, layout.stem), last, (last, 2 * layout.latent))
         blocks: list[nn.Module] = []
         for stage, (inputs, outputs) in enumerate(zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)):
-            blocks += [ResidualBlock(inputs, outputs), ResidualBlock(outputs, outputs)]
+            blocks += residual_blocks(inputs, outputs, layout.blocks)
             if stage < len(ENCODER_TIME):
                 blocks.append(Down(outputs, ENCODER_TIME[stage]))
         self.downsamples = nn.ModuleList(blocks)
@@ -59,7 +64,7 @@ class Decoder(Coder):
         super().__init__((layout.latent, first), first, (layout.decoder_out[-1], layout.colours))
         blocks: list[nn.Module] = []
         for stage, (inputs, outputs) in enumerate(zip(layout.decoder_in, layout.decoder_out, strict=True)):
-            blocks += [ResidualBlock(inputs, outputs), ResidualBlock(outputs, outputs), ResidualBlock(outputs, outputs)]
+            blocks += residual_blocks(inputs, outputs, layout.blocks + 1)
             if stage < len(DECODER_TIME):
                 blocks.append(Up(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
         self.upsamples = nn.ModuleList(blocks)

@@ -1,7 +1,8 @@
 """Sizes of a Wan 2.1 autoencoder, read off its tensors.
 
-The graph is fixed: four stages, two residual blocks a stage in the encoder and three in the decoder, time halved after the second and third
-encoder stage. What varies is the width of each stage: 96, 192, 384, 384 in the published network, a quarter of that in LightVAE.
+The graph is fixed: four stages, one residual block more per stage in the decoder than in the encoder, time halved after the second and
+third encoder stage. What varies is the width of each stage (96, 192, 384, 384 in the published network, a quarter of that in LightVAE) and, in
+principle, the number of blocks (2).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 
+STAGES = 4
 ENCODER_TIME = (False, True, True)  # which of the three halvings also halve the frame rate
 DECODER_TIME = (True, True, False)
 DOING = "loading Wan VAE weights"
@@ -30,6 +32,7 @@ class WanLayout:
         encoder: Channels of the four encoder stages.
         decoder_in: Channels that enter each of the four decoder stages.
         decoder_out: Channels that leave the residual blocks of each decoder stage.
+        blocks: Residual blocks of an encoder stage; a decoder stage has one more.
     """
 
     colours: int
@@ -38,6 +41,7 @@ class WanLayout:
     encoder: tuple[int, ...]
     decoder_in: tuple[int, ...]
     decoder_out: tuple[int, ...]
+    blocks: int = 2
 
     @classmethod
     def of_base(cls, base: int, latent: int = 16) -> WanLayout:
@@ -57,13 +61,20 @@ def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLa
     Raises:
         InputError: A key that gives a width is missing.
     """
+    halvings = [int(key.split(".")[2]) for key in sd if key.startswith("encoder.downsamples.") and ".resample." in key]
+    if not halvings:
+        raise InputError(DOING, f"{source} ({len(sd)} tensors)", "missing: encoder.downsamples.2.resample.1.weight", DO)
+    blocks = min(halvings)
+    encoder_starts = [stage * (blocks + 1) for stage in range(STAGES)]
+    decoder_starts = [stage * (blocks + 2) for stage in range(STAGES)]
     return WanLayout(
         colours=_length(sd, source, "decoder.head.2.bias"),
         latent=_length(sd, source, "conv2.bias"),
         stem=_length(sd, source, "encoder.conv1.bias"),
-        encoder=tuple(_length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in (0, 3, 6, 9)),
-        decoder_in=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in (0, 4, 8, 12)),
-        decoder_out=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.3.gamma") for i in (2, 6, 10, 14)),
+        encoder=tuple(_length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in encoder_starts),
+        decoder_in=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in decoder_starts),
+        decoder_out=tuple(_length(sd, source, f"decoder.upsamples.{i + blocks}.residual.3.gamma") for i in decoder_starts),
+        blocks=blocks,
     )
 
 

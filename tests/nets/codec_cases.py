@@ -16,6 +16,8 @@ from alpasim_plugin.nets.wan_vae_layout import WanLayout
 SMALL = WanLayout.of_base(8)
 UNEVEN = WanLayout(colours=3, latent=16, stem=4, encoder=(8, 12, 20, 24), decoder_in=(28, 12, 8, 6), decoder_out=(20, 16, 10, 4))
 
+DEEPER = WanLayout(3, 16, 4, (4, 8, 8, 12), (12, 8, 8, 4), (12, 12, 8, 4), blocks=3)
+
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
     """Return standard normal numbers, the same every time."""

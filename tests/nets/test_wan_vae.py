@@ -16,7 +16,7 @@ from alpasim_plugin.nets.clips import crop_clip, pad_clip
 from alpasim_plugin.nets.wan_vae import WanVAE
 from alpasim_plugin.nets.wan_vae_blocks import causal_conv, causal_conv_reference
 from alpasim_plugin.nets.wan_vae_layout import WanLayout, read_layout
-from tests.nets.codec_cases import SMALL, UNEVEN, clip, noise
+from tests.nets.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +231,7 @@ def test_summed_2d_convolutions_equal_the_3d_one(past: int, frames: int, inputs:
 # Checkpoints
 
 
-@pytest.mark.parametrize("layout", [SMALL, UNEVEN], ids=["small", "uneven"])
+@pytest.mark.parametrize("layout", [SMALL, UNEVEN, DEEPER], ids=["small", "uneven", "deeper"])
 def test_sizes_are_read_off_the_tensors(layout: WanLayout) -> None:
     sd = WanVAE.random(layout).state_dict()
     assert read_layout(sd) == layout
@@ -299,6 +299,10 @@ Spoil = Callable[[dict[str, Tensor]], object]
 SPOILED: dict[str, tuple[Spoil, str]] = {
     "missing bias": (lambda sd: sd.pop("encoder.middle.0.residual.2.bias"), "missing: encoder.middle.0.residual.2.bias"),
     "missing width": (lambda sd: sd.pop("encoder.downsamples.6.residual.3.gamma"), "missing: encoder.downsamples.6.residual.3.gamma"),
+    "no halving": (
+        lambda sd: [sd.pop(key) for key in list(sd) if ".resample." in key],
+        "missing: encoder.downsamples.2.resample.1.weight",
+    ),
     "missing block": (
         lambda sd: [sd.pop(key) for key in list(sd) if key.startswith("decoder.upsamples.13.")],
         "missing: decoder.upsamples.13.residual.0.gamma",
@@ -348,3 +352,12 @@ def test_a_deep_copy_is_independent(vae: WanVAE) -> None:
     other = copy.deepcopy(vae)
     other.conv1.weight.zero_()
     assert vae.conv1.weight.abs().max() > 0
+
+
+def test_the_published_size_runs_on_the_accelerator_path_without_memory() -> None:
+    with torch.device("meta"):
+        full = WanVAE(WanLayout.of_base(96)).to(torch.bfloat16)
+        z = full.encode(torch.empty(1, 3, 13, 544, 960))
+        assert z.shape == (1, 16, 4, 68, 120)
+        assert z.dtype == torch.bfloat16
+        assert full.decode(z).shape == (1, 3, 13, 544, 960)
