@@ -1,8 +1,8 @@
 """Sizes of a Wan 2.1 autoencoder, read off its tensors.
 
 The graph is fixed: four stages, one residual block more per stage in the decoder than in the encoder, time halved after the second and
-third encoder stage. What varies is the width of each stage (96, 192, 384, 384 in the published network, a quarter of that in LightVAE) and, in
-principle, the number of blocks (2).
+third encoder stage. What varies is the width of each stage (96, 192, 384, 384 in the published network, a quarter of that in LightVAE)
+and, in principle, the number of blocks (2).
 """
 
 from __future__ import annotations
