@@ -19,6 +19,8 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 
+from evaluators import aggregate, paired
+
 DOCS = Path(__file__).resolve().parents[1]
 SHOWN = ("collision_at_fault", "collision_any", "offroad", "route_distance_m", "progress", "min_distance_to_obstacle_m")
 STRIP_PICK = (0, 1, 3)  # three of the strip's four frames
@@ -88,6 +90,12 @@ def table(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def pooled(runs: list[Path]) -> dict[str, Any]:
+    """Return the tables of several runs of the same cells' kind taken together, as one summary."""
+    rows = [row for run in runs for row in pq.read_table(run / "rollouts.parquet").to_pylist()]
+    return {"metrics": aggregate(rows), "paired": paired(rows, "clean")}
+
+
 def scene_table(run: Path) -> str:
     """Return one row per scene and renderer, averaged over seeds."""
     rows = pq.read_table(run / "rollouts.parquet").to_pylist()
@@ -154,7 +162,9 @@ def main() -> None:
     text = page.read_text()
     text = replace(text, "real", table(real) + "\n\n" + scene_table(runs / "real"))
     text = replace(text, "replay", scene_table(runs / "replay"))
-    text = replace(text, "suites", "\n\n".join(f"**{name}**\n\n{table(summary)}" for name, summary in suites.items()))
+    together = pooled([runs / name for name in suites])
+    suites_text = [f"**{name}**\n\n{table(summary)}" for name, summary in {"all four together": together, **suites}.items()]
+    text = replace(text, "suites", "\n\n".join(suites_text))
     text = replace(text, "speed", speed_table({"one rollout at a time": one, "pooled": suites["smoke"]}))
     page.write_text(text)
 
