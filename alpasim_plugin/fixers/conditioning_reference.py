@@ -1,7 +1,7 @@
 """The semantic map drawn the slow way: the definition that the fast kernels are held to.
 
-Lines and triangles are halved until their pieces are short and seen under less than `ANGLE_RAD`; every point is projected by the exact
-formula in float64. Then each stroke and shape asks every pixel whether it covers it: no bands, no shortcuts.
+Lines and triangles are halved until their pieces are short and seen under a small angle; every point is projected by the exact formula in
+float64. Then each stroke and shape asks every pixel whether it covers it: no bands, no shortcuts.
 
 - A stroke covers a sample when the sample's distance to the line, measured with vertical pixels stretched, is at most the radius that the
   line has at the point nearest to the pixel's centre. 1/depth is linear along a stroke and over a shape.
@@ -36,12 +36,17 @@ from alpasim_plugin.fixers.map_style import WIDTH_DEFINED_AT_PX, MapStyle
 from alpasim_plugin.geometry import transform_points
 from alpasim_plugin.types import F32, F64, U8, Bool
 
-ANGLE_RAD = 0.03
 
 def draw_map_reference(
-    scene: PreparedMap, camera: MapCamera, T_world_camera: F64, actors: Sequence[ActorBox] = (), *, step_m: float = 1.0
+    scene: PreparedMap,
+    camera: MapCamera,
+    T_world_camera: F64,
+    actors: Sequence[ActorBox] = (),
+    *,
+    step_m: float = 2.0,
+    angle_rad: float = 0.05,
 ) -> U8:
-    """Draw what `alpasim_plugin.fixers.conditioning.draw_map` draws, from points at most ``step_m`` and `ANGLE_RAD` apart.
+    """Draw what `alpasim_plugin.fixers.conditioning.draw_map` draws, from points at most ``step_m`` and ``angle_rad`` apart.
 
     Raises:
         InputError: As the fast one.
@@ -49,13 +54,13 @@ def draw_map_reference(
     _, _, pose = view_of(scene, camera, T_world_camera)
     T_camera_scene = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
     faces, edges = actor_geometry(actors, scene)
-    first = strokes_reference(scene.segments, T_camera_scene, camera, scene.style, step_m)
-    strokes = np.concatenate([first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m)])
-    shapes = [shapes_reference(part, T_camera_scene, camera, scene.style, step_m) for part in (scene.triangles, faces)]
+    first = strokes_reference(scene.segments, T_camera_scene, camera, scene.style, step_m, angle_rad)
+    strokes = np.concatenate([first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m, angle_rad)])
+    shapes = [shapes_reference(part, T_camera_scene, camera, scene.style, step_m, angle_rad) for part in (scene.triangles, faces)]
     return draw_reference(strokes, len(first), np.concatenate(shapes), camera, scene.style)
 
 
-def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera, style: MapStyle, step_m: float) -> F64:
+def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera, style: MapStyle, step_m: float, angle_rad: float) -> F64:
     """Cut segments into short strokes ``(N, STROKE)``, clipped at the near and the far plane."""
     rows = [np.zeros((0, STROKE))]
     for ends, (width_px, *look) in zip(segments.ends, segments.style, strict=True):
@@ -68,7 +73,7 @@ def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera
             continue
         if inside[0] > inside[1]:
             continue
-        points = _along(a + inside[0] * (b - a), a + inside[1] * (b - a), step_m)
+        points = _along(a + inside[0] * (b - a), a + inside[1] * (b - a), step_m, angle_rad)
         points[:, 2] = np.maximum(points[:, 2], style.near_m)
         seen = np.column_stack([project_points(camera, points), 1.0 / points[:, 2]])
         half = width_px / 2 * camera.width / WIDTH_DEFINED_AT_PX
@@ -76,13 +81,13 @@ def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera
     return np.concatenate(rows)
 
 
-def shapes_reference(triangles: Triangles, T_camera_scene: F64, camera: MapCamera, style: MapStyle, side_m: float) -> F64:
+def shapes_reference(triangles: Triangles, T_camera_scene: F64, camera: MapCamera, style: MapStyle, side_m: float, angle_rad: float) -> F64:
     """Cut triangles into small shapes ``(N, SHAPE)``, clipped at the near plane."""
     rows = [np.zeros((0, SHAPE))]
     for corners, shade, look in zip(triangles.corners, triangles.shade, triangles.style, strict=True):
         polygon = clip_reference(np.column_stack([transform_points(T_camera_scene, corners), shade]), style.near_m)
         for k in range(1, len(polygon) - 1):
-            for piece in _cut(polygon[[0, k, k + 1]], side_m):
+            for piece in _cut(polygon[[0, k, k + 1]], side_m, angle_rad):
                 seen = np.column_stack([project_points(camera, piece[:, :3]), 1.0 / piece[:, 2], piece[:, 3] / piece[:, 2]])
                 inverse = 1.0 / piece[:, 2]
                 rows.append(np.array([[*seen.ravel(), inverse.max(), inverse.min(), *look]]))
@@ -102,28 +107,28 @@ def clip_reference(polygon: F64, near_m: float) -> F64:
     return np.array(out).reshape(-1, polygon.shape[1])
 
 
-def _short(a: F64, b: F64, side_m: float) -> bool:
+def _short(a: F64, b: F64, side_m: float, angle_rad: float) -> bool:
     """Tell whether a piece between two camera-frame points is short enough to be taken as straight in any image."""
     nearest_m = min(float(np.linalg.norm(a[:3])), float(np.linalg.norm(b[:3])))
-    return bool(np.linalg.norm((b - a)[:3]) <= min(side_m, ANGLE_RAD * nearest_m))
+    return bool(np.linalg.norm((b - a)[:3]) <= min(side_m, angle_rad * nearest_m))
 
 
-def _along(a: F64, b: F64, side_m: float) -> F64:
+def _along(a: F64, b: F64, side_m: float, angle_rad: float) -> F64:
     """Return points ``(N, 3)`` from a to b."""
-    if _short(a, b, side_m):
+    if _short(a, b, side_m, angle_rad):
         return np.stack([a, b])
     middle = (a + b) / 2
-    return np.concatenate([_along(a, middle, side_m)[:-1], _along(middle, b, side_m)])
+    return np.concatenate([_along(a, middle, side_m, angle_rad)[:-1], _along(middle, b, side_m, angle_rad)])
 
 
-def _cut(triangle: F64, side_m: float) -> list[F64]:
+def _cut(triangle: F64, side_m: float, angle_rad: float) -> list[F64]:
     """Halve a triangle at its longest side until all sides are short."""
     k = int(np.argmax([np.linalg.norm((triangle[i] - triangle[i - 2])[:3]) for i in range(3)]))  # the side from k to k + 1
     a, b, c = triangle[k], triangle[k - 2], triangle[k - 1]
-    if all(_short(p, q, side_m) for p, q in ((a, b), (b, c), (c, a))):
+    if all(_short(p, q, side_m, angle_rad) for p, q in ((a, b), (b, c), (c, a))):
         return [triangle]
     middle = (a + b) / 2
-    return _cut(np.stack([a, middle, c]), side_m) + _cut(np.stack([middle, b, c]), side_m)
+    return _cut(np.stack([a, middle, c]), side_m, angle_rad) + _cut(np.stack([middle, b, c]), side_m, angle_rad)
 
 
 def draw_reference(strokes: F64, n_first: int, shapes: F64, camera: MapCamera, style: MapStyle) -> U8:

@@ -15,7 +15,7 @@ from numba import njit
 
 from alpasim_plugin.fixers.map_prepare import GROUP
 
-BEND_PX = 0.25
+BEND_PX = 0.1
 DEPTH_ERROR = 0.02
 WIDE_RAD_COS = 0.94  # pieces seen under more than 20 degrees are halved whatever their middle says
 MAX_HALVINGS = 10
