@@ -24,7 +24,8 @@ Array = npt.ArrayLike
 
 def plan_of(t_s: Array, x: Array, y: Array, yaw: Array) -> Trajectory:
     t, x_, y_, yaw_ = (np.broadcast_to(np.asarray(v, dtype=np.float64), np.shape(t_s)) for v in (t_s, x, y, yaw))
-    return Trajectory(np.rint(t * 1e6).astype(np.int64), np.column_stack([x_, y_, np.zeros_like(x_)]), quat_from_yaw(yaw_))
+    with np.errstate(invalid="ignore"):  # some plans are broken on purpose
+        return Trajectory(np.rint(t * 1e6).astype(np.int64), np.column_stack([x_, y_, np.zeros_like(x_)]), quat_from_yaw(yaw_))
 
 
 def drive(plan: Trajectory | Callable[[EgoState], Trajectory], start: EgoState, seconds: float, step_us: int = 100_000) -> list[EgoState]:
