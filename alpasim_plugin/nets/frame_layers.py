@@ -58,13 +58,6 @@ def conv_frames(x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1,
     return out.reshape(b, t, *out.shape[1:])
 
 
-def deconv_frames(x: Tensor, weight: Tensor, stride: int) -> Tensor:
-    """Apply the transpose of `conv_frames` without bias or padding: ``(B, T, h, w, O)`` to ``(B, T, H, W, C)``."""
-    b, t = x.shape[:2]
-    out = F.conv_transpose2d(x.flatten(0, 1).permute(0, 3, 1, 2), weight, stride=stride).permute(0, 2, 3, 1)
-    return out.reshape(b, t, *out.shape[1:])
-
-
 class Float32Buffers(nn.Module):
     """A module whose constants stay float32, and exact, when the network around it changes precision (``net.to(torch.bfloat16)``)."""
 

@@ -36,7 +36,7 @@ from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import from_layers, halves_to_frames, split_last, to_layers
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinyEncoder, TinyPainter, TinySizes
-from alpasim_plugin.nets.tiny_vae_transform import COLOURS, CosineTransform, from_grid, to_grid
+from alpasim_plugin.nets.tiny_vae_transform import CELL, COLOURS, CosineTransform, from_grid, to_grid
 
 DOING = "loading tiny VAE weights"
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
@@ -216,16 +216,18 @@ class TinyVAE(nn.Module):
         if render is None:
             correction, _ = self.decoder.next(mu.to(self.dtype), None, carry)
             return from_grid(frames + correction).to(self.dtype), carry.state
-        shown, cover = to_grid(_whole_groups(render, carry.first)), None
-        difference = shown - grid
-        if opacity is not None:
+        shown = to_grid(_whole_groups(render, carry.first))
+        if opacity is None:
+            cover, difference = None, shown  # the synthesised picture has no detail to subtract
+        else:
             cover = to_grid(_whole_groups(opacity, carry.first))
-            shown, difference = (_per_pixel(x, cover) for x in (shown, difference))
+            shown, difference = _per_pixel(shown, cover), _per_pixel(shown - grid, cover)
         seen = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
         correction, gate = self.decoder.next(mu.to(self.dtype), seen, carry)
         assert gate is not None
-        detail = _per_pixel(as_frames(self.transform.residue(difference)), gate)
-        return from_grid(frames + correction + detail).to(self.dtype), carry.state
+        detail = split_last(as_frames(self.transform.residue(difference)), CELL)
+        picture = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
+        return from_grid(picture.flatten(-2)).to(self.dtype), carry.state
 
 
 def _untrained_stats() -> LatentStats:

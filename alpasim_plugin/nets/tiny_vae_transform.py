@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.nets.clips import GROUP, SIDE
-from alpasim_plugin.nets.frame_layers import Float32Buffers, conv_frames, deconv_frames
+from alpasim_plugin.nets.frame_layers import Float32Buffers, conv_frames
 
 COLOURS = 3
 QUARTER = 4  # pixels of a grid cell's side
@@ -46,7 +47,7 @@ def from_grid(grid: Tensor) -> Tensor:
 class CosineTransform(Float32Buffers):
     """Analyse grids of 4 frames into the 16 components of every 8x8 square, and synthesise them back.
 
-    Both directions are one convolution with the same fixed orthonormal kernel, computed in code and not stored in weights. Everything here
+    Both directions use the same fixed orthonormal kernel, computed in code and not stored in weights. Everything here
     is float32: half precision would cost a grey level.
     """
 
@@ -76,7 +77,9 @@ class CosineTransform(Float32Buffers):
         return conv_frames(grid, self.kernel, None, stride=SIDE // QUARTER)
 
     def _sum(self, coefficients: Tensor) -> Tensor:
-        return deconv_frames(coefficients, self.kernel, stride=SIDE // QUARTER)
+        b, t, rows, columns, _ = coefficients.shape
+        squares = F.linear(coefficients, self.kernel.permute(2, 3, 1, 0).flatten(0, 2)).view(b, t, rows, columns, 2, 2, -1)
+        return squares.permute(0, 1, 2, 4, 3, 5, 6).reshape(b, t, 2 * rows, 2 * columns, -1)
 
 
 def _kernel() -> Tensor:
