@@ -15,7 +15,7 @@ from alpasim_plugin.fixers.map_kernels import SHAPE, STROKE
 from alpasim_plugin.fixers.map_kernels import shapes as project_shapes
 from alpasim_plugin.fixers.map_kernels import strokes as project_strokes
 from alpasim_plugin.fixers.map_layers import ActorBox
-from alpasim_plugin.fixers.map_prepare import CORNERS, EDGES, TRIANGLES, PreparedMap, Segments, Triangles, box_corners, require_box
+from alpasim_plugin.fixers.map_prepare import CORNERS, EDGES, TRIANGLES, PreparedMap, Segments, Triangles, require_box
 from alpasim_plugin.fixers.map_projection import KernelCamera, MapCamera, kernel_camera
 from alpasim_plugin.fixers.map_raster import SAMPLES_1, SAMPLES_4, draw_bands, rows_of
 from alpasim_plugin.fixers.map_style import WIDTH_DEFINED_AT_PX, MapStyle, box_class
@@ -56,7 +56,7 @@ def draw_map(
         InputError: A pose that is not rigid or not finite, a box of impossible size, or a camera that is none.
     """
     lens, view, pose = view_of(scene, camera, T_world_camera)
-    faces, edges = actor_geometry(actors, scene)
+    faces, edges = actor_geometry(actors, scene, pose)
     n_first, n_strokes, strokes = _strokes(scene.segments, edges, pose, lens, view)
     n_shapes, shapes = _shapes(scene.triangles, faces, pose, lens, view)
 
@@ -98,21 +98,40 @@ def view_of(scene: PreparedMap, camera: MapCamera, T_world_camera: F64) -> tuple
     return lens, view, np.ascontiguousarray(inverse(T)[:3])
 
 
-def actor_geometry(actors: Sequence[ActorBox], scene: PreparedMap) -> tuple[Triangles, Segments]:
-    """Return the faces and edges of road users."""
+def actor_geometry(actors: Sequence[ActorBox], scene: PreparedMap, pose: F64) -> tuple[Triangles, Segments]:
+    """Return the faces and edges of road users, the nearest first: what they hide is then not shaded.
+
+    Faces of a box that the near plane cuts show their insides; of the others those that face away are marked as left out.
+    """
     style = scene.style
-    for actor in actors:
-        require_box(f"actor box ({actor.label})", actor.T_world_box, actor.box, DOING)
-    corners = np.array([box_corners(a.T_world_box, a.box, scene.origin) for a in actors]).reshape(-1, 8, 3)
-    colours = np.array([(0.0, *front, *back) for front, back in (style.box_colours[box_class(a.label)] for a in actors)]).reshape(-1, 7)
-    faces = Triangles(
-        corners[:, TRIANGLES].reshape(-1, 3, 3),
-        np.tile((0.5 - CORNERS[:, 0])[TRIANGLES], (len(actors), 1)),
-        np.repeat(colours, len(TRIANGLES), axis=0),
-    )
+    poses, sizes = _checked(actors)
+    order = np.argsort((poses[:, :3, 3] - scene.origin) @ pose[2, :3], kind="stable")
+    poses, sizes = poses[order], sizes[order]
+    corners = (CORNERS * sizes[:, None, :]) @ poses[:, :3, :3].transpose(0, 2, 1) + (poses[:, :3, 3] - scene.origin)[:, None, :]
+    uncut = (corners @ pose[2, :3] + pose[2, 3]).min(axis=1, initial=np.inf) > style.near_m
+    shades = [style.box_colours[box_class(actors[i].label)] for i in order]
+    colours = np.array([(0.0, *front, *back) for front, back in shades], dtype=np.float64).reshape(-1, 7)
+    n = len(TRIANGLES)
+    shade = np.tile((0.5 - CORNERS[:, 0])[TRIANGLES], (len(actors), 1))
+    faces = Triangles(corners[:, TRIANGLES].reshape(-1, 3, 3), np.repeat(uncut, n), shade, np.repeat(colours, n, axis=0))
     edge = np.array((style.box_edge_px, 1.0, style.edge_bias_m, *style.colours["box_edge"]), dtype=np.float64)
     ends = corners[:, EDGES].reshape(-1, 2, 3)
     return faces, Segments(ends, np.tile(edge, (len(ends), 1)), _NO_SPHERES)
+
+
+def _checked(actors: Sequence[ActorBox]) -> tuple[F64, F64]:
+    """Return poses ``(A, 4, 4)`` and sizes ``(A, 3)``, all tested at once; only where that fails the precise message is composed."""
+    sizes = np.array([(a.box.length_m, a.box.width_m, a.box.height_m) for a in actors], dtype=np.float64).reshape(-1, 3)
+    if all(np.shape(actor.T_world_box) == (4, 4) for actor in actors):
+        poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
+        rotation = poses[:, :3, :3]
+        sound = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0) <= 1e-5 and (np.linalg.det(rotation) > 0).all()
+        sound = sound and np.isfinite(poses).all() and np.abs(poses[:, 3] - [0, 0, 0, 1]).max(initial=0.0) <= 1e-9
+        if sound and np.isfinite(sizes).all() and (sizes >= 0).all():
+            return poses, sizes
+    for actor in actors:
+        require_box(f"actor box ({actor.label})", actor.T_world_box, actor.box, DOING)
+    return np.stack([actor.T_world_box for actor in actors]), sizes
 
 
 def _strokes(static: Segments, edges: Segments, pose: F64, lens: KernelCamera, view: F64) -> tuple[int, int, F64]:
@@ -129,8 +148,8 @@ def _strokes(static: Segments, edges: Segments, pose: F64, lens: KernelCamera, v
 def _shapes(static: Triangles, faces: Triangles, pose: F64, lens: KernelCamera, view: F64) -> tuple[int, F64]:
     while True:
         room = _room.shapes
-        count = project_shapes(static.corners, static.shade, static.style, pose, lens.params, lens.table, view, room, 0)
-        count = project_shapes(faces.corners, faces.shade, faces.style, pose, lens.params, lens.table, view, room, count)
+        count = project_shapes(static.corners, static.closed, static.shade, static.style, pose, lens.params, lens.table, view, room, 0)
+        count = project_shapes(faces.corners, faces.closed, faces.shade, faces.style, pose, lens.params, lens.table, view, room, count)
         if count <= len(room):
             return int(count), room
         _room.shapes = np.empty((count + count // 4, SHAPE))

@@ -53,7 +53,7 @@ def draw_map_reference(
     """
     _, _, pose = view_of(scene, camera, T_world_camera)
     T_camera_scene = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
-    faces, edges = actor_geometry(actors, scene)
+    faces, edges = actor_geometry(actors, scene, pose)
     first = strokes_reference(scene.segments, T_camera_scene, camera, scene.style, step_m, angle_rad)
     strokes = np.concatenate([first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m, angle_rad)])
     shapes = [shapes_reference(part, T_camera_scene, camera, scene.style, step_m, angle_rad) for part in (scene.triangles, faces)]
@@ -201,7 +201,7 @@ def _shape(shape: F64, depth_max_m: float, samples: F64, depth: F32, colour: F64
 
     middle = parts(centre)
     inverse = np.clip(middle @ corners[:, 2], shape[FARTHEST], shape[NEAREST])
-    fade = np.maximum(0.0, 1.0 - 1.0 / (inverse * depth_max_m))
+    fade = np.maximum(0.0, 1.0 - 1.0 / inverse / depth_max_m)
     back = np.clip(middle @ corners[:, 3] / inverse, 0.0, 1.0)[..., None]
     painted = np.floor((shape[FRONT : FRONT + 3] * (1 - back) + shape[BACK : BACK + 3] * back) * fade[..., None] + 0.5)
     at_samples = np.stack([parts(centre + offset) for offset in samples], axis=-2)

@@ -206,7 +206,15 @@ def _shapes_of(piece, camera, table, style, view, stack, levels, out, count):
 
 
 @njit(cache=True, nogil=True)
-def shapes(corners, shade, style, pose, camera, table, view, out, count):
+def _faces_away(a, b, c):
+    """Tell whether the camera lies behind a triangle that is wound to the left from its front."""
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    return (uy * vz - uz * vy) * a[0] + (uz * vx - ux * vz) * a[1] + (ux * vy - uy * vx) * a[2] >= 0.0
+
+
+@njit(cache=True, nogil=True)
+def shapes(corners, closed, shade, style, pose, camera, table, view, out, count):
     """Project triangles ``(T, 3, 3)`` into shapes after the first ``count``; returns how many there are then, written or not."""
     near = view[NEAR]
     stack = np.empty((2 * MAX_HALVINGS + 2, 3, 6))
@@ -216,6 +224,8 @@ def shapes(corners, shade, style, pose, camera, table, view, out, count):
         for k in range(3):
             raw[k, 0], raw[k, 1], raw[k, 2] = _to_camera(pose, corners[s, k])
             raw[k, 3] = shade[s, k]
+        if closed[s] and _faces_away(raw[0], raw[1], raw[2]):
+            continue
         mx = (raw[0, 0] + raw[1, 0] + raw[2, 0]) / 3
         my = (raw[0, 1] + raw[1, 1] + raw[2, 1]) / 3
         mz = (raw[0, 2] + raw[1, 2] + raw[2, 2]) / 3

@@ -12,14 +12,15 @@ from alpasim_plugin.fixers.map_layers import POLE_HEIGHT_M, LaneLine, MapExtras,
 from alpasim_plugin.fixers.map_style import OPENGL, MapStyle, Rgb
 from alpasim_plugin.fixers.triangulate import ear_clip
 from alpasim_plugin.gaussians.cloud import require_rigid
-from alpasim_plugin.types import F64, Box, LaneMap
+from alpasim_plugin.types import F64, Bool, Box, LaneMap
 
 GROUP = 32  # segments that share a bounding sphere
-GROUND_BIAS_M = 0.5  # ground areas are pushed this far back: lines painted on them stay visible
+# Ground areas are pushed this far back: lines painted on them stay visible, and so do smaller areas on larger ones.
+GROUND_BIAS_M = {"road_marking": 0.3, "crosswalk": 0.4, "road_island": 0.5, "buffer_zone": 0.5, "intersection": 0.6}
 DOING = "preparing the semantic map"
 # Corners of a unit box: bit 2 is +x, bit 1 is +y, bit 0 is +z.
 CORNERS = np.array([[(i >> 2 & 1) - 0.5, (i >> 1 & 1) - 0.5, (i & 1) - 0.5] for i in range(8)])
-FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])  # wound to the left from outside
 TRIANGLES = np.concatenate([FACES[:, [0, 1, 2]], FACES[:, [0, 2, 3]]])  # (12, 3)
 EDGES = np.array([[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]])
 
@@ -38,6 +39,7 @@ class Triangles:
     """Flat triangles, relative to the scene's origin."""
 
     corners: F64  # (T, 3, 3) metres
+    closed: Bool  # (T,) whether it is the face of a solid, wound to the left from outside, and may be left out where it faces away
     shade: F64  # (T, 3) position between front colour (0) and back colour (1) at the corners
     style: F64  # (T, 7) bias towards the camera in metres, front r, g, b, back r, g, b
 
@@ -90,12 +92,13 @@ def prepare_map(lane_map: LaneMap, extras: MapExtras | None = None, style: MapSt
     for name, width_px, group in plain:
         pieces += [(line - origin, width_px, 1.0 if name == "pole" else gain, style.colours[name]) for line in group]
     corners = [_triangulate(name, ring - origin) for name, ring in areas]
-    colours = [_flat(-GROUND_BIAS_M, style.colours[name], len(c)) for (name, _), c in zip(areas, corners, strict=True)]
+    colours = [_flat(-GROUND_BIAS_M[name], style.colours[name], len(c)) for (name, _), c in zip(areas, corners, strict=True)]
     for name, pose, box in boxes:
         corners.append(box_corners(pose, box, origin)[TRIANGLES])
         colours.append(_flat(0.0, style.colours[name], len(TRIANGLES)))
     triangles = np.concatenate([np.zeros((0, 3, 3)), *corners])
-    filled = Triangles(triangles, np.zeros((len(triangles), 3)), np.concatenate([np.zeros((0, 7)), *colours]))
+    open_ = np.zeros(len(triangles), dtype=bool)
+    filled = Triangles(triangles, open_, np.zeros((len(triangles), 3)), np.concatenate([np.zeros((0, 7)), *colours]))
     return PreparedMap(origin, _segments(pieces), filled, style)
 
 

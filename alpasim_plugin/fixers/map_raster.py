@@ -77,6 +77,7 @@ def _draw_stroke(stroke, first_row, last_row, band_row, width, stretch, depth_ma
     reach = stroke[HALF] * min(widest, 1.0)
     slack = 0.0 if n_samples == 1 else 0.4
     slack_far = slack * np.sqrt(1.0 + stretch * stretch)
+    limit2 = (reach + slack_far) * (reach + slack_far)
     reach_y = reach / stretch + slack
     for row in range(first_row, last_row + 1):
         yc = row + 0.5
@@ -96,11 +97,13 @@ def _draw_stroke(stroke, first_row, last_row, band_row, width, stretch, depth_ma
         for column in range(left, min(right + 1, width)):
             vx = column + 0.5 - x0
             t = min(max((vx * dx + vy * sy) * over, 0.0), 1.0)
+            ex, ey = vx - t * dx, vy - t * sy
+            distance2 = ex * ex + ey * ey
+            if distance2 > limit2:
+                continue
             inverse = i0 + t * di
             fade = max(0.0, 1.0 - 1.0 / (inverse * depth_max))
             radius = stroke[HALF] * min(1.0, stroke[GAIN] * fade)
-            ex, ey = vx - t * dx, vy - t * sy
-            distance2 = ex * ex + ey * ey
             if distance2 > (radius + slack_far) * (radius + slack_far):
                 continue
             mask = (1 << n_samples) - 1
@@ -138,8 +141,10 @@ def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples,
     a2, c2 = (y0 - y1) * turn, (x1 - x0) * turn
     slack = 0.0 if n_samples == 1 else 0.4
     m0, m1, m2 = slack * (abs(a0) + abs(c0)), slack * (abs(a1) + abs(c1)), slack * (abs(a2) + abs(c2))
-    ix = a0 * shape[2] + a1 * shape[6] + a2 * shape[10]
-    iy = c0 * shape[2] + c1 * shape[6] + c2 * shape[10]
+    # 1/depth and shade/depth are planes over the image as well.
+    ix, iy = a0 * shape[2] + a1 * shape[6] + a2 * shape[10], c0 * shape[2] + c1 * shape[6] + c2 * shape[10]
+    sx, sy = a0 * shape[3] + a1 * shape[7] + a2 * shape[11], c0 * shape[3] + c1 * shape[7] + c2 * shape[11]
+    far, near = shape[FARTHEST], shape[NEAREST]
     bias = shape[S_BIAS]
     for row in range(first_row, last_row + 1):
         yc = row + 0.5
@@ -158,39 +163,38 @@ def _draw_shape(shape, first_row, last_row, band_row, width, depth_max, samples,
             elif rest < 0.0:
                 high = -1.0
         begin, end = width, -1
+        r0, r1, r2 = c0 * (yc - y1) - a0 * x1, c1 * (yc - y2) - a1 * x2, c2 * (yc - y0) - a2 * x0
+        ir, sr = shape[2] + iy * (yc - y0) - ix * x0, shape[3] + sy * (yc - y0) - sx * x0
         for column in range(int(low), min(int(high) + 1, width)):
             xc = column + 0.5
-            b0 = a0 * (xc - x1) + c0 * (yc - y1)
-            b1 = a1 * (xc - x2) + c1 * (yc - y2)
-            b2 = a2 * (xc - x0) + c2 * (yc - y0)
+            b0, b1, b2 = a0 * xc + r0, a1 * xc + r1, a2 * xc + r2
             if b0 < -m0 or b1 < -m1 or b2 < -m2:
                 continue
-            mask = (1 << n_samples) - 1
-            if b0 < m0 or b1 < m1 or b2 < m2:
-                mask = 0
-                for s in range(n_samples):
-                    ox, oy = samples[s, 0], samples[s, 1]
-                    if b0 + a0 * ox + c0 * oy >= 0.0 and b1 + a1 * ox + c1 * oy >= 0.0 and b2 + a2 * ox + c2 * oy >= 0.0:
-                        mask |= 1 << s
-                if mask == 0:
-                    continue
-            centre = b0 * shape[2] + b1 * shape[6] + b2 * shape[10]
-            inverse = min(max(centre, shape[FARTHEST]), shape[NEAREST])
-            fade = max(0.0, 1.0 - 1.0 / (inverse * depth_max))
-            part = min(max((b0 * shape[3] + b1 * shape[7] + b2 * shape[11]) / inverse, 0.0), 1.0)
-            red = shape[FRONT] + part * (shape[BACK] - shape[FRONT])
-            green = shape[FRONT + 1] + part * (shape[BACK + 1] - shape[FRONT + 1])
-            blue = shape[FRONT + 2] + part * (shape[BACK + 2] - shape[FRONT + 2])
-            packed = _pack(red, green, blue, fade)
+            whole = b0 >= m0 and b1 >= m1 and b2 >= m2
+            centre = ix * xc + ir
             at = ((row - band_row) * width + column) * n_samples
+            mask = 0
             for s in range(n_samples):
-                if mask >> s & 1:
-                    here = min(max(centre + ix * samples[s, 0] + iy * samples[s, 1], shape[FARTHEST]), shape[NEAREST])
+                ox, oy = samples[s, 0], samples[s, 1]
+                if whole or (b0 + a0 * ox + c0 * oy >= 0.0 and b1 + a1 * ox + c1 * oy >= 0.0 and b2 + a2 * ox + c2 * oy >= 0.0):
+                    here = min(max(centre + ix * ox + iy * oy, far), near)
                     if bias != 0.0:
                         here = here / max(1.0 - bias * here, 1e-3)
                     if np.float32(here) > depth[at + s]:
                         depth[at + s] = here
-                        colour[at + s] = packed
+                        mask |= 1 << s
+            if mask == 0:
+                continue
+            z = 1.0 / min(max(centre, far), near)
+            fade = max(0.0, 1.0 - z / depth_max)
+            part = min(max((sx * xc + sr) * z, 0.0), 1.0)
+            red = shape[FRONT] + part * (shape[BACK] - shape[FRONT])
+            green = shape[FRONT + 1] + part * (shape[BACK + 1] - shape[FRONT + 1])
+            blue = shape[FRONT + 2] + part * (shape[BACK + 2] - shape[FRONT + 2])
+            packed = _pack(red, green, blue, fade)
+            for s in range(n_samples):
+                if mask >> s & 1:
+                    colour[at + s] = packed
             begin, end = min(begin, column), column
         if end >= 0:
             touched[row - band_row, 0] = min(touched[row - band_row, 0], begin)
@@ -231,18 +235,26 @@ def draw_bands(
 def _resolve(band_row, end_row, n_samples, depth, colour, touched, image):
     """Average the samples of a band into the image and leave the buffers clear."""
     width = image.shape[1]
+    half = n_samples // 2
     for row in range(band_row, end_row + 1):
         image[row, :, :] = 0
-        for column in range(touched[row - band_row, 0], touched[row - band_row, 1] + 1):
-            at = ((row - band_row) * width + column) * n_samples
-            red, green, blue = np.uint32(0), np.uint32(0), np.uint32(0)
-            for s in range(n_samples):
-                packed = colour[at + s]
-                red += packed & 255
-                green += (packed >> 8) & 255
-                blue += (packed >> 16) & 255
-                depth[at + s] = 0.0
-                colour[at + s] = 0
-            image[row, column, 0] = (red + n_samples // 2) // n_samples
-            image[row, column, 1] = (green + n_samples // 2) // n_samples
-            image[row, column, 2] = (blue + n_samples // 2) // n_samples
+        first = (row - band_row) * width * n_samples
+        left, right = touched[row - band_row, 0], touched[row - band_row, 1] + 1
+        for column in range(left, right):
+            at = first + column * n_samples
+            packed = colour[at]
+            same = True
+            for s in range(1, n_samples):
+                same = same and colour[at + s] == packed
+            red, green, blue = packed & 255, (packed >> 8) & 255, (packed >> 16) & 255
+            if not same:
+                for s in range(1, n_samples):
+                    packed = colour[at + s]
+                    red += packed & 255
+                    green += (packed >> 8) & 255
+                    blue += (packed >> 16) & 255
+                red, green, blue = (red + half) // n_samples, (green + half) // n_samples, (blue + half) // n_samples
+            image[row, column, 0], image[row, column, 1], image[row, column, 2] = red, green, blue
+        if left < right:
+            depth[first + left * n_samples : first + right * n_samples] = 0.0
+            colour[first + left * n_samples : first + right * n_samples] = 0

@@ -5,7 +5,7 @@ The copy of the clip at hand has no camera extrinsics. The mounts in ``cosmos_mo
 compared.
 
     python -m tests.fixers.cosmos_agreement FOLDER            prints the table
-    python -m tests.fixers.cosmos_agreement FOLDER --picture docs/img/conditioning-overlay.png
+    python -m tests.fixers.cosmos_agreement FOLDER --pictures docs/img   makes the pictures of docs/conditioning.md
     python -m tests.fixers.cosmos_agreement FOLDER --fit      estimates the mounts anew (minutes)
 
 FOLDER holds ``example`` and ``example_outputs`` of Cosmos-Drive-Dreams (CC-BY-4.0, (c) NVIDIA).
@@ -26,12 +26,12 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.fixers.conditioning import draw_map
-from alpasim_plugin.fixers.map_layers import Area, MapExtras
+from alpasim_plugin.fixers.map_layers import ActorBox, Area, MapExtras
 from alpasim_plugin.fixers.map_prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.map_projection import FThetaCamera
-from alpasim_plugin.fixers.map_style import COLOURS, OPENGL, MapStyle
-from alpasim_plugin.geometry import se3
-from alpasim_plugin.types import F64, U8, Bool, LaneMap
+from alpasim_plugin.fixers.map_style import COLOURS, LUDUS, OPENGL, MapStyle
+from alpasim_plugin.geometry import se2, se3
+from alpasim_plugin.types import F64, U8, Bool, Box, LaneMap
 from scenarios.cosmos import read_cosmos
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
 from scenarios.cosmos_layers import read_layer
@@ -236,32 +236,41 @@ def fit_mount(clip: Clip, camera: str) -> F64:
 # --- picture and table ------------------------------------------------------------------------------------------------
 
 
-def overlay(published: U8, ours: U8) -> U8:
-    """Show the published render dimmed, our lines and boundaries in green over it, white where both are lit."""
-    lit, mine = published.max(axis=2) > LIT, ours.max(axis=2) > LIT
-    out = (published * 0.75).astype(np.uint8)
-    out[mine & lit] = (255, 255, 255)
-    out[mine & ~lit] = (0, 255, 0)
+def overlay(clip: Clip, camera: str, frame: int) -> U8:
+    """Show a published frame with the middles of our lane lines and boundaries over it in green."""
+    thin = only_lines(clip, replace(AS_PUBLISHED, line_px=2.0))
+    ours = draw_map(thin, clip.cameras[camera], clip.T_world_rig[frame] @ mounts()[camera]).max(axis=2)
+    out = clip.video(camera)[frame].copy()
+    out[ours > LIT] = (0, 255, 0)
     return out
 
 
 def picture(clip: Clip, frame: int = 28) -> U8:
-    """Return the six overlays of one frame, two a row, each cut to where something is drawn."""
+    """Return the six overlays of one frame, two a row, without the empty sky."""
     tiles = []
-    for camera, T in mounts().items():
-        ours = draw_map(only_lines(clip, AS_PUBLISHED), clip.cameras[camera], clip.T_world_rig[frame] @ T)
-        image = overlay(clip.video(camera)[frame], ours)
-        tile = cv2.resize(image[144:], (960, 420), interpolation=cv2.INTER_AREA)
+    for camera in clip.cameras:
+        tile = cv2.resize(overlay(clip, camera, frame)[144:], (960, 420), interpolation=cv2.INTER_AREA)
         cv2.putText(tile, camera, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 0), 1, cv2.LINE_AA)
         tiles.append(np.pad(tile, ((2, 2), (2, 2), (0, 0)), constant_values=90))
     return np.concatenate([np.concatenate(tiles[k : k + 2], axis=1) for k in range(0, len(tiles), 2)])
+
+
+def example(clip: Clip, frame: int = 28) -> U8:
+    """Return the front camera in both styles, one above the other, with road users put there by hand."""
+    rig = clip.T_world_rig[frame]
+    places = [(12, -4, 0.1, Box(4.5, 1.9, 1.6), "car"), (25, 4, 3.1, Box(9, 2.5, 3.2), "truck"), (40, 0, 0.0, Box(1, 1, 1), "other")]
+    places += [(14, 7, 1.0, Box(0.6, 0.6, 1.8), "pedestrian"), (9, 2.2, 0.0, Box(1.8, 0.7, 1.7), "cyclist")]
+    boxes = tuple(ActorBox(rig @ se2(x, y, yaw, box.height_m / 2), box, label) for x, y, yaw, box, label in places)
+    pose, camera = rig @ mounts()[FRONT_WIDE], clip.cameras[FRONT_WIDE]
+    scenes = [prepare_map(clip.lane_map, clip.extras, style) for style in (OPENGL, LUDUS)]
+    return np.concatenate([draw_map(scene, camera, pose, boxes)[330:] for scene in scenes])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--fit", action="store_true")
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     clip = read_clip(options.folder)
     if options.fit:
@@ -271,8 +280,9 @@ def main() -> None:
             six[camera] = [round(float(v), 5) for v in (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_rotvec())]
             print(camera, six[camera], flush=True)
         MOUNTS.write_text(json.dumps(six, indent=1) + "\n")
-    if options.picture:
-        cv2.imwrite(str(options.picture), picture(clip)[..., ::-1])
+    if options.pictures:
+        cv2.imwrite(str(options.pictures / "conditioning-overlay.jpg"), picture(clip)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+        cv2.imwrite(str(options.pictures / "conditioning-styles.png"), example(clip)[..., ::-1])
         return
     rows = [(camera, T, style) for camera, T in mounts().items() for style in (AS_PUBLISHED, SOLID, OPENGL)]
     rows.insert(0, (FRONT_WIDE, orthonormal(T_RIG_FRONT_WIDE), SOLID))

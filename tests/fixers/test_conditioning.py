@@ -346,7 +346,7 @@ def test_raster_equals_the_plain_one_bit_by_bit(camera, samples):
     scene = replace(scene, style=replace(scene.style, samples=samples))
     fast = draw_map(scene, camera, at(), boxes)
     lens, view, pose = conditioning.view_of(scene, camera, at())
-    faces, edges = conditioning.actor_geometry(boxes, scene)
+    faces, edges = conditioning.actor_geometry(boxes, scene, pose)
     first, n, strokes = conditioning._strokes(scene.segments, edges, pose, lens, view)
     n_shapes, shapes = conditioning._shapes(scene.triangles, faces, pose, lens, view)
     plain = draw_reference(strokes[:n], first, shapes[:n_shapes], camera, scene.style)
