@@ -145,12 +145,12 @@ def _lane_line(line: LaneLine, style: MapStyle) -> list[tuple[F64, float, float,
         return []
     if not style.typed_lines:
         return [(line.xyz, style.line_px, style.line_width_gain, style.colours["line_untyped"])]
-    width_px = style.line_px * (style.other_factor if line.colour == "other" else 1.0)
     colour = style.colours[f"line_{line.colour}"]
     offsets = (0.0,) if len(line.patterns) == 1 else (style.double_offset_m, -style.double_offset_m)
     out: list[tuple[F64, float, float, Rgb]] = []
     for pattern, left_m in zip(line.patterns, offsets, strict=True):
         shifted = _beside(line.xyz, left_m) if left_m else line.xyz
+        width_px = style.line_px * (style.other_factor if pattern == "other" else 1.0)
         out += [(piece, width_px, style.line_width_gain, colour) for piece in cut_dashes(shifted, style.patterns[pattern])]
     return out
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 Rgb = tuple[int, int, int]
 LineColour = Literal["untyped", "white", "yellow", "other"]
-Pattern = Literal["solid", "long_dashed", "short_dashed", "dotted", "dotted_1_9", "dot_dashed"]
+Pattern = Literal["solid", "long_dashed", "short_dashed", "dotted", "dotted_1_9", "dot_dashed", "other"]
 LightState = Literal["unknown", "red", "yellow", "green"]
 AreaKind = Literal["road_marking", "intersection", "road_island", "buffer_zone"]
 
@@ -60,6 +60,7 @@ _CLASS_OF = {label: kind for kind, labels in _LABELS.items() for label in labels
 # Lengths painted and left bare, metres, repeated from the first point of a line.
 _OPENGL_PATTERNS: Mapping[Pattern, tuple[tuple[float, float], ...]] = {
     "solid": (),
+    "other": (),  # a line of no known pattern: solid and wide
     "long_dashed": ((3.0, 9.0),),
     "short_dashed": ((1.5, 1.5),),
     "dotted": ((0.3, 0.6),),
@@ -82,7 +83,7 @@ class MapStyle:
     line_px: float = 12.0  # lane lines, boundaries, stop lines
     pole_px: float = 5.0
     box_edge_px: float = 4.0
-    other_factor: float = 3.0  # lane lines that are neither white nor yellow are this much wider
+    other_factor: float = 3.0  # lane lines of pattern "other" are this much wider
     ndc_widths: bool = True  # widths are measured in normalised coordinates: a horizontal line is H / W times as thick as a vertical one
     line_width_gain: float = 1.0  # line width is scaled by clamp(gain * (1 - depth / depth_max))
     depth_max_m: float = 200.0  # colours and widths fade to nothing here

@@ -71,10 +71,11 @@ def test_untyped_style_draws_every_line_solid():
     assert plain.segments.style[0, 3:].tolist() == [98, 183, 249]
 
 
-def test_line_of_another_colour_is_three_times_as_wide():
+def test_line_of_no_known_pattern_is_three_times_as_wide():
     line = np.array([[0.0, 0, 0], [60, 0, 0]])
-    scene = prepare_map(LaneMap({}), MapExtras(lane_lines=(LaneLine(line, "other"), LaneLine(line, "white"))))
+    scene = prepare_map(LaneMap({}), MapExtras(lane_lines=(LaneLine(line, "white", ("other",)), LaneLine(line, "other"))))
     assert scene.segments.style[:, 0].tolist() == [36.0, 12.0]
+    assert scene.segments.style[:, 3:].tolist() == [[255, 255, 255], [181, 164, 71]]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+import av
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from alpasim_plugin.fixers.conditioning import draw_map
 from alpasim_plugin.fixers.map_layers import ActorBox
 from alpasim_plugin.fixers.map_prepare import prepare_map
 from alpasim_plugin.fixers.map_projection import kernel_camera, project_points
+from alpasim_plugin.fixers.map_style import BOX_COLOURS, COLOURS
 from alpasim_plugin.geometry import se2
 from alpasim_plugin.types import Box
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, project_ftheta, read_lenses
@@ -59,6 +62,23 @@ def test_projection_equals_the_reader_s(clip, shared_data):
         table = np.interp(theta * lens.params[7], np.arange(len(lens.table)), lens.table)
         exact = project_points(camera, np.column_stack([np.sin(theta), 0 * theta, np.cos(theta)]))[:, 0] - camera.cx
         np.testing.assert_allclose(table * camera.A[0][0], exact, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["cross_right_120fov", "front_wide_120fov", "rear_left_70fov"])
+def test_published_conditioning_videos_hold_our_colours(shared_data, name):
+    """Nearly every drawn pixel of the renders that the network was trained with is one of the palette's colours times a fade."""
+    flat = [rgb for key, rgb in COLOURS.items() if key not in ("intersection", "road_island", "buffer_zone")]
+    steps = np.linspace(0, 1, 25)[:, None]
+    palette = np.concatenate([np.array(flat, dtype=float), *((1 - steps) * a + steps * b for a, b in np.array(list(BOX_COLOURS.values())))])
+    folder = shared_data / "cosmos-transfer" / "posttrain" / "control_input_hdmap_bbox" / f"ftheta_camera_{name}"
+    with av.open(str(next(folder.glob("av_002b815b*.mp4")))) as video:
+        image = next(frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
+    inner = cv2.erode((image.max(axis=2) > 40).astype(np.uint8), np.ones((3, 3))) > 0  # rims mix two colours
+    pixels = image[inner].astype(float)
+    fade = np.clip(pixels @ palette.T / (palette**2).sum(axis=1), 0, 1)
+    off = np.abs(pixels[:, None] - fade[..., None] * palette).max(axis=2).min(axis=1)
+    assert len(pixels) > 20_000
+    assert (off <= 14).mean() > 0.94
 
 
 @pytest.mark.slow
