@@ -66,7 +66,7 @@ def test_projection_equals_the_reader_s(clip, shared_data):
 
 @pytest.mark.parametrize("name", ["cross_right_120fov", "front_wide_120fov", "rear_left_70fov"])
 def test_published_conditioning_videos_hold_our_colours(shared_data, name):
-    """Nearly every drawn pixel of the renders that the network was trained with is one of the palette's colours times a fade."""
+    """Nearly every drawn pixel of renders that a network was trained with is one of the palette's colours times a fade."""
     flat = [rgb for key, rgb in COLOURS.items() if key not in ("intersection", "road_island", "buffer_zone")]
     steps = np.linspace(0, 1, 25)[:, None]
     palette = np.concatenate([np.array(flat, dtype=float), *((1 - steps) * a + steps * b for a, b in np.array(list(BOX_COLOURS.values())))])
