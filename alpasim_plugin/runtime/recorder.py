@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 import uuid
 from collections.abc import Mapping, Sequence
@@ -95,6 +96,7 @@ class Recorder:
                     "t_us": frame.t_us,
                     "camera": frame.camera,
                     "opacity_mean": None if frame.alpha is None else round(float(frame.alpha.mean()), 5),
+                    "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
                     "events": " ".join(frame.events),
                 }
             )
