@@ -1,0 +1,119 @@
+"""What a rollout did, component by component and instant by instant, as digests: two rollouts are compared and the first difference named."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.alpasim.asl import AslReader
+from alpasim_plugin.log.facts import Fact
+from alpasim_plugin.log.schema import EGO
+
+# In the order in which the loop makes them at one instant: where the ego got to, where the others are, what the cameras saw, what the
+# policy answered. Scores come last of all: they are made from the finished log.
+COMPONENTS = ("ego", "actors", "frames", "plans", "scores")
+
+Key = tuple[int, str]  # time in microseconds, and which part of the component: a camera, a metric, ...
+Trace = Mapping[str, Mapping[Key, str]]  # component -> key -> SHA-256
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first place where two rollouts are not the same."""
+
+    component: str
+    t_us: int
+    step: int | None  # control step; None before the first frame
+    what: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {"component": self.component, "t_us": self.t_us, "step": self.step, "what": self.what}
+
+    def __str__(self) -> str:
+        at = f"step {self.step}" if self.step is not None else "before the first frame"
+        return f"{self.component} at {at} ({self.what}, t = {self.t_us} us)"
+
+
+def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str, dict[Key, str]]:
+    """Read the components of a rollout out of its log.
+
+    Names of sessions and services are not part of any component: rollouts of different names can be equal.
+
+    Args:
+        path: The ``.asl`` file.
+        facts: Rows of the frame facts beside it: they hold the digest of the pixels before the log's image compression. Times that were
+            measured (names ending in ``_ms``) are left out.
+
+    Raises:
+        InputError: The log is missing or damaged.
+    """
+    parts: dict[str, dict[Key, str]] = {name: {} for name in COMPONENTS if name != "scores"}
+    asked_us = 0
+    for entry in AslReader(path):
+        kind = entry.WhichOneof("log_entry")
+        if kind == "actor_poses":
+            poses = entry.actor_poses
+            parts["ego"][poses.timestamp_us, "pose"] = _joined(p.SerializeToString() for p in poses.actor_poses if p.actor_id == EGO)
+            parts["actors"][poses.timestamp_us, "poses"] = _joined(p.SerializeToString() for p in poses.actor_poses if p.actor_id != EGO)
+        elif kind == "controller_return":
+            states = entry.controller_return.states
+            parts["ego"][states[-1].timestamp_us, "motion"] = _joined(state.SerializeToString() for state in states)
+        elif kind == "driver_camera_image":
+            image = entry.driver_camera_image.camera_image
+            parts["frames"][image.frame_end_us, f"camera {image.logical_id} as logged"] = sha256(image.image_bytes)
+        elif kind == "driver_request":
+            asked_us = entry.driver_request.time_now_us
+        elif kind == "driver_return":
+            parts["plans"][asked_us, "plan"] = sha256(entry.driver_return.SerializeToString())
+    for fact in facts:
+        text = json.dumps({name: value for name, value in fact.items() if not name.endswith("_ms")}, sort_keys=True)
+        parts["frames"][int(fact["t_us"] or 0), f"camera {fact['camera']}"] = sha256(text.encode())
+    return parts
+
+
+def digests(trace: Trace) -> dict[str, str]:
+    """Return one SHA-256 per component."""
+    return {name: sha256(repr(sorted(part.items())).encode()) for name, part in trace.items()}
+
+
+def first_difference(
+    one: Trace, other: Trace, start_us: int, control_us: int, until_us: Mapping[str, int] | None = None
+) -> Difference | None:
+    """Return the earliest difference, or None; what only one of the two has is a difference as well.
+
+    At equal times the component that the loop makes first is named; scores are named only where nothing else differs.
+
+    Args:
+        one: A rollout.
+        other: Another one.
+        start_us: Time of the first frame, from which steps are counted.
+        control_us: Length of a step.
+        until_us: Component -> first time that is not compared; components without one are left out. None compares everything.
+    """
+    found: list[tuple[bool, int, int, str]] = []  # scores?, time, rank, which part
+    for rank, name in enumerate(COMPONENTS):
+        if until_us is not None and name not in until_us:
+            continue
+        a, b = one.get(name, {}), other.get(name, {})
+        keys = [key for key in {**a, **b} if a.get(key) != b.get(key) and (until_us is None or key[0] < until_us[name])]
+        if keys:
+            t_us, what = min(keys)
+            found.append((name == "scores", t_us, rank, what if (t_us, what) in a and (t_us, what) in b else f"{what}, in one only"))
+    if not found:
+        return None
+    _, t_us, rank, what = min(found)
+    return Difference(COMPONENTS[rank], t_us, (t_us - start_us) // control_us if t_us >= start_us else None, what)
+
+
+def sha256(data: bytes) -> str:
+    """Return the hexadecimal SHA-256 of some bytes."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def _joined(parts: Iterable[bytes]) -> str:
+    return sha256(b"".join(len(part).to_bytes(4, "big") + part for part in parts))

@@ -1,0 +1,114 @@
+"""The determinism certificate of a run: one rollout is made again and compared with the first, component by component, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import pyarrow.parquet as pq
+
+from alpasim_plugin.log import read_facts
+from alpasim_plugin.log.trace import Key, digests, first_difference, sha256, trace_log
+from alpasim_plugin.runtime.cell import run_cell
+from alpasim_plugin.runtime.plan import Cell, RunPlan
+from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
+
+Certify = Literal["none", "one"]
+
+
+def certify(
+    plan: RunPlan, root: Path, manifests: Sequence[dict[str, Any]], threads: int, wanted: Certify, before: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Repeat one rollout of a finished run and return the certificate.
+
+    The rollout with the fewest control steps is taken, of several the one with the smallest content key: the choice depends on the plan
+    alone. It is repeated in this process, alone, whatever the run did.
+
+    Args:
+        plan: The run.
+        root: Its folder.
+        manifests: One per cell, in the plan's order.
+        threads: Threads of the repeat; results must not depend on them.
+        wanted: "none" makes no repeat.
+        before: The certificate that the folder held; it is kept where it is of the same rollout and the same log.
+
+    Returns:
+        ``status`` (equal, different, skipped), ``reason`` where skipped, ``cell``, ``path``, ``rollout_key``, ``score_key``, ``steps``,
+        ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout), ``repeated`` (the same of the repeat),
+        ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
+    """
+    if wanted == "none":
+        return {"status": "skipped", "reason": "switched off with --certify none"}
+    done = [(cell, m) for cell, m in zip(plan.cells, manifests, strict=True) if m["status"] == "ok"]
+    repeatable = [(cell, m) for cell, m in done if plan.scenarios[cell.scene].latency.kind != "measured"]
+    if not repeatable:
+        why = "latency 'measured' depends on the machine: no rollout can be repeated" if done else "no rollout was run to its end"
+        return {"status": "skipped", "reason": why}
+    cell, manifest = min(repeatable, key=lambda pair: (pair[1]["steps"], pair[0].rollout_key))
+    log_sha256 = sha256((root / cell.folder / LOG_NAME).read_bytes())
+    facts = {
+        "cell": {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed},
+        "path": cell.folder.as_posix(),
+        "rollout_key": cell.rollout_key,
+        "score_key": cell.score_key,
+        "steps": manifest["steps"],
+        "log_sha256": log_sha256,
+    }
+    if before and before.get("status") == "equal" and all(before.get(key) == value for key, value in facts.items()):
+        return dict(before)
+    return facts | _repeat(plan, cell, root, manifest, threads, log_sha256)
+
+
+def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], threads: int, log_sha256: str) -> dict[str, Any]:
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="simrun-repeat-") as name:
+        again = run_cell(cell, plan.options, Path(name), threads)
+        if again["status"] != "ok":
+            found = f"the repeat failed: {again['error']['found']}"
+            verdict: dict[str, Any] = {
+                "status": "different",
+                "repeated": {},
+                "first_difference": {"component": "run", "t_us": None, "step": None, "what": found},
+            }
+            return verdict | {"digests": {}, "wall_s": round(time.perf_counter() - began, 3)}
+        one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(Path(name) / cell.folder, again)
+        same_bytes = sha256((Path(name) / cell.folder / LOG_NAME).read_bytes()) == log_sha256
+    scenario = plan.scenarios[cell.scene]
+    difference = first_difference(one, other, scenario.start_us, scenario.rates.control_us)
+    first = None if difference is None else difference.as_dict()
+    if first is None and not same_bytes:
+        first = {"component": "log", "t_us": None, "step": None, "what": "an entry that belongs to no component"}
+    return {
+        "status": "equal" if first is None else "different",
+        "digests": digests(one),
+        "repeated": digests(other),
+        "first_difference": first,
+        "wall_s": round(time.perf_counter() - began, 3),
+    }
+
+
+def rollout_trace(folder: Path, manifest: Mapping[str, Any]) -> dict[str, dict[Key, str]]:
+    """Read all components of a finished rollout, its scores included.
+
+    Args:
+        folder: The rollout's folder.
+        manifest: Its manifest.
+
+    Raises:
+        InputError: A file is missing or damaged.
+    """
+    trace = trace_log(folder / LOG_NAME, read_facts(folder / FRAMES_NAME))
+    table = pq.read_table(folder / "steps.parquet", columns=["t_us", "metric", "value", "valid", "reason"])
+    values: dict[Key, list[str]] = defaultdict(list)
+    columns: list[list[Any]] = [table[name].to_pylist() for name in table.column_names]
+    for t_us, metric, *rest in zip(*columns, strict=True):
+        values[t_us, metric].append(repr(rest))
+    scores = {key: sha256("".join(found).encode()) for key, found in values.items()}
+    for name, entry in manifest["metrics"].items():
+        scores[0, f"{name} of the rollout"] = sha256(json.dumps(entry, sort_keys=True).encode())
+    return trace | {"scores": scores}
