@@ -136,6 +136,7 @@ class RenderRequest:
     camera: CameraSpec
     T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
+    ahead: Sequence[RenderRequest] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
 
 
 @dataclass(frozen=True)
@@ -145,9 +146,10 @@ class Frame:
     t_us: int
     camera: str
     rgb: U8  # (H, W, 3) sRGB
-    alpha: F32 | None = None  # (H, W) accumulated opacity, 0..1
+    alpha: F32 | None = None  # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
     depth: F32 | None = None  # (H, W) metres along the optical axis, alpha-weighted mean; 0 where alpha is 0
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
+    facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
 
 
 # --- policy ---------------------------------------------------------------------------------------------------------
@@ -333,7 +335,7 @@ class MetricSeries:
 
 @runtime_checkable
 class Renderer(Protocol):
-    """One rollout's renderer session."""
+    """One rollout's renderer session. What else a session may offer to the loop: `alpasim_plugin.runtime.offers`."""
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""

@@ -22,11 +22,12 @@ class LogView:
     Args:
         camera: The camera, usually of small size.
         depth: ``(H, W)`` metres.
-        alpha: ``(H, W)``; below one half nothing hides what is behind.
+        alpha: ``(H, W)``; up to one half nothing hides what is behind: it is sky.
     """
 
     def __init__(self, camera: PinholeCamera, depth: F32, alpha: F32) -> None:
         self.camera = camera
+        self.sky: F32 = (alpha <= 0.5).astype(np.float32)
         # The farthest surface of the neighbouring pixels: what shows beside an occluder's edge from a metre on counts as seen.
         farthest = cv2.dilate(depth, np.ones((3, 3), dtype=np.uint8))
         self.limit: F32 = np.where(alpha > 0.5, farthest * (1 + TOLERANCE) + MARGIN_M, np.inf).astype(np.float32)

@@ -26,6 +26,7 @@ from alpasim_plugin.gaussians.nodes import SceneNode
 from alpasim_plugin.gaussians.output import RasterOutput
 from alpasim_plugin.gaussians.rasterize import Backend
 from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.sky_mask import SkyMask
 from alpasim_plugin.geometry import interpolate, inverse
 from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario
@@ -56,7 +57,8 @@ class CleanRenderer:
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame at the shutter's end."""
-        return self._frame(request, self.scene.render(camera_at(request), request.actors, self.threads, self.backend))
+        camera, complete = camera_at(request), self.scenario.background is None
+        return self._frame(request, self.scene.render(camera, request.actors, self.threads, self.backend, sky_in_alpha=complete))
 
     def _frame(self, request: RenderRequest, out: RasterOutput) -> Frame:
         self.stats = out.stats
@@ -68,7 +70,7 @@ class SurrogateRenderer(CleanRenderer):
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
         super().__init__(scenario, seed, device, threads)
-        self.surrogate, self.ghosts, self._graphs = reconstruction_of(scenario, self.scene)
+        self.surrogate, self.sky, self.ghosts, self._graphs = reconstruction_of(scenario, self.scene)
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; how bad it is follows the rig's lateral distance from the logged path."""
@@ -79,9 +81,11 @@ class SurrogateRenderer(CleanRenderer):
             poses[actor_id] = self.surrogate.pose(actor_id, pose, request.t_us, self.seed, w)
             if actor_id + GHOST in graph.actors:
                 poses[actor_id + GHOST] = self.surrogate.ghost_pose(actor_id, pose, request.t_us, self.seed, w)
-        out = graph.render(camera_at(request), poses, self.threads, self.backend)
+        camera = camera_at(request)
+        out = graph.render(camera, poses, self.threads, self.backend)
         gain = self.surrogate.gain(request.t_us, self.seed, w)
-        return self._frame(request, replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0)))
+        shown = np.maximum(out.alpha, self.sky.share(camera))
+        return self._frame(request, replace(out, rgb=np.clip(out.rgb * gain, 0.0, 1.0), alpha=shown))
 
     def _graph(self, w: float) -> SceneGraph:
         if w not in self._graphs:
@@ -128,12 +132,17 @@ def scene_of(scenario: Scenario) -> SceneGraph:
     return _cached(f"scene:{scene_key(scenario)}", partial(_build, scenario))
 
 
-def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, list[SceneNode], dict[float, SceneGraph]]:
-    """Return the surrogate, the ghosts of moving actors and the graphs made so far, by weight; shared by all rollouts of a process."""
+def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
+    """Return the surrogate, its sky, the ghosts of moving actors, and graphs by weight as they are made; a process's rollouts share them."""
     key = f"surrogate:{scene_key(scenario)}:{scenario.degradation!r}"
     moving = [a.actor_id for a in scenario.actors if not a.is_static]
     ghosts = [SceneNode(i + GHOST, "actor", scene.actors[i].levels[1:]) for i in moving]
-    return _cached(key, lambda: (Surrogate(scenario, log_views(scenario, scene)), ghosts, {}))
+
+    def make() -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
+        views = log_views(scenario, scene)
+        return Surrogate(scenario, views), SkyMask(views), ghosts, {}
+
+    return _cached(key, make)
 
 
 def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:

@@ -1,0 +1,1 @@
+"""Make training data and train the networks of a fixer."""

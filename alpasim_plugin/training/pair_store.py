@@ -1,0 +1,196 @@
+"""Pairs on disk: one folder a sequence, one array file a channel, read through memory maps, also while more are being written.
+
+    ROOT/SPLIT/SEQUENCE/rgb_input.npy        (T, H, W, 3) uint8   what the damaged reconstruction shows
+                        rgb_gt.npy           (T, H, W, 3) uint8   what there is to see
+                        opacity.npy          (T, H, W)    uint8   accumulated opacity of the reconstruction, 255 is opaque
+                        sdmap.npy            (T, H, W, 3) uint8   semantic map
+                        T_world_camera.npy   (T, 4, 4)    float64
+                        t_us.npy             (T,)         int64
+                        sequence.json        scene, family, camera, how it was made; written last: a folder without it is unfinished
+
+Channels may differ in length; a sequence is as long as its shortest one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.types import F64, I64, U8
+
+SEQUENCE_FILE = "sequence.json"
+READING = "reading training pairs"
+
+
+class Pair(NamedTuple):
+    """One frame of a sequence: images ``(H, W, 3)``, opacity ``(H, W)`` uint8, pose ``(4, 4)``, microseconds."""
+
+    rgb_input: U8
+    rgb_gt: U8
+    opacity: U8
+    sdmap: U8
+    T_world_camera: F64
+    t_us: int
+
+
+@dataclass(frozen=True)
+class PairClip:
+    """Consecutive frames; arrays as in the files, possibly views of memory maps that nobody may write to."""
+
+    rgb_input: U8
+    rgb_gt: U8
+    opacity: U8
+    sdmap: U8
+    T_world_camera: F64
+    t_us: I64
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    def cut(self, start: int, frames: int) -> Self:
+        """Return ``frames`` frames from ``start``.
+
+        Raises:
+            InputError: The clip is shorter.
+        """
+        if not 0 <= start <= len(self) - frames:
+            raise InputError(READING, f"frames {start} to {start + frames}", f"the sequence has {len(self)}", "ask for fewer frames")
+        return type(self)(**{f.name: getattr(self, f.name)[start : start + frames] for f in fields(self)})
+
+
+CHANNELS = tuple(f.name for f in fields(PairClip))
+_FORMS: dict[str, tuple[int, str]] = {
+    "rgb_input": (4, "uint8"), "rgb_gt": (4, "uint8"), "opacity": (3, "uint8"), "sdmap": (4, "uint8"), "T_world_camera": (3, "float64"),
+    "t_us": (1, "int64"),
+}  # fmt: skip
+
+
+class PairSequence:
+    """A finished sequence on disk; its arrays are opened when first asked for.
+
+    Raises:
+        InputError: A channel is missing, of another type or size, or empty.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        path = folder / SEQUENCE_FILE
+        try:
+            self.info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(READING, str(path), str(error), "give a folder that 'simrun train pairs' finished") from error
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence's folder."""
+        return self.folder.name
+
+    @cached_property
+    def clip(self) -> PairClip:
+        """All frames that every channel has, as memory maps."""
+        arrays = {name: self._open(name) for name in CHANNELS}
+        size = arrays["rgb_gt"].shape[1:3]
+        for name in ("rgb_input", "opacity", "sdmap"):
+            if arrays[name].shape[1:3] != size:
+                raise InputError(READING, str(self.folder), f"{name} is {arrays[name].shape[1:3]}, rgb_gt {size}", "make all of one size")
+        length = min(len(a) for a in arrays.values())
+        if length == 0:
+            raise InputError(READING, str(self.folder), "no frame that every channel has", "remove the folder and make it again")
+        return PairClip(**{name: a[:length] for name, a in arrays.items()})
+
+    def _open(self, name: str) -> Any:
+        path = self.folder / f"{name}.npy"
+        axes, dtype = _FORMS[name]
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise InputError(READING, str(path), str(error), "give a whole .npy file of this channel") from error
+        if array.ndim != axes or array.dtype != np.dtype(dtype):
+            found = f"{array.dtype} with {array.ndim} axes"
+            raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/training.md)")
+        return array
+
+
+class PairDataset:
+    """The finished sequences of one split, in order of name; `refresh` finds those that were finished since.
+
+    Raises:
+        InputError: No such split, or no finished sequence in it.
+    """
+
+    def __init__(self, root: Path | str, split: str) -> None:
+        self.folder = Path(root) / split
+        self.sequences: tuple[PairSequence, ...] = ()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Look again for finished sequences."""
+        known = {s.name: s for s in self.sequences}
+        finished = sorted(p.parent for p in self.folder.glob(f"*/{SEQUENCE_FILE}") if not p.parent.name.startswith("."))
+        if not finished:
+            raise InputError(READING, str(self.folder), "no finished sequence", "make some with 'simrun train pairs'")
+        self.sequences = tuple(known.get(f.name) or PairSequence(f) for f in finished)
+
+    def __len__(self) -> int:
+        return len(self.sequences)
+
+
+def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapping[str, Any]) -> None:
+    """Write a sequence; it appears under its name only once complete.
+
+    Args:
+        folder: ROOT/SPLIT/SEQUENCE; replaced if it exists.
+        frames: At most ``length`` frames of one size, taken one at a time.
+        length: How many frames to make room for.
+        info: What to remember about it; goes to sequence.json.
+
+    Raises:
+        InputError: No frame, or frames of changing size.
+        InfrastructureError: The disk refuses.
+    """
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        count = _write_arrays(partial, frames, length)
+        document = {**info, "frames": count}
+        (partial / SEQUENCE_FILE).write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.replace(folder)
+    except OSError as error:
+        raise InfrastructureError("writing training pairs", str(folder), str(error), "make room, or choose another folder") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _write_arrays(folder: Path, frames: Iterable[Pair], length: int) -> int:
+    arrays: dict[str, Any] = {}
+    count = 0
+    for count, frame in enumerate(frames, start=1):
+        for name, value in frame._asdict().items():
+            item = np.asarray(value)
+            if name not in arrays:
+                shape = (length, *item.shape)
+                arrays[name] = np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=_FORMS[name][1], shape=shape)
+            if arrays[name].shape[1:] != item.shape or count > length:
+                found = f"frame {count} of {length}: {name} {item.shape}, the first is {arrays[name].shape[1:]}"
+                raise InputError("writing training pairs", str(folder), found, "give frames of one size, no more than announced")
+            arrays[name][count - 1] = item
+    if not count:
+        raise InputError("writing training pairs", str(folder), "no frames", "give at least one")
+    for name, array in arrays.items():
+        array.flush()
+        if count < length:  # the file's header says ``length``: write what there is under a header that tells the truth
+            short = np.array(array[:count])
+            del array
+            np.save(folder / f"{name}.npy", short)
+    return count

@@ -1,0 +1,127 @@
+"""Make pairs from scenarios: what a damaged reconstruction shows, what there is to see, and the map, along paths beside the log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.conditioning import draw_map
+from alpasim_plugin.fixers.map_layers import actor_boxes
+from alpasim_plugin.fixers.map_prepare import prepare_map
+from alpasim_plugin.gaussians.degrade import log_actors
+from alpasim_plugin.geometry import interpolate, yaw_of
+from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.pair_store import SEQUENCE_FILE, Pair, write_sequence
+from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario
+from alpasim_plugin.world.ground import ground_pose
+
+DOING = "making training pairs"
+
+
+@dataclass(frozen=True)
+class PairRecipe:
+    """How a sequence is made.
+
+    Args:
+        source: Renderer of the damaged frames.
+        target: Renderer of the frames to be learned.
+        wander_m: Largest sideways distance from the logged path; the camera drifts smoothly within it.
+        interval_us: Time between frames.
+        camera: Name of the scenario's camera; None takes the first.
+    """
+
+    source: str = "3dgs"
+    target: str = "clean"
+    wander_m: float = 1.5
+    interval_us: int = 100_000
+    camera: str | None = None
+
+
+def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: int, *, split: str, family: str, threads: int = 1) -> bool:
+    """Make one sequence of a scenario unless the same one is there already.
+
+    Args:
+        scenario: The whole of its driven time is rendered.
+        folder: ROOT/SPLIT/SEQUENCE.
+        recipe: How.
+        seed: Rollout seed: the path beside the log and what wanders in the source renderer.
+        split, family: Remembered in sequence.json.
+        threads: Threads of the rasteriser.
+
+    Returns:
+        Whether it was made now.
+
+    Raises:
+        InputError: The scenario has no such camera.
+    """
+    info = {
+        "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "split": split, "family": family,
+        "recipe": asdict(recipe),
+    }  # fmt: skip
+    if _is_made(folder, info):
+        return False
+    camera = _camera(scenario, recipe.camera)
+    times = range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
+    facts = {**info, "camera": {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}}
+    write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads), len(times), facts)
+    return True
+
+
+def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed: int, threads: int) -> Iterator[Pair]:
+    """Yield the frames of one sequence in order of time."""
+    source = make_renderer(recipe.source, scenario, seed=seed, threads=threads)
+    target = make_renderer(recipe.target, scenario, seed=seed, threads=threads)
+    layers = prepare_map(scenario.lane_map)
+    offset_m = wander(scenario, recipe, seed)
+    for i, t_us in enumerate(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)):
+        T_world_camera = beside_log(scenario, t_us, float(offset_m[i])) @ camera.T_rig_camera
+        actors = log_actors(scenario, t_us)
+        request = RenderRequest(t_us, camera, np.stack([T_world_camera, T_world_camera]), actors)
+        damaged = source.render(request)
+        if damaged.alpha is None:
+            raise InputError(DOING, f"renderer {recipe.source!r}", "frames without opacity", "choose a renderer that gives it")
+        opacity = np.rint(damaged.alpha * 255).clip(0, 255).astype(np.uint8)
+        sdmap = draw_map(layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=threads)
+        yield Pair(damaged.rgb, target.render(request).rgb, opacity, sdmap, T_world_camera, t_us)
+
+
+def wander(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
+    """Return a sideways offset for every frame ``(T,)``, metres, left positive: two slow waves of random size, at most ``wander_m``.
+
+    A fifth of the sequences stays on the logged path, where a reconstruction is best.
+    """
+    rng = stream(scenario.scene_id, seed, "training.wander")
+    t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
+    size = 0.0 if rng.random() < 0.2 else recipe.wander_m * np.sqrt(rng.uniform(0.05, 1.0))
+    periods_s, phases = rng.uniform([6.0, 12.0], [12.0, 30.0]), rng.uniform(0, 2 * np.pi, 2)
+    waves = np.sin(2 * np.pi * t_s[:, None] / periods_s + phases) @ np.array([0.35, 0.65])
+    return np.asarray(size * waves)
+
+
+def beside_log(scenario: Scenario, t_us: int, offset_m: float) -> F64:
+    """Return the rig's pose ``(4, 4)`` at a sideways offset from the logged one, on the ground, with the logged heading."""
+    T = interpolate(scenario.ego_log, t_us)
+    x, y = T[:2, 3] + offset_m * T[:2, 1]
+    return ground_pose(scenario.ground, float(x), float(y), yaw_of(T))
+
+
+def _camera(scenario: Scenario, name: str | None) -> CameraSpec:
+    for camera in scenario.cameras:
+        if name is None or camera.name == name:
+            return camera
+    known = sorted(c.name for c in scenario.cameras)
+    raise InputError(DOING, f"camera {name!r}", f"scene {scenario.scene_id!r} has {known}", "name one of them")
+
+
+def _is_made(folder: Path, info: dict[str, object]) -> bool:
+    path = folder / SEQUENCE_FILE
+    if not path.exists():
+        return False
+    document = json.loads(path.read_text(encoding="utf-8"))
+    return all(document.get(key) == value for key, value in info.items())

@@ -1,0 +1,47 @@
+"""Sky told from holes by what the logged views saw."""
+
+import numpy as np
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.log_views import LogView
+from alpasim_plugin.gaussians.sky_mask import SkyMask
+from alpasim_plugin.geometry import se2
+
+
+def camera(width: int, height: int, yaw_rad: float = 0.0, x_m: float = 0.0) -> PinholeCamera:
+    T_rig_camera = np.eye(4)
+    T_rig_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    K = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
+    return PinholeCamera.from_pose(width, height, K, se2(x_m, 0, yaw_rad) @ T_rig_camera)
+
+
+def view(alpha: np.ndarray, **pose: float) -> LogView:
+    return LogView(camera(alpha.shape[1], alpha.shape[0], **pose), np.ones(alpha.shape, np.float32), alpha)
+
+
+def test_same_pose_at_twice_the_size_repeats_what_the_view_saw() -> None:
+    alpha = np.ones((18, 32), np.float32)
+    alpha[:8] = 0.0
+    share = SkyMask([view(alpha)]).share(camera(64, 36))
+    np.testing.assert_array_equal(share[:15], 1.0)
+    np.testing.assert_array_equal(share[17:], 0.0)
+
+
+def test_turning_left_moves_the_skyline_to_the_right() -> None:
+    alpha = np.ones((18, 32), np.float32)
+    alpha[:, 16:] = 0.0  # sky to the right of straight ahead
+    share = SkyMask([view(alpha)]).share(camera(32, 18, yaw_rad=np.arctan(4 / 32)))
+    columns = share[9] > 0.5
+    assert np.flatnonzero(columns)[0] in (19, 20, 21)  # 4 columns on, as the focal length says
+    assert columns[21:].all()
+
+
+def test_nearest_view_that_looks_the_same_way_is_taken() -> None:
+    clear, hidden = np.zeros((18, 32), np.float32), np.ones((18, 32), np.float32)
+    mask = SkyMask([view(clear, x_m=0.0), view(hidden, x_m=10.0), view(clear, x_m=9.0, yaw_rad=np.pi)])
+    assert mask.share(camera(32, 18, x_m=1.0)).min() == 1.0
+    assert mask.share(camera(32, 18, x_m=9.0)).max() == 0.0
+
+
+def test_without_views_nothing_is_sky() -> None:
+    assert SkyMask([]).share(camera(8, 4)).max() == 0.0
