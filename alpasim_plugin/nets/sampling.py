@@ -5,7 +5,7 @@ Noise is always an argument. Everything works on normalised latents ``(B, C, T, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
 
 import torch
@@ -151,12 +151,7 @@ def sample_block(
         found = f"{len(sources)} sources for {len(schedule)} steps with history {history!r}"
         do = f"give {sources_needed(schedule, history)}: one per step" + (", one for the cache write" if history == "finalise" else "")
         raise InputError("sampling a block of latents", "sources", found, do)
-    n = 0 if given is None else given.shape[2]
-    mask = None if given is None else torch.cat([torch.ones_like(given[:, :1]), torch.zeros_like(sources[0][:, :1, n:])], dim=2)
-
-    def fixed(z: Tensor) -> Tensor:
-        return z if given is None else torch.cat([given, z[:, :, n:]], dim=2)
-
+    fixed, mask = _given(given, sources[0])
     z = sources[0]
     for i, level in enumerate(schedule):
         last = i == len(schedule) - 1
@@ -165,7 +160,36 @@ def sample_block(
         if not last:
             z = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
     if history == "finalise":
-        level = context_level()
-        noised = interpolant(z_0, sources[-1], level.sigma)
-        (finalise_net or net).step(fixed(noised), level.t, text, hdmap, cache, commit, mask)
+        finalise(finalise_net or net, z_0, sources[-1], text, hdmap, cache, given, commit)
     return z_0
+
+
+def finalise(
+    net: BlockNet,
+    z_0: Tensor,
+    eps: Tensor,
+    text: Tensor | TextContext,
+    hdmap: Tensor,
+    cache: BlockCache,
+    given: Tensor | None = None,
+    commit: bool = True,
+) -> None:
+    """Write clean latents into the history by a forward over them, slightly noised and told t = 128.
+
+    Args:
+        net, text, hdmap, cache, given, commit: As in `sample_block`.
+        z_0: ``(B, C, T, H, W)`` clean latents of the open block.
+        eps: Standard normal noise like ``z_0``.
+    """
+    level = context_level()
+    fixed, mask = _given(given, z_0)
+    net.step(fixed(interpolant(z_0, eps, level.sigma)), level.t, text, hdmap, cache, commit, mask)
+
+
+def _given(given: Tensor | None, like: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
+    """Return what puts known latents at the head of a block, and the condition mask that says where."""
+    if given is None:
+        return lambda z: z, None
+    n = given.shape[2]
+    mask = torch.cat([torch.ones_like(given[:, :1]), torch.zeros_like(like[:, :1, n:])], dim=2)
+    return lambda z: torch.cat([given, z[:, :, n:]], dim=2), mask

@@ -64,14 +64,21 @@ def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
     return NoiseLevel(t, float(table[np.abs(TABLE * table - t).argmin()]))
 
 
-def steps(count: int) -> tuple[NoiseLevel, ...]:
-    """Return the schedule of ``NAME@count``: named steps evenly spaced from 1000 down.
+def names(count: int) -> tuple[float, ...]:
+    """Return the named steps of ``NAME@count``, evenly spaced from 1000 down.
 
-    One, two and four steps are the released lists [1000], [1000, 500] and [1000, 750, 500, 250].
+    Example:
+        >>> names(1), names(2), names(4)
+        ((1000.0,), (1000.0, 500.0), (1000.0, 750.0, 500.0, 250.0))
     """
     if count < 1:
         raise InputError("choosing denoising steps", "step count", str(count), "take at least one step")
-    return from_names([TABLE * (count - i) / count for i in range(count)])
+    return tuple(TABLE * (count - i) / count for i in range(count))
+
+
+def steps(count: int) -> tuple[NoiseLevel, ...]:
+    """Return the schedule of ``NAME@count``; one, two and four steps are the released lists."""
+    return from_names(names(count))
 
 
 def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:

@@ -1,0 +1,44 @@
+"""The fixer that fixes nothing: closed-loop wiring and timing without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from alpasim_plugin.fixers.base import FIXERS, BlockRule
+from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.views import group_views
+from alpasim_plugin.types import U8, Frame
+
+
+@FIXERS.register("identity", "passes frames on unchanged")
+class IdentityFixer:
+    """Return every frame as it came.
+
+    Args:
+        settings: Gives the length of a block.
+        scene_id, seed, device, threads: As every fixer takes them; without effect here.
+    """
+
+    settings_model = FixerSettings
+    trained = False
+
+    def __init__(self, settings: FixerSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+        self.settings = settings
+        self.label = f"{settings.name}, no network"
+        self.blocks = BlockRule.of_latents(settings.block_latents)
+        self._done = 0
+
+    def reset(self, seed: int) -> None:
+        """Start a new rollout."""
+        self._done = 0
+
+    def preview(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        """Return the block, checked as every fixer checks it."""
+        group_views(block, maps, self.blocks.frames(self._done))
+        return tuple(block)
+
+    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        """Return the block and count it."""
+        out = self.preview(block, maps)
+        self._done += 1
+        return out

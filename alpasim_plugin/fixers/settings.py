@@ -1,0 +1,162 @@
+"""Settings of a fixer: ``configs/fixers/NAME.yaml``, validated, with dotted overrides on top."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from alpasim_plugin.config import apply_overrides, load_yaml, validate
+from alpasim_plugin.yaml_marks import Document
+
+DOING = "reading the settings of a fixer"
+Positive = Annotated[int, Field(ge=1)]
+
+
+class Part(BaseModel):
+    """A section: frozen, and no key that the model does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class FixerSettings(Part):
+    """What the closed loop needs to know of any fixer."""
+
+    name: str = Field(description="Name in tables and reports.")
+    block_latents: Positive = Field(default=2, description="Latents of a block: 2 are 8 frames, 5 at the start of a rollout.")
+    mode: Literal["chunk", "speculative"] = Field(
+        default="speculative",
+        description="chunk: the plan is committed for a block. speculative: a block is made along the plan and made again where "
+        "the true poses leave it.",
+    )
+    tolerance_m: float = Field(default=0.02, ge=0, description="Speculative: largest camera displacement from the predicted pose.")
+    tolerance_deg: float = Field(default=0.1, ge=0, description="Speculative: largest camera rotation from the predicted pose.")
+    uses_map: bool = Field(default=False, description="Whether the semantic map is drawn and given to the fixer.")
+
+
+class DiTSettings(Part):
+    """Sizes of the transformer where they are not read off weights."""
+
+    width: Positive = Field(description="Channels of the token stream.")
+    blocks: Positive = Field(description="Transformer blocks.")
+    head_width: Positive = Field(description="Channels of an attention head, even.")
+    mlp_width: Positive = Field(description="Inner channels of the feed-forward part.")
+    adaln_rank: Positive = Field(description="Rank of the time modulation.")
+    text_width: Positive = Field(description="Width of the prompt's features.")
+    context_width: Positive = Field(description="Width of the projected prompt.")
+
+
+class CodecSettings(Part):
+    """The video autoencoder."""
+
+    kind: Literal["tiny", "wan"] = Field(description="tiny: TinyVAE. wan: the Wan 2.1 autoencoder at any width.")
+    base: Positive = Field(default=96, description="Width of an untrained wan autoencoder: 96 as published, 24 for LightVAE.")
+
+
+class DecoderSettings(Part):
+    """From latents to frames."""
+
+    kind: Literal["latent", "render", "taehv"] = Field(
+        default="latent",
+        description="latent: the autoencoder's decoder. render: the same, and it also sees the render's frames (tiny only). "
+        "taehv: the tiny Wan decoder.",
+    )
+    scaled: bool = Field(default=False, description="taehv: weights expect de-normalised latents (LightTAE).")
+
+
+class WeightsSettings(Part):
+    """Files with weights; relative paths start at the folder of the file that names them, or at the working folder."""
+
+    bundle: str | None = Field(default=None, description="A safetensors file or a folder with everything (docs/fixers.md).")
+    dit: str | None = Field(default=None, description="The transformer alone.")
+    vae: str | None = Field(default=None, description="The autoencoder alone.")
+    decoder: str | None = Field(default=None, description="The tiny Wan decoder.")
+    prompt: str | None = Field(default=None, description="Safetensors with 'text' (tokens, text_width).")
+    sha256: dict[str, str] = Field(default={}, description="Expected digests by the keys above, checked before reading.")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> WeightsSettings:
+        parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self, key) is not None]
+        if self.bundle is not None and parts:
+            raise ValueError(f"a bundle and {', '.join(parts)} | give the bundle alone, or the parts")
+        unknown = sorted(set(self.sha256) - {"bundle", "dit", "vae", "decoder", "prompt"})
+        if unknown:
+            raise ValueError(f"sha256 for {', '.join(unknown)} | name bundle, dit, vae, decoder or prompt")
+        return self
+
+
+class OneFixerSettings(FixerSettings):
+    """A causal latent fixer: autoencoder, transformer with history, flow steps."""
+
+    dit: DiTSettings = Field(description="Sizes of the transformer where no weights say them.")
+    rope_ratios: tuple[float, float, float] = Field(default=(3.0, 3.0, 1.0), description="NTK stretch: height, width, time.")
+    vae: CodecSettings = Field(description="The video autoencoder.")
+    decoder: DecoderSettings = Field(default=DecoderSettings(), description="From latents to frames.")
+    weights: WeightsSettings = Field(default=WeightsSettings(), description="Files with weights.")
+    untrained: Literal["identity", "random", "refuse"] = Field(
+        default="refuse", description="What stands in for missing weights: a network that changes nothing, a random one, or an error."
+    )
+    window: Positive = Field(default=6, description="Latents that a block sees, itself and the sink included.")
+    sink: int = Field(default=0, ge=0, description="First latents of the rollout that stay in sight.")
+    steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
+    history: Literal["finalise", "last-forward"] = Field(
+        default="last-forward", description="What the history keeps of a block: keys and values of an extra forward, or of the last step."
+    )
+    holes: Literal["noise", "render"] = Field(
+        default="noise", description="What a block starts from where the render is transparent: noise (Eq. 1), or the render all the same."
+    )
+    precision: Literal["fp32", "bf16", "fp16", "int8"] = Field(default="fp32", description="Of the transformer; int8 is its linears.")
+    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
+    fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> OneFixerSettings:
+        if any(b >= a for a, b in zip(self.steps, self.steps[1:], strict=False)) or self.steps[0] != 1000 or self.steps[-1] <= 0:
+            raise ValueError(f"steps = {list(self.steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
+        if self.sink > self.window:
+            raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
+        if self.decoder.kind == "render" and self.vae.kind != "tiny":
+            raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
+        if self.decoder.kind == "taehv" and self.vae.kind != "wan":
+            raise ValueError(f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan")
+        return self
+
+
+S = TypeVar("S", bound=FixerSettings)
+
+
+def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S:
+    """Read ``configs/fixers/NAME.yaml`` (a fixer without a file has its model's defaults) and apply overrides.
+
+    Args:
+        name: The fixer.
+        model: What its settings are.
+        overrides: ``window=4``, ``decoder.kind=latent``.
+
+    Raises:
+        InputError: An unknown key with the nearest known one, or a bad value, with file, line and column.
+    """
+    path = Path(str(resources.files("configs.fixers"))) / f"{name}.yaml"
+    document = load_yaml(path, DOING) if path.is_file() else Document({"name": name}, {}, f"the defaults of {name}")
+    return validate(model, _absolute(_override(document, overrides)), DOING)
+
+
+def _override(document: Document, overrides: Sequence[str]) -> Document:
+    """Apply overrides under the prefix that users write, ``--set fixer.KEY=VALUE``, so that messages show it."""
+    nested = Document({"fixer": document.data}, {("fixer", *loc): mark for loc, mark in document.marks.items()}, document.path)
+    done = apply_overrides(nested, [f"fixer.{text}" for text in overrides], DOING)
+    marks = {loc[1:]: mark for loc, mark in done.marks.items()}
+    return Document(done.data["fixer"], marks, document.path, document.sources, tuple(overrides))
+
+
+def _absolute(document: Document) -> Document:
+    """Resolve relative paths of weights against the file, or the working folder, that they were written in."""
+    weights = document.data.get("weights")
+    if not isinstance(weights, dict):
+        return document
+    paths = {key: str(document.folder_of(("weights", key)) / value) for key, value in weights.items() if isinstance(value, str)}
+    return replace(document, data={**document.data, "weights": {**weights, **paths}})

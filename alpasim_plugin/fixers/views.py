@@ -1,0 +1,170 @@
+"""Between frames and tensors: grouping by camera and size, filling up to the block's grid, and the way back.
+
+A *view* is one camera's frames of a block. Views of one size stand side by side as a batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.nets.clips import ClipSize, crop_clip, pad_clip
+from alpasim_plugin.nets.sampling import RANGE_SLACK as SLACK
+from alpasim_plugin.types import F32, U8, Frame
+
+DOING = "giving a block of frames to a fixer"
+SIDE = 16  # pixels of a token's side
+HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
+
+
+@dataclass(frozen=True)
+class Views:
+    """The frames of cameras of one size, oldest first."""
+
+    cameras: tuple[str, ...]  # B of them, sorted
+    index: tuple[tuple[int, ...], ...]  # per camera, where its T frames stand in the block
+    t_us: tuple[tuple[int, ...], ...]  # per camera
+    rgb: U8  # (B, T, H, W, 3)
+    alpha: F32 | None  # (B, T, H, W), 0 to 1; None where every pixel is opaque
+    maps: U8 | None  # (B, T, H, W, 3)
+
+    @property
+    def size(self) -> ClipSize:
+        """Frames, height and width."""
+        return ClipSize(*self.rgb.shape[1:4])
+
+    def same(self, other: Views | None) -> bool:
+        """Say whether two blocks are equal bit for bit."""
+        return other is not None and all(_same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One block as the networks take it, filled up in time and space."""
+
+    rgb: Tensor  # (B, 3, T, H, W) in [-1, 1]
+    alpha: Tensor | None  # (B, 1, T, H, W), 0 to 1; None where every pixel is opaque
+    maps: Tensor | None  # (B, 3, T, H, W) in [-1, 1]
+
+
+def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> tuple[Views, ...]:
+    """Sort a block by size, camera and time.
+
+    Args:
+        block: Frames of any cameras in any order.
+        maps: Semantic maps of the same frames, or empty.
+        frames_due: Most frames that a camera may have.
+
+    Returns:
+        One batch of views per image size; pixels are copied.
+
+    Raises:
+        InputError: No frame, too many, cameras with different numbers of frames, two frames at one time, sizes that change within a camera,
+            or maps that do not belong to the frames.
+        RendererError: An opacity that is not a number or outside [0, 1].
+    """
+    if not block:
+        raise InputError(DOING, "the block", "no frames", "give at least one frame per camera")
+    if maps and len(maps) != len(block):
+        raise InputError(DOING, "semantic maps", f"{len(maps)} for {len(block)} frames", "give one per frame in the same order, or none")
+    order = sorted(range(len(block)), key=lambda i: (block[i].rgb.shape, block[i].camera, block[i].t_us))
+    index: dict[str, list[int]] = {}
+    for i in order:
+        index.setdefault(block[i].camera, []).append(i)
+    counts = {camera: len(mine) for camera, mine in index.items()}
+    if len(set(counts.values())) > 1 or max(counts.values()) > frames_due:
+        do = f"give each camera the same number of frames, at most {frames_due}"
+        raise InputError(DOING, "frames by camera", str(counts), do)
+    for camera, mine in index.items():
+        _check_view(camera, [block[i] for i in mine], [maps[i] for i in mine] if maps else [])
+    sizes: dict[tuple[int, ...], list[str]] = {}
+    for camera, mine in index.items():
+        sizes.setdefault(block[mine[0]].rgb.shape, []).append(camera)
+    return tuple(_stack(block, maps, cameras, index) for cameras in sizes.values())
+
+
+def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -> Clip:
+    """Bring views to tensors: ``x / 127.5 - 1``, last frame repeated up to ``frames_due``, edges up to multiples of 16."""
+
+    def video(images: U8 | F32) -> Tensor:
+        x = torch.from_numpy(images).to(device).float()
+        x = x if images.dtype == np.float32 else x.div_(HALF).sub_(1)
+        x = x.permute(0, 4, 1, 2, 3)
+        short = frames_due - x.shape[2]
+        if short:
+            x = torch.cat([x, x[:, :, -1:].expand(-1, -1, short, -1, -1)], dim=2)
+        return pad_clip(x, group=1, side=SIDE)[0]
+
+    return Clip(
+        video(views.rgb),
+        None if views.alpha is None else video(views.alpha[..., None]),
+        None if views.maps is None else video(views.maps),
+    )
+
+
+def to_images(video: Tensor, size: ClipSize) -> U8:
+    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values beyond the range are cut."""
+    cropped = crop_clip(video, size).float().clamp(-1, 1)
+    images: U8 = cropped.add(1).mul_(HALF).round_().to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
+    return images
+
+
+def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> None:
+    times = [frame.t_us for frame in frames]
+    shape = frames[0].rgb.shape
+    if len(set(times)) < len(times):
+        raise InputError(DOING, f"camera {camera!r}", f"two frames at one time: {times}", "give every frame once")
+    for frame in frames:
+        what = f"camera {camera!r} at {frame.t_us} us"
+        if frame.rgb.ndim != 3 or frame.rgb.shape[2] != 3 or 0 in frame.rgb.shape or frame.rgb.dtype != np.uint8:
+            raise InputError(DOING, what, f"rgb is {frame.rgb.dtype} {frame.rgb.shape}", "give (height, width, 3) uint8")
+        if frame.rgb.shape != shape:
+            do = "keep a camera's image size for the whole rollout"
+            raise InputError(DOING, what, f"rgb of {frame.rgb.shape[:2]} after {shape[:2]} (height, width)", do)
+        if frame.alpha is not None:
+            _check_alpha(what, frame.alpha, shape[:2])
+    for t_us, image in zip(times, maps, strict=False):
+        if image.shape != shape or image.dtype != np.uint8:
+            found = f"{image.dtype} {image.shape}"
+            raise InputError(DOING, f"map of camera {camera!r} at {t_us} us", found, f"give uint8 {shape}, the size of the frame")
+
+
+def _check_alpha(what: str, alpha: F32, shape: tuple[int, ...]) -> None:
+    if alpha.shape != shape:
+        raise InputError(DOING, what, f"alpha of {alpha.shape} with rgb of {shape} (height, width)", "give both at one size")
+    low, high = float(alpha.min()), float(alpha.max())
+    if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max hand on
+        found = f"opacity with {int(np.isnan(alpha).sum())} NaN, values from {np.nanmin(alpha):.4g} to {np.nanmax(alpha):.4g}"
+        raise RendererError(DOING, what, found, "repair the renderer: its opacity is accumulated alpha, 0 to 1")
+
+
+def _stack(block: Sequence[Frame], maps: Sequence[U8], cameras: Sequence[str], index: dict[str, list[int]]) -> Views:
+    names = tuple(sorted(cameras))
+    order = tuple(tuple(index[name]) for name in names)
+    shape = block[order[0][0]].rgb.shape
+    lead = (len(names), len(order[0]))
+    flat = [i for mine in order for i in mine]
+    frames = [block[i] for i in flat]
+    alpha = None
+    if any(frame.alpha is not None and frame.alpha.min() < 1 for frame in frames):
+        alphas = [np.ones(shape[:2], np.float32) if frame.alpha is None else frame.alpha for frame in frames]
+        alpha = np.stack(alphas, dtype=np.float32).clip(0, 1).reshape(*lead, *shape[:2])
+    return Views(
+        names,
+        order,
+        tuple(tuple(block[i].t_us for i in mine) for mine in order),
+        np.stack([frame.rgb for frame in frames]).reshape(*lead, *shape),
+        alpha,
+        np.stack([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
+    )
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b)
+    return a is b if a is None or b is None else bool(a == b)
