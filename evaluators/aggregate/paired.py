@@ -6,96 +6,183 @@ not independent: differences are averaged per scene, and the scene is the unit o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, Direction
-from evaluators.aggregate.intervals import cluster_means, clustered
-from evaluators.aggregate.rows import Row, column, metric_names, renderers
+from alpasim_plugin.types import F64, Bool
+from evaluators.aggregate.intervals import Interval, cluster_means, rate_interval, t_interval
+from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
+from evaluators.aggregate.rows import Cell, Row, Side, failure_of, metric_names, reason_of, sides
+from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
 from evaluators.metrics import info
 
-Verdict = Literal["better", "worse", "undecided"]
-ALPHA = 0.05
+LISTED = 50  # missing cells named per metric; the count is always whole
+NO_PAIR = "no scene-seed cell has this metric on both sides"
 
 
-def paired(rows: Sequence[Row], baseline: str, metrics: Sequence[str] | None = None) -> dict[str, dict[str, dict[str, Any]]]:
+def paired(
+    rows: Sequence[Row],
+    baseline: str,
+    metrics: Sequence[str] | None = None,
+    margins: Mapping[str, float] | None = None,
+    listed: int = LISTED,
+) -> dict[str, dict[str, dict[str, Any]]]:
     """Compare every renderer with a baseline, cell by cell.
 
     Args:
         rows: As for `aggregate`.
         baseline: Renderer that the others are compared with.
         metrics: Which metrics; all that any row has by default.
+        margins: How much worse is accepted, by metric, in its unit; `default_margin` for the others.
+        listed: How many missing cells to name per metric.
 
     Returns:
-        RENDERER -> METRIC -> ``baseline``, ``diff`` (renderer minus baseline: mean over scenes of the scene's mean difference), ``ci95``
-        ([low, high], t interval on the scenes' mean differences), ``p_value``, ``test``, ``verdict`` (better, worse, undecided),
-        ``n_cells``, ``n_scenes``, ``n_missing`` (cells that only one side has), ``unit``, ``direction``; ``reason`` where numbers are None.
+        RENDERER -> METRIC -> what `compare` gives.
 
     Raises:
         InputError: No row has the baseline.
     """
-    known = renderers(rows)
-    if baseline not in known:
-        raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(known)}")
+    split = sides(rows)
+    if baseline not in split:
+        raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(split)}")
     names = list(metrics) if metrics is not None else metric_names(rows)
-    split = {name: [row for row in rows if row["renderer"] == name] for name in known}
+    chosen = {name: (margins or {}).get(name, default_margin(name)) for name in names}
     return {
-        renderer: {metric: compare(split[renderer], split[baseline], metric, baseline) for metric in names}
-        for renderer in known
+        renderer: {name: compare(side, split[baseline], name, baseline, chosen[name], listed) for name in names}
+        for renderer, side in split.items()
         if renderer != baseline
     }
 
 
-def compare(rows: Sequence[Row], base_rows: Sequence[Row], metric: str, baseline: str) -> dict[str, Any]:
-    """Compare one metric of two sets of rows on their shared cells; see `paired`."""
+def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, listed: int = LISTED) -> dict[str, Any]:
+    """Compare one metric of two sides on their shared cells.
+
+    Returns:
+        ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
+        and its ``method``; ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference`` (better,
+        worse, none shown: whatever the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
+        ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
+        exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
+        independent);
+        ``n_cells``, ``n_scenes``, ``n_missing`` and ``missing`` (planned cells without a pair: cell, side, why); ``unit``, ``direction``;
+        ``reason`` where numbers are None, ``note`` where they need care.
+    """
     facts = info(metric)
-    here, there = column(rows, metric), column(base_rows, metric)
-    of_base = dict(zip(there.cells, there.values, strict=True))
-    shared = [(cell, value - of_base[cell]) for cell, value in zip(here.cells, here.values, strict=True) if cell in of_base]
+    mine, base, lost = _pair(here, there, metric, listed)
+    n_missing = lost.pop("count")
     entry: dict[str, Any] = {
         "baseline": baseline,
         "diff": None,
         "ci95": None,
+        "method": None,
         "p_value": None,
         "test": None,
+        "margin": margin,
         "verdict": "undecided",
-        "n_cells": len(shared),
-        "n_scenes": len({cell[1] for cell, _ in shared}),
-        "n_missing": len(set(here.cells) ^ set(there.cells)),
+        "difference": "none shown",
+        "more_scenes": None,
+        "n_cells": len(mine.cells),
+        "n_scenes": len({cell[1] for cell in mine.cells}),
+        "n_missing": n_missing,
+        "missing": lost["cells"],
         "unit": facts.unit,
         "direction": facts.direction,
     }
-    if not shared:
-        return entry | {"reason": "no scene-seed cell has this metric on both sides"}
-    difference = np.array([d for _, d in shared])
-    scenes = [cell[1] for cell, _ in shared]
-    interval = clustered(difference, scenes)
-    entry["diff"], entry["ci95"] = interval.centre, interval.bounds
+    if not mine.cells:
+        return entry | {"reason": NO_PAIR}
+    delta = mine.values - base
+    means, _ = cluster_means(delta, [cell[1] for cell in mine.cells])
+    up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
+    entry["scenes"] = {"up": up, "down": down, "same": len(means) - up - down, "p_value": sign_test(up, down)}
+    if facts.is_flag:
+        gained, lost_events = int(np.sum((mine.values > 0) & (base == 0))), int(np.sum((mine.values == 0) & (base > 0)))
+        entry["cells"] = {"only_here": gained, "only_baseline": lost_events, "p_value": sign_test(gained, lost_events)}
+    interval = flag_interval(delta, [c[1] for c in mine.cells]) if facts.is_flag else t_interval(means, "scenes")
+    entry["diff"], entry["ci95"], entry["method"] = interval.centre, interval.bounds, interval.method or None
     if interval.reason:
         return entry | {"reason": interval.reason}
-    entry["p_value"], entry["test"] = p_value(cluster_means(difference, scenes)[0], facts.is_flag)
-    entry["verdict"] = verdict(interval.bounds, entry["p_value"], interval.centre, facts.direction)
+    if interval.note:
+        entry["note"] = interval.note
+    entry["spread"] = float(np.std(means, ddof=1))
+    entry["p_value"], entry["test"] = p_value(means, facts.is_flag)
+    entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, facts.direction)
+    entry["difference"] = difference(interval.bounds, entry["p_value"], facts.direction)
+    if entry["verdict"] == "undecided" and facts.direction != "none":
+        seen = harm([interval.centre] * 2, facts.direction)[0]
+        entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, facts.is_flag)
     return entry
 
 
-def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
-    """Test that scene differences ``(G,)`` centre on zero.
+def flag_interval(delta: F64, scenes: Sequence[str]) -> Interval:
+    """Return the interval of a difference of rates.
 
-    Flags, and differences that are all alike (where t has no spread to go by), take the exact two-sided sign test on the scenes that
-    changed; other metrics the paired t test.
+    A t interval on the scenes' mean differences, once enough scenes changed for it to hold. Where fewer than six changed, the rates of
+    cells that gained and that lost the event get their own intervals (`rate_interval`), which are joined by the method of variance
+    estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008): wide, and never without width.
+
+    Args:
+        delta: ``(N,)`` differences per cell, in [-1, 1].
+        scenes: Scene of each cell.
     """
-    if is_flag or bool(np.all(means == means[0])):
-        up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
-        return (1.0 if up + down == 0 else float(stats.binomtest(up, up + down).pvalue)), "exact sign test on scenes"
-    return float(stats.ttest_1samp(means, 0.0).pvalue), "paired t test on scene means"
+    means, _ = cluster_means(delta, scenes)
+    gained, _ = cluster_means(np.maximum(delta, 0.0), scenes)
+    lost, _ = cluster_means(np.maximum(-delta, 0.0), scenes)
+    changed = int(np.sum((gained > 0) | (lost > 0)))
+    if len(means) < 2 or changed >= LEAST_DECIDED_FLAGS:
+        return t_interval(means, "scenes")
+    up, down = rate_interval(gained), rate_interval(lost)
+    if up.low is None or up.high is None or down.low is None or down.high is None:
+        raise AssertionError("two scenes or more have a rate interval")
+    centre = float(np.mean(means))
+    low = centre - float(np.hypot(up.centre - up.low, down.high - down.centre))
+    high = centre + float(np.hypot(up.high - up.centre, down.centre - down.low))
+    note = f"{changed} of {len(means)} scenes changed: bounds joined from those of gained and lost events"
+    return Interval(centre, max(low, -1.0), min(high, 1.0), note=note, method="gained and lost rates joined")
 
 
-def verdict(bounds: list[float] | None, p: float, diff: float, direction: Direction) -> Verdict:
-    """Call a difference better or worse only where interval and test agree that it is not zero, and the metric has a better side."""
-    if bounds is None or direction == "none" or p >= ALPHA or bounds[0] <= 0.0 <= bounds[1]:
-        return "undecided"
-    return "better" if (diff < 0) == (direction == "lower") else "worse"
+class _Shared:
+    """Cells with a value on both sides, and the values of one side."""
+
+    def __init__(self, cells: list[Cell], values: F64) -> None:
+        self.cells, self.values = cells, values
+
+
+def _pair(here: Side, there: Side, metric: str, listed: int) -> tuple[_Shared, F64, dict[str, Any]]:
+    """Return the shared cells with both values, and the planned cells that have none."""
+    mine, base = here.values(metric), there.values(metric)
+    place = {cell: i for i, cell in enumerate(there.cells)}
+    index = np.array([place.get(cell, -1) for cell in here.cells], dtype=np.int64)
+    partner = np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(mine), np.nan)
+    both: Bool = np.isfinite(mine) & np.isfinite(partner)
+    known = set(here.cells)
+    lone = [here.cells[i] for i in np.flatnonzero(~both)] + [cell for cell in there.cells if cell not in known]
+    cells = [_lost(cell, (here, mine), (there, base), metric) for cell in sorted(lone)[:listed]]
+    shared = [here.cells[i] for i in np.flatnonzero(both)]
+    return _Shared(shared, mine[both]), partner[both], {"count": len(lone), "cells": cells}
+
+
+def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str) -> dict[str, Any]:
+    why = {"here": _why(cell, *here, metric), "baseline": _why(cell, *there, metric)}
+    gone = {side: text for side, text in why.items() if text}
+    policy, scene, seed = cell
+    return {
+        "policy": policy,
+        "scene": scene,
+        "seed": seed,
+        "missing": "both" if len(gone) == 2 else next(iter(gone)),
+        "why": "; ".join(f"{side}: {text}" for side, text in gone.items()),
+    }
+
+
+def _why(cell: Cell, side: Side, values: F64, metric: str) -> str:
+    """Return why a side has no value for a cell, or ""."""
+    found = side.rows_of.get(cell)
+    if found is None:
+        return "not planned"
+    if np.isfinite(values[side.cell[found[0]]]):
+        return ""
+    row = side.rows[found[0]]
+    return f"not valid ({reason_of(row, metric)})" if side.ok[found[0]] else f"failed ({failure_of(row)})"

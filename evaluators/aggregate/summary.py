@@ -7,9 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from evaluators.aggregate.intervals import clustered, normal_half_width
-from evaluators.aggregate.rows import Row, column, is_ok, metric_names, renderers
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F64, I64
+from evaluators.aggregate.bootstrap import cluster_bootstrap
+from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, normal_half_width, wilson_rate
+from evaluators.aggregate.rows import Row, Side, metric_names, sides
 from evaluators.metrics import info
+
+BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
 
 def aggregate(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> dict[str, dict[str, dict[str, Any]]]:
@@ -21,44 +26,66 @@ def aggregate(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> dict
         metrics: Which metrics; all that any row has by default.
 
     Returns:
-        RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered`` ([low, high], t interval on scene
-        means), ``n_rollouts``, ``n_scenes``, ``n_invalid``, ``unit``, ``direction``; for rates also ``n_events``. What does not exist is
-        None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason``; ``note`` qualifies the clustered interval.
+        RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered`` ([low, high], scenes as clusters) and
+        its ``ci95_clustered_method``, ``ci95_bootstrap`` ([low, high], scenes redrawn), ``design_effect``, ``n_rollouts``, ``n_scenes``,
+        ``n_invalid``, ``unit``, ``direction``; for rates also ``n_events``, ``ci95_wilson`` and ``ci95_exact`` (both as if rollouts were
+        independent). What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
+        ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
     """
     names = list(metrics) if metrics is not None else metric_names(rows)
-    out: dict[str, dict[str, dict[str, Any]]] = {}
-    for renderer in renderers(rows):
-        mine = [row for row in rows if row["renderer"] == renderer]
-        out[renderer] = {name: _entry(mine, name) for name in names}
-    return out
+    return {renderer: {name: _entry(side, name) for name in names} for renderer, side in sides(rows).items()}
 
 
-def _entry(rows: Sequence[Row], metric: str) -> dict[str, Any]:
+def _entry(side: Side, metric: str) -> dict[str, Any]:
     facts = info(metric)
-    found = column(rows, metric)
-    n, n_ran = len(found.values), sum(is_ok(row) for row in rows)
+    by_cell = side.values(metric)
+    known = np.isfinite(by_cell)
+    values, scenes = by_cell[known], side.scene[known]
+    n, n_ran = len(values), int(side.ok.sum())
     entry: dict[str, Any] = {
         "mean": None,
         "ci95": None,
         "ci95_clustered": None,
+        "ci95_clustered_method": None,
+        "ci95_bootstrap": None,
+        "design_effect": None,
         "n_rollouts": n,
-        "n_scenes": len(set(found.scenes)),
+        "n_scenes": len(np.unique(scenes)),
         "n_invalid": max(n_ran - n, 0),
         "unit": facts.unit,
         "direction": facts.direction,
     }
     if n == 0:
         return entry | {"reason": "no rollout was run to its end" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
-    entry["mean"] = float(np.mean(found.values))
-    entry["ci95"], why = normal_half_width(found.values)
+    entry["mean"] = float(np.mean(values))
+    entry["ci95"], why = normal_half_width(values)
     if why:
         entry["ci95_reason"] = why
-    interval = clustered(found.values, found.scenes, facts.is_flag)
-    entry["ci95_clustered"] = interval.bounds
+    interval = clustered(values, scenes, facts.is_flag)
+    entry["ci95_clustered"], entry["ci95_clustered_method"] = interval.bounds, interval.method or None
+    entry["design_effect"] = design_effect(values, scenes)
     if interval.reason:
         entry["ci95_clustered_reason"] = interval.reason
     if interval.note:
         entry["note"] = interval.note
+    entry |= _bootstrap(metric, values, scenes, entry["n_scenes"])
     if facts.is_flag:
-        entry["n_events"] = int(np.sum(found.values > 0))
+        entry |= _counts(values)
     return entry
+
+
+def _bootstrap(metric: str, values: F64, scenes: I64, n_scenes: int) -> dict[str, Any]:
+    if n_scenes > BOOTSTRAP_SCENES:
+        return {"ci95_bootstrap_reason": f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"}
+    # Keyed by the metric alone: renderers meet the same draws of scenes.
+    found = cluster_bootstrap(values, scenes, stream(metric, 0, "aggregate/bootstrap"))
+    return {"ci95_bootstrap": found.bounds} | ({"ci95_bootstrap_reason": found.reason} if found.reason else {})
+
+
+def _counts(values: F64) -> dict[str, Any]:
+    """Return the count of events and, where every cell is 0 or 1, the bounds for independent trials."""
+    out: dict[str, Any] = {"n_events": int(np.sum(values > 0)), "ci95_wilson": None, "ci95_exact": None}
+    if bool(np.all((values == 0.0) | (values == 1.0))):
+        k, n = out["n_events"], len(values)
+        out["ci95_wilson"], out["ci95_exact"] = list(wilson_rate(k, n)), list(exact_rate(k, n))
+    return out

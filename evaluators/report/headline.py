@@ -73,15 +73,20 @@ def find(run: Run) -> Finding:
 
 
 def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
-    """Give the tone of one paired difference: its stated verdict, or where there is none whether its interval excludes zero.
+    """Give the tone of one paired difference, or where no verdict is stated whether its interval excludes zero.
+
+    Neutral means non-inferior: no worse than its margin, and not shown to be better.
 
     Args:
         entry: One metric of ``summary.json``'s ``paired``.
         direction: "lower", "higher" or "none": which way is better.
     """
-    stated = str(entry.get("verdict") or "").lower().replace("_", "-")
+    stated = str(entry.get("verdict") or "").lower()
     if stated:
-        known: dict[str, Tone] = {"worse": "worse", "better": "better", "superior": "better", "undecided": "unclear"}
+        shown = entry.get("difference")
+        if shown == "better" or (shown == "worse" and stated != "non-inferior"):
+            return "better" if shown == "better" else "worse"
+        known: dict[str, Tone] = {"worse": "worse", "better": "better", "undecided": "unclear"}
         return known.get(stated, "neutral")
     difference = finite(entry.get("diff"))
     bounds = interval(entry.get("ci95"), difference)

@@ -148,7 +148,8 @@ def test_differences_are_taken_cell_by_cell_and_averaged_per_scene():
     assert found["ci95"] == pytest.approx([low, high])
     assert found["p_value"] == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
     assert (found["verdict"], found["n_cells"], found["n_scenes"], found["baseline"]) == ("worse", 6, 3, "clean")
-    assert pair(other, base)["verdict"] == "better"
+    better = pair(other, base)
+    assert (better["verdict"], better["difference"]) == ("non-inferior", "better")
 
 
 def test_pairing_sees_what_overlapping_intervals_hide():
@@ -177,9 +178,10 @@ def test_seeds_of_one_scene_are_not_independent_evidence():
     assert found["reason"] == "needs at least two scenes, found 1"
 
 
-def test_no_difference_at_all_is_undecided_with_p_one():
+def test_no_difference_at_all_is_non_inferior_with_p_one_and_no_difference_shown():
     found = pair([[1.0], [2.0], [3.0]], [[1.0], [2.0], [3.0]])
-    assert (found["diff"], found["ci95"], found["p_value"], found["verdict"]) == (0.0, [0.0, 0.0], 1.0, "undecided")
+    assert (found["diff"], found["ci95"], found["p_value"], found["verdict"]) == (0.0, [0.0, 0.0], 1.0, "non-inferior")
+    assert found["difference"] == "none shown"
 
 
 def test_equal_differences_have_no_spread_and_take_the_sign_test():
@@ -201,7 +203,7 @@ def test_a_metric_without_a_better_side_gets_no_verdict():
 
 
 def test_higher_is_better_for_progress():
-    assert pair([[0.5], [0.5], [0.4]], [[0.9], [0.9], [0.9]], "progress")["verdict"] == "better"
+    assert pair([[0.5], [0.5], [0.4]], [[0.9], [0.9], [0.9]], "progress")["difference"] == "better"
 
 
 def test_an_unknown_baseline_lists_the_known_ones():
@@ -221,7 +223,10 @@ def test_the_ledger_counts_every_cause_and_bounds_every_rate():
     assert found["failed"] == {"policy": 1}
     assert (found["steps_total"], found["steps_warmup"], found["steps_after_event"], found["steps_scored"]) == (40, 8, 12, 20)
     assert found["invalid"]["offroad"] == {"rollouts": 1, "reasons": {"not given": 1}}
-    assert found["bounds"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(3 / 5)]
+    assert found["bounds_rollouts"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(3 / 5)]
+    # Two rollouts without the event lost their last three steps: it may have happened there.
+    assert found["bounds"]["offroad"] == [pytest.approx(1 / 5), pytest.approx(5 / 5)]
+    assert found["cut"]["offroad"] == 2
 
 
 def test_a_dropped_rollout_is_listed_with_its_reason():

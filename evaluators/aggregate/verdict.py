@@ -1,0 +1,89 @@
+"""The three-way verdict on a paired difference: non-inferior, worse or undecided, with a stated margin."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from alpasim_plugin.types import F64, Direction
+from evaluators.metrics import info
+
+Verdict = Literal["non-inferior", "worse", "undecided"]
+Difference = Literal["better", "worse", "none shown"]
+
+ALPHA = 0.05
+RATE_MARGIN = 0.02
+# How much worse is accepted, in the metric's unit, where no gate says otherwise. A metric that is not here has none.
+MARGINS = {
+    "progress": 0.02,
+    "progress_rel": 0.02,
+    "route_distance_m": 0.1,
+    "dist_to_gt_trajectory": 0.25,
+    "dist_to_gt_location": 0.5,
+    "min_distance_to_obstacle_m": 0.25,
+    "min_distance_to_lane_boundary_m": 0.05,
+    "plan_deviation": 0.05,
+}
+
+
+def default_margin(metric: str) -> float:
+    """Return the margin of a metric where no gate sets one: `MARGINS`, 2 points for rates, else 0."""
+    return MARGINS.get(metric, RATE_MARGIN if info(metric).is_flag else 0.0)
+
+
+def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
+    """Turn the bounds of a difference so that positive means worse."""
+    return (bounds[0], bounds[1]) if direction == "lower" else (-bounds[1], -bounds[0])
+
+
+def verdict(bounds: list[float] | None, p: float | None, margin: float, direction: Direction) -> Verdict:
+    """Judge a difference by its 95 % interval.
+
+    Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is more than ``margin`` worse, and the test
+    of no difference rejects too (p < 0.05). Undecided: neither, or the metric has no better side. So each of the two claims is wrong in at
+    most 2.5 % of runs, and more data decides.
+
+    Args:
+        bounds: [low, high] of renderer minus baseline, or None.
+        p: Of the test of no difference; None where there is none.
+        margin: How much worse is accepted, in the metric's unit, at least 0.
+        direction: The better side of the metric.
+    """
+    if bounds is None or direction == "none":
+        return "undecided"
+    low, high = harm(bounds, direction)
+    if high < margin or (margin == 0.0 and high == low == 0.0):
+        return "non-inferior"
+    return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
+
+
+def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:
+    """Say whether any difference is shown, whatever the margin: the interval leaves out 0 and the test rejects."""
+    if bounds is None or direction == "none" or p is None or p >= ALPHA or bounds[0] <= 0.0 <= bounds[1]:
+        return "none shown"
+    return "worse" if harm(bounds, direction)[0] > 0.0 else "better"
+
+
+def sign_test(up: int, down: int) -> float:
+    """Return the exact two-sided p of ``up`` against ``down`` under a fair coin; 1 where both are 0.
+
+    On scenes that changed it is the sign test; on discordant cells of a flag it is the exact McNemar test.
+
+    Example:
+        >>> round(sign_test(6, 0), 5)
+        0.03125
+    """
+    return 1.0 if up + down == 0 else float(stats.binomtest(up, up + down).pvalue)
+
+
+def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
+    """Test that scene differences ``(G,)`` centre on zero.
+
+    Flags, and differences that are all alike (where t has no spread to go by), take the exact two-sided sign test on the scenes that
+    changed; other metrics the paired t test.
+    """
+    if is_flag or bool(np.all(means == means[0])):
+        return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
+    return float(stats.ttest_1samp(means, 0.0).pvalue), "paired t test on scene means"
