@@ -237,6 +237,7 @@ class Scene:
     lane_map: LaneMap
     ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
     vehicle: Vehicle
+    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
 
 
 @dataclass(frozen=True)
@@ -264,11 +265,12 @@ class Scenario:
     world_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what was subtracted from the source's coordinates, metres
     content_hash: str = ""
     notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
+    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
 
     @property
     def scene(self) -> Scene:
         """Give the part that evaluators may see."""
-        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle)
+        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle, self.alpasim_map)
 
 
 # --- log and scores -------------------------------------------------------------------------------------------------

@@ -3,28 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-
-import numpy as np
+from itertools import islice
 
 from alpasim_plugin.clock import Clock, Tick
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.runtime.cadence import Cadence, make_cadence
+from alpasim_plugin.runtime.forecast import Ahead, Foresight, shutter_poses
 from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
 
 
 class CameraRig:
     """The cameras one policy listens to.
 
-    A frame is due every sensor period; it is rendered only if no newer frame of that camera will exist when the policy next looks.
+    Args:
+        scenario: Has the cameras.
+        sensors: Which of them, at which period.
+        clock: Ticks of the rollout.
+        cadence: When the policy looks; by default at its own period.
+        foresight: Source of the forecasts that requests carry, for `lookahead` frames.
+        lookahead: How many of a camera's next frames a request foretells.
 
     Raises:
         InputError: The policy asks for a camera the scenario lacks, or for a period that is no multiple of the control period.
     """
 
-    def __init__(self, scenario: Scenario, sensors: Sequence[SensorSpec], clock: Clock) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        sensors: Sequence[SensorSpec],
+        clock: Clock,
+        cadence: Cadence | None = None,
+        foresight: Foresight | None = None,
+        lookahead: int = 0,
+    ) -> None:
         known = {camera.name: camera for camera in scenario.cameras}
         self._due: list[tuple[CameraSpec, int]] = []
+        self._held: list[RenderRequest] = []
         self._clock = clock
+        self._cadence = cadence or make_cadence(clock, scenario, sensors)
+        self._foresight, self._lookahead = foresight, lookahead
         for sensor in sensors:
             if sensor.camera not in known:
                 raise InputError(
@@ -49,16 +66,24 @@ class CameraRig:
         return {camera.name: camera for camera, _ in self._due}
 
     def requests(self, tick: Tick, history: Trajectory, actors: Mapping[str, F64]) -> list[RenderRequest]:
-        """Return what to render now. Shutter-start poses come from the motion so far, the shutter end is now."""
-        elapsed = tick.t_us - self._clock.start_us
-        to_policy = -elapsed % self._clock.rates.policy_us
-        out = []
+        """Return what to render now. Shutter-start poses come from the motion so far, the shutter end is now.
+
+        In a cadence of whole blocks requests are held until the block's last frame is due and then handed over together.
+        """
+        forecast = self._foresight.now() if self._foresight and self._lookahead else None
         for camera, period in self._due:
-            is_due = elapsed % period == 0
-            superseded = to_policy >= period  # a newer frame arrives before the policy looks
-            nobody_looks = tick.t_us + to_policy > self._clock.start_us + (self._clock.n_steps - 1) * self._clock.rates.control_us
-            if is_due and not superseded and not nobody_looks:
-                start_us = max(tick.t_us - camera.shutter_us, int(history.t_us[0]))
-                poses = interpolate(history, np.array([start_us, tick.t_us])) @ camera.T_rig_camera
-                out.append(RenderRequest(tick.t_us, camera, poses, actors))
-        return out
+            if self._is_due(tick.t_us, period):
+                ahead = Ahead(forecast, camera, self._next_us(tick.t_us, period)) if forecast else ()
+                self._held.append(RenderRequest(tick.t_us, camera, shutter_poses(history, camera, tick.t_us), actors, ahead))
+        if self._cadence.whole_blocks and not self._cadence.asks(tick.t_us):
+            return []
+        ready, self._held = self._held, []
+        return ready
+
+    def _is_due(self, t_us: int, period: int) -> bool:
+        return (t_us - self._clock.start_us) % period == 0 and self._cadence.wants(t_us, period)
+
+    def _next_us(self, t_us: int, period: int) -> tuple[int, ...]:
+        end_us = self._clock.start_us + self._clock.n_steps * self._clock.rates.control_us
+        coming = (t for t in range(t_us + period, end_us, period) if self._is_due(t, period))
+        return tuple(islice(coming, self._lookahead))

@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
+from alpasim_plugin.runtime.offers import batch_of
 from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest
 
 BLACK_LEVEL = 10  # AlpaSim's img_is_black: every byte at or below this
 
 
-def checked_frame(renderer: Renderer, request: RenderRequest) -> Frame:
-    """Render and check one frame; an all-black frame passes but carries the event ``black``.
+def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
+    """Render and check the frames of one instant, or of one block; an all-black frame passes but carries the event ``black``.
 
     Raises:
-        RendererError: The renderer raised, or its frame has another size, type, time or camera than asked for.
+        RendererError: The renderer raised, or its frames have another number, size, type, time or camera than asked for.
     """
-    name = f"{type(renderer).__name__}, camera {request.camera.name!r} at {request.t_us} us"
+    if not requests:
+        return []
+    name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
     try:
-        frame = renderer.render(request)
+        frames = list(batch_of(renderer)(requests))
     except SimrunError:
         raise
     except Exception as error:
         raise RendererError(
             "rendering a frame", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
         ) from error
+    if len(frames) != len(requests):
+        raise RendererError(
+            "rendering a frame", name, f"{len(frames)} frames for {len(requests)} requests", "return one frame for each request"
+        )
+    return [_checked(type(renderer).__name__, frame, request) for frame, request in zip(frames, requests, strict=True)]
+
+
+def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
     wanted = (request.camera.height, request.camera.width, 3)
     problems = []
     if frame.rgb.shape != wanted or frame.rgb.dtype != np.uint8:
@@ -37,8 +49,9 @@ def checked_frame(renderer: Renderer, request: RenderRequest) -> Frame:
         if plane is not None and (plane.shape != wanted[:2] or not np.isfinite(plane).all()):
             problems.append(f"{label} has shape {plane.shape} or is not finite")
     if problems:
+        name = f"{renderer}, camera {request.camera.name!r} at {request.t_us} us"
         raise RendererError("rendering a frame", name, "; ".join(problems), "fix the renderer; its contract is types.Frame")
-    if int(frame.rgb.max()) <= BLACK_LEVEL:
+    if int(frame.rgb.max()) <= BLACK_LEVEL and "black" not in frame.events:
         return replace(frame, events=(*frame.events, "black"))
     return frame
 

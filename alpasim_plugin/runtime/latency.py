@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from alpasim_plugin.types import Latency, Trajectory
 
@@ -23,6 +23,10 @@ class PlanQueue:
         """Add the answer to a question asked at ``asked_us`` that took ``wall_us`` of wall time."""
         delay = {"none": 0, "fixed": self.latency.fixed_us, "measured": wall_us}[self.latency.kind]
         self._pending.append((asked_us + delay, plan_world))
+
+    def copy(self) -> PlanQueue:
+        """Return a queue that goes on separately: what will be in force if nothing more is submitted."""
+        return replace(self, _pending=list(self._pending))
 
     def active(self, t_us: int) -> Trajectory | None:
         """Return the plan in force at ``t_us``: the newest question's answer among those due. None before the first."""

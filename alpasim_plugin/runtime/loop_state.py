@@ -53,11 +53,6 @@ class LoopState:
         n = self._filled
         return Trajectory(self._t_us[:n], self._xyz[:n], self._quat[:n])
 
-    @property
-    def closed_loop_us(self) -> int:
-        """Give the instant from which the policy drives."""
-        return self.scenario.start_us + self.scenario.warmup_us
-
     def observe(self, cameras: Mapping[str, CameraSpec]) -> Observation:
         """Return what the policy may know now."""
         route = route_in_rig(self.scenario.route, self.ego.T_world_rig)
@@ -84,13 +79,7 @@ class LoopState:
         Returns:
             Whether the log was forced.
         """
-        forced = to_us <= self.closed_loop_us
-        if forced:
-            self.ego = ego_state_from_log(self.scenario.ego_log, to_us, self.scenario.vehicle)
-        else:
-            moved = controller.advance(self.ego, plan, to_us)
-            x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
-            self.ego = replace(moved, T_world_rig=ground_pose(self.scenario.ground, x, y, yaw_of(moved.T_world_rig)))
+        self.ego, forced = moved_ego(self.scenario, controller, self.ego, plan, to_us)
         self._remember()
         return forced
 
@@ -100,3 +89,12 @@ class LoopState:
         self._xyz[n] = self.ego.T_world_rig[:3, 3]
         self._quat[n] = quat_from_matrix(self.ego.T_world_rig[:3, :3])
         self._filled = n + 1
+
+
+def moved_ego(scenario: Scenario, controller: Controller, ego: EgoState, plan: Trajectory | None, to_us: int) -> tuple[EgoState, bool]:
+    """Return the ego at ``to_us`` and whether the log was forced: it is until the end of the warm-up."""
+    if to_us <= scenario.start_us + scenario.warmup_us:
+        return ego_state_from_log(scenario.ego_log, to_us, scenario.vehicle), True
+    moved = controller.advance(ego, plan, to_us)
+    x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
+    return replace(moved, T_world_rig=ground_pose(scenario.ground, x, y, yaw_of(moved.T_world_rig))), False

@@ -15,9 +15,10 @@ import numpy as np
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.runtime.offers import spent_by
 from alpasim_plugin.runtime.pictures import Pictures
 from alpasim_plugin.runtime.stages import StageTimes
-from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, RenderRequest, RolloutLog, Scenario, Trajectory
+from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, Renderer, RenderRequest, RolloutLog, Scenario, Trajectory
 from alpasim_plugin.world.ego import ego_state_from_log
 
 LOG_NAME, FRAMES_NAME = "rollout.asl", "frames.jsonl"
@@ -56,7 +57,7 @@ class Recorder:
         self._frames: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
         self._told_us = -1
-        self._steps = 0
+        self._steps = self._first_call = 0
         self._writer: AslWriter | None = None
 
     def __enter__(self) -> Recorder:
@@ -69,6 +70,11 @@ class Recorder:
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Time one pass through a stage of the loop."""
         return self._times.measure(name)
+
+    def rendering(self, renderer: Renderer, frames: int) -> AbstractContextManager[None]:
+        """Time the rendering of so many frames; what the renderer reports as stages of their own is filed under their names."""
+        self._first_call = self._first_call or frames
+        return self._times.measure("render", frames, lambda: spent_by(renderer))
 
     # --- in the loop's order ----------------------------------------------------------------------------------------
 
@@ -99,6 +105,7 @@ class Recorder:
                     "rgb_sha256": hashlib.sha256(frame.rgb.tobytes()).hexdigest()[:16],
                     "events": " ".join(frame.events),
                 }
+                | dict(frame.facts)
             )
             if self._pictures is not None:
                 self._pictures.add(frame)
@@ -146,6 +153,7 @@ class Recorder:
                 events[event] = events.get(event, 0) + 1
         return {
             "frames": len(self._frames),
+            "first_call_frames": self._first_call,
             "steps": self._steps,
             "frame_events": events,
             "stage_ms": self._times.as_ms(),

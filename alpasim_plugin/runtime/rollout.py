@@ -6,10 +6,13 @@ import time
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.control import Controller, make_controller
+from alpasim_plugin.runtime.cadence import make_cadence
 from alpasim_plugin.runtime.cameras import CameraRig
-from alpasim_plugin.runtime.guards import checked_frame, checked_plan
+from alpasim_plugin.runtime.forecast import Foresight
+from alpasim_plugin.runtime.guards import checked_frames, checked_plan
 from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState
+from alpasim_plugin.runtime.offers import chunk_of, lookahead_of
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.types import Policy, Renderer, Scenario
 from alpasim_plugin.world.actors import make_actors
@@ -43,9 +46,11 @@ def run_rollout(
     recorder = recorder or Recorder(scenario, seed)
     controller = controller or make_controller(getattr(policy, "controller", "bicycle"), scenario.vehicle)
     actors = make_actors(scenario)
-    rig = CameraRig(scenario, policy.sensors, clock)
     plans = PlanQueue(scenario.latency)
     state = LoopState.at_start(scenario, clock.n_steps)
+    cadence = make_cadence(clock, scenario, policy.sensors, chunk_of(renderer))
+    foresight = Foresight(scenario, controller, plans, actors, state)
+    rig = CameraRig(scenario, policy.sensors, clock, cadence, foresight, lookahead_of(renderer))
     policy.reset(seed, scenario.route)
     recorder.start(clock, rig.specs)
 
@@ -53,14 +58,15 @@ def run_rollout(
         with recorder.stage("actors"):
             others = actors.step(tick.t_us, state.ego)
         recorder.poses(state.ego, others)
-        for request in rig.requests(tick, state.history, others):
-            with recorder.stage("render"):
-                frame = checked_frame(renderer, request)
+        requests = rig.requests(tick, state.history, others)
+        with recorder.rendering(renderer, len(requests)):
+            frames = checked_frames(renderer, requests)
+        for frame, request in zip(frames, requests, strict=True):
             state.frames[frame.camera] = frame
             recorder.frame(frame, request)
         if tick.is_last:
             break
-        if tick.policy_due:
+        if cadence.asks(tick.t_us):
             observation = state.observe(rig.specs)
             recorder.question(observation, clock)
             began = time.perf_counter()

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, rollouts_schema, write_bytes, write_json, write_table
+from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 
 
@@ -83,26 +84,27 @@ def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
 
-    A frame's time is the sum of all stages of the loop between two frames. The first frame of each rollout is kept apart: it may
-    compile or fill caches.
+    A frame's time is the sum of all stages of the loop between two frames; frames made together share their time evenly. The first
+    frames of each rollout (all that its first call made) are kept apart: that call may compile or fill caches.
     """
     stages: dict[str, list[float]] = {}
     first, per_frame = [], []
     for manifest in manifests:
-        frames = max(int(manifest["frames"]), 1)
+        frames, opening = max(int(manifest["frames"]), 1), max(int(manifest.get("first_call_frames", 1)), 1)
         total = np.zeros(frames)
         for stage, durations in manifest["stage_ms"].items():
-            # Stages that run more often than frames are spread evenly over them.
-            total += np.array([chunk.sum() for chunk in np.array_split(np.asarray(durations), frames)])
-            stages.setdefault(stage, []).extend(durations[1:])
-        first.append(float(total[0]))
-        per_frame.extend(total[1:].tolist())
+            total += spread(durations, frames)
+            stages.setdefault(stage, []).extend(durations[opening if len(durations) == frames else 1 :])
+        first.append(float(total[:opening].sum()))
+        per_frame.extend(total[opening:].tolist())
     if not per_frame:
-        return {"ms_per_frame_p50": None, "ms_per_frame_p95": None, "frames_per_s": None, "first_frame_ms": None, "stages": {}}
+        nothing = dict.fromkeys(("ms_per_frame_p50", "ms_per_frame_p95", "ms_per_frame_mean", "frames_per_s", "first_frame_ms"))
+        return nothing | {"stages": {}}
     all_ms = sum(sum(d) for d in stages.values())
     return {
         "ms_per_frame_p50": round(float(np.percentile(per_frame, 50)), 3),
         "ms_per_frame_p95": round(float(np.percentile(per_frame, 95)), 3),
+        "ms_per_frame_mean": round(float(np.mean(per_frame)), 3),
         "frames_per_s": round(1e3 / float(np.mean(per_frame)), 2),
         "first_frame_ms": round(float(np.median(first)), 3),
         "stages": {
@@ -115,6 +117,17 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
             if d
         },
     }
+
+
+def spread(durations: Sequence[float], frames: int) -> F64:
+    """Share out the durations of a stage that runs more or less often than frames come, evenly and in order.
+
+    Example:
+        >>> spread([2.0, 4.0], 4), spread([1.0, 1.0, 3.0, 3.0], 2)
+        (array([1., 1., 2., 2.]), array([2., 6.]))
+    """
+    done = np.concatenate([[0.0], np.cumsum(durations)])
+    return np.diff(np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done))
 
 
 def _pool(root: Path, manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float) -> dict[str, Any]:

@@ -7,13 +7,13 @@ line, on along the lanes where it ends, and leave the scene at the end of the ma
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
-from alpasim_plugin.types import F64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
+from alpasim_plugin.types import F64, I64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
 from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import Bodies, IdmParams, Spans, find_leader, idm_acceleration, nearest_ahead, spans, wanted_gap_m
@@ -68,16 +68,21 @@ class Actors:
         """
         if self.t_us is not None and t_us <= self.t_us:
             raise InputError("moving the actors", f"t = {t_us} us", f"the last time was {self.t_us} us", "step forwards, or reset first")
-        poses = self.replay.at(t_us)
+        poses = self.replay.at(t_us, self.replay.cursor)
         if self.drivers:
             if self.t_us is not None and t_us > self.closed_us:
                 self._advance(max(self.t_us, self.closed_us), t_us, ego, poses)
             for driver in self.drivers:
-                pose = driver.pose(t_us, self.closed_us)
+                pose = driver.pose(t_us, self.closed_us, driver.motion)
                 if pose is not None:
                     poses[driver.actor.actor_id] = pose
         self.t_us = t_us
         return poses
+
+    def outlook(self) -> Outlook:
+        """Return a forecast from the present instant, which does not change as the actors move on."""
+        reactive = [(d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present]
+        return Outlook(self.replay, self.replay.cursor.copy(), tuple(reactive), self.t_us, self.closed_us)
 
     def _advance(self, from_us: int, to_us: int, ego: EgoState, poses: Mapping[str, F64]) -> None:
         n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
@@ -93,6 +98,35 @@ class Actors:
                 driver.decide(everybody, row, self.standing, present)
             for driver in driving:
                 driver.advance(dt_s)
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """Where road users will be, as far as one can tell at one instant.
+
+    Replayed ones follow their track, reactive ones keep their speed along their line.
+    """
+
+    replay: _Replay
+    cursor: I64
+    reactive: tuple[tuple[_Driver, _Motion | None], ...]
+    t_us: int | None
+    closed_us: int
+
+    def at(self, t_us: int) -> dict[str, F64]:
+        """Return ``T_world_box`` ``(4, 4)`` of every actor expected at ``t_us``, not earlier than the instant of the forecast."""
+        poses = self.replay.at(t_us, self.cursor.copy())
+        for driver, motion in self.reactive:
+            pose = driver.pose(t_us, t_us, None) if motion is None else self._moved(driver, motion, t_us)
+            if pose is not None:
+                poses[driver.actor.actor_id] = pose
+        return poses
+
+    def _moved(self, driver: _Driver, motion: _Motion, t_us: int) -> F64 | None:
+        assert self.t_us is not None
+        assert driver.path is not None
+        s_m = motion.s_m + motion.speed_mps * (t_us - self.t_us) * 1e-6
+        return None if s_m > driver.path.length_m else driver.pose(t_us, self.closed_us, replace(motion, s_m=s_m))
 
 
 def make_actors(scenario: Scenario) -> Actors:
@@ -128,17 +162,18 @@ class _Replay:
     def reset(self) -> None:
         self.cursor = self.begin.copy()
 
-    def at(self, t_us: int) -> dict[str, F64]:
+    def at(self, t_us: int, cursor: I64) -> dict[str, F64]:
+        """Return the poses at ``t_us``, not earlier than where the cursors (one per actor) stand, and move those there."""
         rows = np.flatnonzero((self.first <= t_us) & (t_us <= self.last))
         if len(rows) == 0:
             return {}
-        i = self.cursor[rows]
+        i = cursor[rows]
         while True:
             behind = (i + 1 < self.end[rows]) & (self.t[np.minimum(i + 1, self.end[rows])] <= t_us)
             if not behind.any():
                 break
             i = i + behind
-        self.cursor[rows] = i
+        cursor[rows] = i
         j = np.minimum(i + 1, self.end[rows])
         span = np.maximum(self.t[j] - self.t[i], 1).astype(np.float64)
         f = np.clip((t_us - self.t[i]).astype(np.float64) / span, 0.0, 1.0)
@@ -253,14 +288,14 @@ class _Driver:
         if m.s_m > self.path.length_m:
             self.present, self.motion = False, None
 
-    def pose(self, t_us: int, closed_us: int) -> F64 | None:
-        """Return the pose of the box centre, or None where the actor is not in the scene."""
-        if self.motion is None:
+    def pose(self, t_us: int, closed_us: int, motion: _Motion | None) -> F64 | None:
+        """Return the pose of the box centre for a state of motion (None: on the track), or None where the actor is not in the scene."""
+        if motion is None:
             first, last = int(self.actor.track.t_us[0]), int(self.actor.track.t_us[-1])
             on_track = first <= t_us <= last and self.present and (t_us <= closed_us or self.path is None)
             return interpolate(self.actor.track, t_us) if on_track else None
         assert self.path is not None
-        xyz, yaw = self.path.at(self.motion.s_m, self.motion.offset_m)
+        xyz, yaw = self.path.at(motion.s_m, motion.offset_m)
         if self.ground is None:
             return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
         T = ground_pose(self.ground, float(xyz[0]), float(xyz[1]), float(yaw))

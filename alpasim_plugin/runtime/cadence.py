@@ -1,0 +1,88 @@
+"""When the policy is asked, and with it which frames are wanted and when they are rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.clock import Clock
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.types import I64, Scenario, SensorSpec
+
+DOING = "setting up a loop in whole blocks of frames"
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """The instants at which the policy is asked.
+
+    With ``whole_blocks`` all frames since the last question are wanted and are rendered together at the next one; otherwise a frame is
+    rendered at its own instant, and only if no newer one of that camera will exist when the policy looks.
+    """
+
+    questions_us: I64  # (Q,) increasing
+    whole_blocks: bool = False
+
+    def asks(self, t_us: int) -> bool:
+        """Tell whether the policy is asked at ``t_us``."""
+        return self.next_question_us(t_us) == t_us
+
+    def next_question_us(self, t_us: int) -> int | None:
+        """Return the first question at or after ``t_us``; None after the last."""
+        i = int(np.searchsorted(self.questions_us, t_us))
+        return int(self.questions_us[i]) if i < len(self.questions_us) else None
+
+    def wants(self, t_us: int, period_us: int) -> bool:
+        """Tell whether the policy will take a frame of ``t_us`` from a camera of that period."""
+        question = self.next_question_us(t_us)
+        return question is not None and (self.whole_blocks or question - t_us < period_us)
+
+
+def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], chunk: tuple[int, int] | None = None) -> Cadence:
+    """Return the cadence of a rollout: the policy's own period, or with ``chunk`` one question at the end of each block of frames.
+
+    ``chunk`` is AlpaSim's rule for video models: the control step is the block, and a plan is committed for the whole next one. The
+    recorded drive has to be forced until the first block is complete, since nobody was asked before. A policy without cameras has no
+    blocks and keeps its own period. Nothing is asked at the last instant: no drive follows it.
+
+    Args:
+        clock: Ticks of the rollout.
+        scenario: Rates and warm-up.
+        sensors: Cameras the policy listens to.
+        chunk: Frames of the first block and of each later one.
+
+    Raises:
+        InputError: Cameras of different periods, a warm-up shorter than the first block, or a scenario in which no block ends.
+    """
+    end_us = clock.start_us + clock.n_steps * clock.rates.control_us
+    if chunk is None or not sensors:
+        return Cadence(np.array([tick.t_us for tick in clock.ticks() if tick.policy_due and not tick.is_last], dtype=np.int64))
+    first, then = chunk
+    periods = {sensor.interval_us or scenario.rates.camera_us for sensor in sensors}
+    if len(periods) > 1:
+        raise InputError(
+            DOING,
+            f"cameras {', '.join(sensor.camera for sensor in sensors)}",
+            f"periods of {' and '.join(map(str, sorted(periods)))} us",
+            "give all cameras one period, or use the mode 'speculative'",
+        )
+    (period_us,) = periods
+    warm_up_us = (first - 1) * period_us
+    if warm_up_us > scenario.warmup_us:
+        raise InputError(
+            DOING,
+            f"scene {scenario.scene_id!r}",
+            f"the first block of {first} frames ends after {warm_up_us} us, the warm-up after {scenario.warmup_us} us",
+            f"--set timing.warmup_us={warm_up_us}, or use the mode 'speculative'",
+        )
+    questions = np.arange(clock.start_us + warm_up_us, end_us, then * period_us, dtype=np.int64)
+    if not len(questions):
+        raise InputError(
+            DOING,
+            f"scene {scenario.scene_id!r}",
+            f"it ends after {end_us - clock.start_us} us, before the first block of {first} frames",
+            "lengthen timing.duration_us, or use the mode 'speculative'",
+        )
+    return Cadence(questions, whole_blocks=True)
