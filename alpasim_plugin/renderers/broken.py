@@ -1,7 +1,7 @@
 """Renderers with one deliberate fault each: known-bad input with which metrics, guards and gates prove that they notice.
 
-Each renders the clean scene and then spoils the frame; what else a frame carries (time, alpha, depth) stays as a fault in a real pipeline
-would leave it.
+Each renders the clean scene and spoils the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays as
+a fault in a real pipeline would leave it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.types import U8, Frame, Renderer, RenderRequest, Scenario
 
-SHIFT_SHARE = 0.12  # of the image's width
-BLUR_SHARE = 0.02
-LATE_FRAMES = 5
+SHIFT_M = 0.5
+BLUR_SHARE = 0.02  # of the image's width
+LATE_US = 1_000_000
 
 Spoil = Callable[[U8], U8]
 
@@ -36,20 +36,35 @@ class BrokenRenderer:
         return replace(frame, rgb=self.spoil(frame.rgb))
 
 
-class StaleRenderer:
-    """Show the picture of an earlier frame of the same camera under the new time: ``frames`` ago, or the first one for ever."""
+class ShiftedRenderer:
+    """Render the clean scene from a camera that stands beside its place, as a wrong extrinsic calibration or map offset would."""
 
-    def __init__(self, clean: CleanRenderer, frames: int | None) -> None:
-        self.clean, self.frames = clean, frames
-        self._past: dict[str, deque[U8]] = {}
+    def __init__(self, clean: CleanRenderer, right_m: float) -> None:
+        self.clean, self.right_m = clean, right_m
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame and swap its picture for an older one."""
+        """Render one frame with the camera moved along its x axis."""
+        moved = request.T_world_camera.copy()
+        moved[..., :3, 3] += self.right_m * moved[..., :3, 0]
+        return self.clean.render(replace(request, T_world_camera=moved))
+
+
+class StaleRenderer:
+    """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or the first one for ever."""
+
+    def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
+        self.clean, self.age_us = clean, age_us
+        self._past: dict[str, deque[tuple[int, U8]]] = {}
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render one frame and swap its picture for an older one; before there is one that old, for the first."""
         frame = self.clean.render(request)
-        past = self._past.setdefault(request.camera.name, deque(maxlen=None if self.frames is None else self.frames + 1))
-        if self.frames is not None or not past:
-            past.append(frame.rgb)
-        return replace(frame, rgb=past[0])
+        past = self._past.setdefault(request.camera.name, deque())
+        if self.age_us is not None or not past:
+            past.append((frame.t_us, frame.rgb))
+        while self.age_us is not None and len(past) > 1 and past[1][0] <= frame.t_us - self.age_us:
+            past.popleft()
+        return replace(frame, rgb=past[0][1])
 
 
 def black(rgb: U8) -> U8:
@@ -60,12 +75,6 @@ def black(rgb: U8) -> U8:
 def mirrored(rgb: U8) -> U8:
     """Swap left and right."""
     return np.ascontiguousarray(rgb[:, ::-1])
-
-
-def shifted(rgb: U8) -> U8:
-    """Move the picture to the right by `SHIFT_SHARE` of its width; the left border repeats its first column."""
-    n = max(1, round(SHIFT_SHARE * rgb.shape[1]))
-    return np.concatenate([np.repeat(rgb[:, :1], n, axis=1), rgb[:, :-n]], axis=1)
 
 
 def blurred(rgb: U8) -> U8:
@@ -79,15 +88,19 @@ def _register_spoiled(name: str, spoil: Spoil, help_text: str) -> None:
         return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), spoil)
 
 
-def _register_stale(name: str, frames: int | None, help_text: str) -> None:
+def _register_stale(name: str, age_us: int | None, help_text: str) -> None:
     @RENDERERS.register(name, help_text)
     def _make(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-        return StaleRenderer(CleanRenderer(scenario, seed, device, threads), frames)
+        return StaleRenderer(CleanRenderer(scenario, seed, device, threads), age_us)
+
+
+@RENDERERS.register("broken-shifted", f"deliberate fault: seen from {SHIFT_M} m to the right")
+def _shifted(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
+    return ShiftedRenderer(CleanRenderer(scenario, seed, device, threads), SHIFT_M)
 
 
 _register_spoiled("broken-black", black, "deliberate fault: black frames")
 _register_spoiled("broken-mirrored", mirrored, "deliberate fault: left and right swapped")
-_register_spoiled("broken-shifted", shifted, "deliberate fault: the picture moved sideways")
 _register_spoiled("broken-blurred", blurred, "deliberate fault: strong blur")
 _register_stale("broken-frozen", None, "deliberate fault: the first frame for ever")
-_register_stale("broken-late", LATE_FRAMES, f"deliberate fault: pictures {LATE_FRAMES} frames old")
+_register_stale("broken-late", LATE_US, f"deliberate fault: pictures {LATE_US / 1e6:g} s old")

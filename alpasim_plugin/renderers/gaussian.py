@@ -133,7 +133,7 @@ def scene_of(scenario: Scenario) -> SceneGraph:
 
 
 def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
-    """Return the surrogate, its sky, the ghosts of moving actors, and graphs by weight as they are made; a process's rollouts share them."""
+    """Return the surrogate, its sky, the ghosts of moving actors, and graphs by weight as they are made, shared by a process."""
     key = f"surrogate:{scene_key(scenario)}:{scenario.degradation!r}"
     moving = [a.actor_id for a in scenario.actors if not a.is_static]
     ghosts = [SceneNode(i + GHOST, "actor", scene.actors[i].levels[1:]) for i in moving]
