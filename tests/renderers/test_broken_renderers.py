@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.geometry import se3
 from alpasim_plugin.renderers import RENDERERS, make_renderer
-from alpasim_plugin.renderers.broken import LATE_FRAMES, SHIFT_SHARE
+from alpasim_plugin.renderers.broken import LATE_US, SHIFT_M
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.types import Renderer, RenderRequest, Scenario
 from tests.gaussians.scene_maps import straight
@@ -17,6 +18,9 @@ from tests.gaussians.scene_maps import straight
 def scenario() -> Iterator[Scenario]:
     yield straight(actors=())
     clear_cache()
+
+
+LATE_FRAMES = 5  # a second of these requests, which follow the log's 5 Hz
 
 
 def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
@@ -50,9 +54,23 @@ def test_frozen_repeats_the_first_picture_and_late_the_one_some_frames_ago(scena
         np.testing.assert_array_equal(late.render(r).rgb, clean[max(0, i - LATE_FRAMES)])
 
 
-def test_mirrored_and_shifted_move_pixels_where_they_say(scenario: Scenario) -> None:
+def test_mirrored_swaps_left_and_right_and_shifted_sees_from_half_a_metre_to_the_right(scenario: Scenario) -> None:
     r = requests(scenario, 1)[0]
-    good = make_renderer("clean", scenario).render(r).rgb
-    np.testing.assert_array_equal(make_renderer("broken-mirrored", scenario).render(r).rgb, good[:, ::-1])
-    n = round(SHIFT_SHARE * good.shape[1])
-    np.testing.assert_array_equal(make_renderer("broken-shifted", scenario).render(r).rgb[:, n:], good[:, :-n])
+    clean = make_renderer("clean", scenario)
+    np.testing.assert_array_equal(make_renderer("broken-mirrored", scenario).render(r).rgb, clean.render(r).rgb[:, ::-1])
+    beside = r.T_world_camera @ np.array([[1.0, 0, 0, SHIFT_M], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    found = make_renderer("broken-shifted", scenario).render(r)
+    np.testing.assert_array_equal(found.rgb, clean.render(replace(r, T_world_camera=beside)).rgb)
+    assert SHIFT_M == 0.5
+
+
+def test_late_shows_the_newest_picture_that_is_a_second_old_at_any_frame_rate(scenario: Scenario) -> None:
+    views = requests(scenario, 21)[::3]
+    t_us = [r.t_us for r in views]
+    assert LATE_US % (t_us[1] - t_us[0])  # a second falls between two frames
+    clean = [make_renderer("clean", scenario).render(r).rgb for r in views]
+    late = make_renderer("broken-late", scenario)
+    for i, r in enumerate(views):
+        due = max((j for j in range(i + 1) if t_us[j] <= t_us[i] - LATE_US), default=0)
+        np.testing.assert_array_equal(late.render(r).rgb, clean[due])
+    assert due > 2
