@@ -14,6 +14,7 @@ from rich.console import Console
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers import RENDERERS
+from alpasim_plugin.runtime.certificate import Certify, certificate_line
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
@@ -52,6 +53,7 @@ def run(
     resume: Annotated[bool, typer.Option("--resume", help="Continue in a folder that another command began.")] = False,
     baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
+    certify: Annotated[Certify, typer.Option("--certify", help="Repeat one rollout and compare bit for bit.")] = "one",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Resolve and print the plan, run nothing.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
@@ -80,7 +82,7 @@ def run(
         _print_plan(plan, root, workers, as_json)
         return
     try:
-        result = execute_run(plan, root, workers, ["simrun", *sys.argv[1:]], make_progress(quiet or as_json), resume)
+        result = execute_run(plan, root, workers, ["simrun", *sys.argv[1:]], make_progress(quiet or as_json), resume, certify)
     except KeyboardInterrupt:
         print(f"interrupted; finished rollouts are in {root}; the same command continues", file=sys.stderr)
         raise typer.Exit(INTERRUPTED) from None
@@ -146,4 +148,5 @@ def _print_result(result: RunResult, as_json: bool) -> None:
         print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
     if result.n_failed:
         print(f"{result.n_failed} of {result.n_rollouts} rollouts failed; the same command runs them again", file=sys.stderr)
+    print(f"repeat  {certificate_line(result.summary['determinism'])}")
     print(f"report  {shlex.quote(str(result.root / 'report.html'))}")

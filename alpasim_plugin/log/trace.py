@@ -1,4 +1,4 @@
-"""What a rollout did, component by component and instant by instant, as digests: two rollouts are compared and the first difference named."""
+"""What a rollout did, component by component, as digests: two rollouts are compared and the first difference is named."""
 
 from __future__ import annotations
 

@@ -64,6 +64,22 @@ def certify(
     return facts | _repeat(plan, cell, root, manifest, threads, log_sha256)
 
 
+def certificate_line(certificate: Mapping[str, Any]) -> str:
+    """Say in one line what a certificate says.
+
+    Example:
+        >>> certificate_line({"status": "skipped", "reason": "no rollout was run to its end"})
+        'skipped: no rollout was run to its end'
+    """
+    if certificate["status"] == "skipped":
+        return f"skipped: {certificate['reason']}"
+    first = certificate["first_difference"]
+    if first is None:
+        return f"equal to the bit: {certificate['path']}"
+    at = f" at step {first['step']}" if first["step"] is not None else ""
+    return f"DIFFERENT: {certificate['path']}, first in {first['component']}{at} ({first['what']})"
+
+
 def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], threads: int, log_sha256: str) -> dict[str, Any]:
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="simrun-repeat-") as name:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.execute import Threads, execute, thread_budget
 from alpasim_plugin.runtime.plan import RunPlan, slug
 from alpasim_plugin.runtime.provenance import hardware, versions
@@ -59,9 +60,15 @@ def default_folder(plan: RunPlan) -> Path:
 
 
 def execute_run(
-    plan: RunPlan, root: Path, workers: int | None, command: Sequence[str], progress: Progress, resume: bool = False
+    plan: RunPlan,
+    root: Path,
+    workers: int | None,
+    command: Sequence[str],
+    progress: Progress,
+    resume: bool = False,
+    certificate: Certify = "one",
 ) -> RunResult:
-    """Run a plan into a folder.
+    """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
@@ -77,7 +84,14 @@ def execute_run(
         progress.rollout_done(manifest, reused)
 
     manifests = execute(plan, root, threads, on_done)
-    summary = write_tables(root, manifests, plan.options.preset, plan.options.baseline, threads, time.perf_counter() - began)
+    wall_s = time.perf_counter() - began
+    tables = root / "summary.json"
+    held = read_json(tables).get("determinism") if tables.exists() else None
+    summary = write_tables(root, manifests, plan.options.preset, plan.options.baseline, threads, wall_s)
+    determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held)
+    summary["determinism"] = determinism
+    write_json(tables, summary)
+    write_json(root / "run.json", read_json(root / "run.json") | {"determinism": determinism})
     write_summary_md(root)
     write_junit(root)
     write_report(root)
@@ -98,10 +112,16 @@ def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, 
                 f"it holds another run (key {key}; this command has {plan.key})",
                 "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
             )
+    write_run_info(root, plan, command, threads)
+
+
+def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads) -> None:
+    """Write ``run.json`` and what a report draws of the scenes."""
     for scene_id, scenario in plan.scenarios.items():
         write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scenario))
+    refs = {cell.scene: cell.ref for cell in plan.cells}
     write_json(
-        path,
+        root / "run.json",
         {
             "schema_version": SCHEMA_VERSION,
             "key": plan.key,
@@ -116,6 +136,7 @@ def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, 
             "scenes": {
                 name: {
                     "source": s.source,
+                    "ref": {"path": str(Path(refs[name].path).absolute()), "seed": refs[name].seed, "overrides": refs[name].overrides},
                     "content_hash": s.content_hash,
                     "seed": s.seed,
                     "duration_s": (s.end_us - s.start_us) * 1e-6,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 
+import numpy as np
+
 from alpasim_plugin.types import Observation, Plan, Route, SensorSpec
 
 
@@ -26,3 +28,20 @@ class KillsItsProcess(Raises):
     def act(self, observation: Observation) -> Plan:
         os.kill(os.getpid(), signal.SIGKILL)
         raise AssertionError("unreachable")
+
+
+class RemembersEarlierRollouts(Raises):
+    """Drives a little to the left after half a second, by how many rollouts its process has seen: no rollout can be repeated."""
+
+    lives = 0
+
+    def reset(self, seed: int, route: Route) -> None:
+        type(self).lives += 1
+        self.start_us: int | None = None
+
+    def act(self, observation: Observation) -> Plan:
+        self.start_us = observation.t_us if self.start_us is None else self.start_us
+        times = observation.t_us + np.arange(0, 2_000_001, 500_000, dtype=np.int64)
+        seconds = (times - observation.t_us) * 1e-6
+        left = 0.01 * self.lives * seconds if observation.t_us >= self.start_us + 500_000 else 0.0 * seconds
+        return Plan(observation.t_us, times, np.stack([observation.ego.speed_mps * seconds, left], axis=1), np.zeros(len(times)))

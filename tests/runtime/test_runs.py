@@ -51,7 +51,7 @@ def comparable(root: Path) -> dict[str, object]:
     rows = pq.read_table(root / "rollouts.parquet").drop_columns(["wall_s"]).to_pylist()
     logs = {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("rollout.asl"))}
     steps = pq.read_table(root / "steps.parquet").to_pylist()
-    summary = {k: v for k, v in json.loads((root / "summary.json").read_text()).items() if k not in ("speed", "pool")}
+    summary = {k: v for k, v in json.loads((root / "summary.json").read_text()).items() if k not in ("speed", "pool", "determinism")}
     return {"rows": repr(rows), "logs": logs, "steps": repr(steps), "summary": summary}
 
 

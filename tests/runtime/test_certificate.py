@@ -1,0 +1,126 @@
+"""The determinism certificate: what it repeats, what it finds, and what it says where it cannot be made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.renderers import RENDERERS
+from alpasim_plugin.renderers.gaussian import CleanRenderer
+from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
+from alpasim_plugin.runtime.execute import Threads, execute
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runtime.run import execute_run
+from alpasim_plugin.types import Frame, RenderRequest, Scenario, SensorSpec
+from policies import ConstantVelocity
+from scenarios.suite import expand
+from tests.runtime.test_runs import Heard
+
+BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
+SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
+FORGETFUL = "tests.runtime.broken_policies:RemembersEarlierRollouts"
+
+
+def plan_of(renderer: str = "clean", policy: str = "lane-camera", overrides: tuple[str, ...] = (), images: str = "none") -> RunPlan:
+    refs = [*expand("smoke/lead_car", (LONGER, *BARE, *overrides)), *expand("smoke/straight", (SHORT, *BARE, *overrides))]
+    return make_plan(refs, (renderer,), (policy,), (0,), RunOptions(images=images))  # type: ignore[arg-type]
+
+
+def certificate(plan: RunPlan, root: Path, before: dict | None = None, wanted: Certify = "one") -> dict:
+    """Run a plan without its tables and return the certificate."""
+    return certify(plan, root, execute(plan, root, Threads(1, 1), lambda manifest, reused: None), 1, wanted, before)
+
+
+def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Path) -> None:
+    found = execute_run(plan_of(), tmp_path, 1, ["simrun"], Heard()).summary["determinism"]
+    assert found["status"] == "equal"
+    assert found["cell"]["scene"] == "smoke-straight"
+    assert found["steps"] == 8
+    assert set(found["digests"]) == {"ego", "actors", "frames", "plans", "scores"}
+    assert found["digests"] == found["repeated"]
+    assert len(set(found["digests"].values())) == 5
+    for name in ("run.json", "summary.json"):
+        assert json.loads((tmp_path / name).read_text())["determinism"] == found
+    assert "smoke-straight" in certificate_line(found)
+
+
+@pytest.fixture
+def flicker() -> Iterator[str]:
+    """Give a renderer that changes one pixel of the fourth frame of every rollout after the process's first."""
+
+    class Flicker(CleanRenderer):
+        lives = 0
+
+        def __init__(self, scenario: Scenario, *more: object) -> None:
+            super().__init__(scenario, *more)  # type: ignore[arg-type]
+            Flicker.lives += 1
+            self.due_us = scenario.start_us + 400_000
+
+        def render(self, request: RenderRequest) -> Frame:
+            frame = super().render(request)
+            if request.t_us == self.due_us:
+                frame.rgb[0, 0, 0] = np.uint8(Flicker.lives)
+            return frame
+
+    RENDERERS.register("flicker-of-a-test", "changes")(Flicker)
+    yield "flicker-of-a-test"
+    del RENDERERS._builtin["flicker-of-a-test"]
+
+
+def test_one_changed_pixel_is_found_without_images_in_the_log(tmp_path: Path, flicker: str) -> None:
+    found = certificate(plan_of(flicker, "tests.runtime.test_certificate:Blind"), tmp_path)
+    assert found["status"] == "different"
+    first = found["first_difference"]
+    assert (first["component"], first["step"]) == ("frames", 4)
+    assert [name for name in found["digests"] if found["digests"][name] != found["repeated"][name]] == ["frames"]
+    assert "DIFFERENT" in certificate_line(found)
+
+
+def test_a_policy_that_remembers_is_named_before_the_motion_that_follows_from_it(tmp_path: Path) -> None:
+    found = certificate(plan_of(policy=FORGETFUL, overrides=("timing.warmup_us=0",)), tmp_path)
+    first = found["first_difference"]
+    assert (first["component"], first["step"]) == ("plans", 5)
+    differing = {name for name in found["digests"] if found["digests"][name] != found["repeated"][name]}
+    assert {"plans", "ego", "scores"} <= differing
+
+
+def test_the_same_command_again_keeps_the_certificate_until_the_log_is_another(tmp_path: Path) -> None:
+    first = certificate(plan_of(images="jpeg"), tmp_path)
+    assert certificate(plan_of(images="jpeg"), tmp_path, first) == first  # wall_s included: nothing was repeated
+    log = tmp_path / first["path"] / "rollout.asl"
+    data = bytearray(log.read_bytes())
+    at = data.rindex(b"\xff\xd9") - 40  # inside the last camera image, before its end mark
+    data[at] ^= 1
+    log.write_bytes(bytes(data))
+    found = certificate(plan_of(images="jpeg"), tmp_path, first)
+    assert found["status"] == "different"
+    assert found["first_difference"]["component"] == "frames"
+    assert found["first_difference"]["step"] == 7
+
+
+def test_resuming_with_more_rollouts_certifies_the_folder_as_it_is_now(tmp_path: Path) -> None:
+    longer = make_plan(expand("smoke/lead_car", (LONGER, *BARE)), ("clean",), ("pure-pursuit",), (0,), RunOptions(images="none"))
+    first = certificate(longer, tmp_path)
+    assert first["cell"]["scene"] == "smoke-lead_car"
+    found = certificate(plan_of(policy="pure-pursuit"), tmp_path, first)
+    assert found["cell"]["scene"] == "smoke-straight"
+    assert found["status"] == "equal"
+
+
+def test_what_cannot_be_repeated_is_said(tmp_path: Path) -> None:
+    assert certificate(plan_of(policy="pure-pursuit"), tmp_path / "off", wanted="none")["reason"] == "switched off with --certify none"
+    measured = certificate(plan_of(policy="pure-pursuit", overrides=("latency.kind=measured",)), tmp_path / "measured")
+    assert measured == {"status": "skipped", "reason": "latency 'measured' depends on the machine: no rollout can be repeated"}
+    failed = certificate(plan_of(policy="tests.runtime.broken_policies:Raises"), tmp_path / "failed")
+    assert failed == {"status": "skipped", "reason": "no rollout was run to its end"}
+    assert certificate_line(failed) == "skipped: no rollout was run to its end"
+
+
+class Blind(ConstantVelocity):
+    """Takes the camera's frames and drives straight on without looking."""
+
+    sensors = (SensorSpec("front"),)
