@@ -8,7 +8,7 @@ import traceback
 
 import typer
 
-from alpasim_plugin.cli import bench, doctor, listing, report, run
+from alpasim_plugin.cli import bench, doctor, listing, refine, report, run
 from alpasim_plugin.errors import SimrunError
 
 app = typer.Typer(
@@ -24,9 +24,10 @@ app.command("run", epilog=run.EPILOG)(run.run)
 app.command("report", epilog=report.EPILOG)(report.report)
 app.command("list", epilog=listing.EPILOG)(listing.list_parts)
 app.command("doctor", epilog=doctor.EPILOG)(doctor.doctor)
+app.command("refine", epilog=refine.EPILOG)(refine.refine)
 app.add_typer(bench.app, name="bench")
 
-VERBS = ("run", "report", "list", "doctor", "bench")
+VERBS = ("run", "report", "list", "doctor", "refine", "bench")
 OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
 
 

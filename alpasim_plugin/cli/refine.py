@@ -1,0 +1,139 @@
+"""``simrun refine``: a fixer over any video."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Literal, Self
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers import BlockFixer, fixer_settings, make_fixer
+from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_video
+
+INTERRUPTED = 130
+LINE_EVERY_S = 10.0
+SCENE = "video"  # key of the noise: the same for every file, so that a renamed video gives the same result
+PREFIX = "fixer."
+
+EPILOG = """
+Examples:
+
+- `simrun refine drive.mp4 -o refined.mp4 --compare side.mp4`
+
+- `simrun refine render.mp4 --opacity alpha.mp4 --sdmap map.mp4 --fixer onefixer-tiny --set fixer.window=12 -o refined.mp4`
+"""
+
+
+def refine(
+    source: Annotated[Path, typer.Argument(metavar="IN.mp4", help="Any video: any size, frame rate and length.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4).")],
+    opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey video, white where the input is reliable; else all is.")] = None,
+    sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Video of the semantic map (docs/conditioning.md).")] = None,
+    fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer-tiny",
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixer's noise.")] = 0,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="Also write input and result side by side (MP4).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace results that exist.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the summary.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Refine a video with a fixer, block by block, at any length in constant memory.
+
+    Frame times, size and colours are kept; sound is left out. The result appears once complete: an interrupted command leaves nothing
+    behind and is simply given again.
+    """
+    del debug
+    settings = fixer_settings(fixer, fixer_overrides(overrides or ()))
+
+    def session() -> BlockFixer:
+        made = make_fixer(fixer, settings, scene_id=SCENE, seed=seed, device=device, threads=threads)
+        if not made.trained and not as_json:
+            print(untrained_notice(made.label), file=sys.stderr)
+        return made
+
+    files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
+    try:
+        with FrameProgress(quiet or as_json) as progress:
+            summary = refine_video(files, session, progress.frames_done)
+    except KeyboardInterrupt:
+        print("interrupted; nothing was written; the same command starts again", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED) from None
+    if as_json:
+        print(json.dumps({"input": str(source), "output": str(out), "compare": compare and str(compare), **asdict(summary)}))
+    else:
+        print(describe(summary, out))
+
+
+def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
+    """Return ``--set`` values without their prefix ``fixer.``.
+
+    Raises:
+        InputError: A value for anything else.
+    """
+    for text in texts:
+        if not text.startswith(PREFIX):
+            raise InputError("reading --set", f"--set {text}", "not a key of the fixer", f"write --set {PREFIX}key=value")
+    return [text.removeprefix(PREFIX) for text in texts]
+
+
+def untrained_notice(label: str) -> str:
+    """Say that weights are missing, so that nobody takes a result for a repair."""
+    return f"UNTRAINED: {label}. The result shows the pipeline, not a repair."
+
+
+def describe(summary: RefineSummary, out: Path) -> str:
+    """Return the summary as lines of text."""
+    rate = "" if summary.fps is None else f" at {summary.fps:g} frames per second"
+    psnr = "equal" if summary.psnr_db is None else f"PSNR {summary.psnr_db:.2f} dB"
+    events = ", ".join(f"{name} {count}" for name, count in sorted(summary.events.items())) or "none"
+    times = f"p50 {summary.ms_per_frame_p50:.1f}, p95 {summary.ms_per_frame_p95:.1f}, first block {summary.ms_per_frame_first:.1f}"
+    lines = [
+        f"     fixer  {summary.fixer}" + ("" if summary.trained else "   UNTRAINED"),
+        f"    frames  {summary.frames} of {summary.width}x{summary.height}{rate}",
+        f"  ms/frame  {times}; with the files {summary.wall_s * 1e3 / summary.frames:.1f}",
+        f"  to input  {psnr}, mean {summary.mean_levels:.2f} and at most {summary.max_levels} grey levels",
+        f"    events  {events}",
+        f"    output  {out}" + ("   (without the input's sound)" if summary.audio_left_out else ""),
+    ]
+    return "\n".join(lines)
+
+
+class FrameProgress:
+    """Show frames done on standard error: a bar on a terminal, a line every ten seconds on a pipe."""
+
+    def __init__(self, silent: bool) -> None:
+        self._silent, self._bar, self._last, self._begin = silent, None, time.perf_counter(), time.perf_counter()
+        if not silent and sys.stderr.isatty():
+            columns = (TextColumn("refining"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"), TimeRemainingColumn())
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task("refining", total=None, speed="")
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def frames_done(self, done: int, claimed: int | None) -> None:
+        """Show that ``done`` of ``claimed`` frames are refined."""
+        now = time.perf_counter()
+        speed = f"{done / (now - self._begin):.1f} frames/s"
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=claimed, speed=speed)
+        elif not self._silent and now - self._last > LINE_EVERY_S:
+            self._last = now
+            print(f"refined {done}{'' if claimed is None else f'/{claimed}'} frames, {speed}", file=sys.stderr, flush=True)

@@ -1,0 +1,236 @@
+"""Refine a video file: read, fix block by block, write; optionally with opacity and map videos beside it.
+
+Nothing is held but the block in progress. The result appears under its name only once complete.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers import BlockFixer
+from alpasim_plugin.fixers.refine import StreamTally, refine_frames
+from alpasim_plugin.log.video_reader import TimedFrame, VideoReader
+from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.types import F32, U8, Frame
+
+DOING = "refining a video"
+CAMERA = "video"
+SAME_RATE = 5e-4  # relative; 29.97 and 30 differ by twice that
+GREY_LEVELS = 40  # an opacity video's channels may differ by this much, for compression's sake
+
+
+@dataclass(frozen=True)
+class RefineFiles:
+    """What is read and written.
+
+    Attributes:
+        source: The video.
+        out: The refined video (MP4).
+        opacity: Grey video, white where the source is reliable; None counts all of it as opaque.
+        sdmap: Video of the semantic map; None gives the fixer none.
+        compare: Also write source and result side by side here.
+        overwrite: Whether existing results may be replaced.
+    """
+
+    source: Path
+    out: Path
+    opacity: Path | None = None
+    sdmap: Path | None = None
+    compare: Path | None = None
+    overwrite: bool = False
+
+    @property
+    def inputs(self) -> dict[str, Path]:
+        """What is read, by role."""
+        named = {"input": self.source, "opacity": self.opacity, "sdmap": self.sdmap}
+        return {role: path for role, path in named.items() if path is not None}
+
+    @property
+    def results(self) -> dict[str, Path]:
+        """What is written, by role."""
+        named = {"output": self.out, "compare": self.compare}
+        return {role: path for role, path in named.items() if path is not None}
+
+
+@dataclass(frozen=True)
+class RefineSummary:
+    """How a video was refined.
+
+    Attributes:
+        fixer: What the fixer is.
+        trained: Whether its weights were learned.
+        frames, width, height: Of the video; odd sizes are padded by one row or column in the file.
+        fps: Average frame rate, None where the source states none.
+        ms_per_frame_p50, ms_per_frame_p95: Fixer only, over blocks; the first block apart where there are more.
+        ms_per_frame_first: Of the first block.
+        wall_s: Everything, files included.
+        psnr_db: Result against source, None where they are equal; before the file's compression.
+        mean_levels, max_levels: Their absolute difference in grey levels.
+        events: How many frames a guard passed on unrefined, by event.
+        audio_left_out: Whether the source has sound; the result has none.
+    """
+
+    fixer: str
+    trained: bool
+    frames: int
+    width: int
+    height: int
+    fps: float | None
+    ms_per_frame_p50: float
+    ms_per_frame_p95: float
+    ms_per_frame_first: float
+    wall_s: float
+    psnr_db: float | None
+    mean_levels: float
+    max_levels: int
+    events: Mapping[str, int]
+    audio_left_out: bool
+
+
+def refine_video(
+    files: RefineFiles, make_fixer: Callable[[], BlockFixer], on_frames: Callable[[int, int | None], None] | None = None
+) -> RefineSummary:
+    """Refine a video file.
+
+    Args:
+        files: What is read and written.
+        make_fixer: Makes the session; called once the files are found good.
+        on_frames: Told the number of frames done and the number that the container claims, after every block.
+
+    Raises:
+        InputError: Files that cannot be read, do not belong together, or stand in the way of the results.
+        InfrastructureError: The disk or the encoder refuses.
+    """
+    check_names(files)
+    begin = time.perf_counter()
+    tally = StreamTally()
+    with ExitStack() as stack:
+        readers = {role: stack.enter_context(VideoReader(path, DOING)) for role, path in files.inputs.items()}
+        check_formats(readers)
+        source = readers["input"].format
+        rate = source.rate or 1 / source.time_base
+        fixer = make_fixer()
+        writers = {
+            role: stack.enter_context(VideoWriter(path, source.time_base, rate, source.colour, source.pixel_aspect))
+            for role, path in files.results.items()
+        }
+        timing: list[TimedFrame] = []  # of the block in progress
+        for block in refine_frames(_joined(readers, timing), fixer):
+            for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
+                writers["output"].write(fixed.rgb, timed.time, timed.duration)
+                if "compare" in writers:
+                    writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
+            timing.clear()
+            tally.add(block)
+            if on_frames is not None:
+                on_frames(tally.frames, source.frames)
+    later = tally.ms_per_frame[1:] or tally.ms_per_frame
+    difference = tally.difference
+    return RefineSummary(
+        fixer=fixer.label,
+        trained=fixer.trained,
+        frames=tally.frames,
+        width=source.width,
+        height=source.height,
+        fps=None if source.rate is None else float(source.rate),
+        ms_per_frame_p50=float(np.median(later)),
+        ms_per_frame_p95=float(np.percentile(later, 95)),
+        ms_per_frame_first=tally.ms_per_frame[0],
+        wall_s=time.perf_counter() - begin,
+        psnr_db=difference.psnr_db if difference.squared else None,
+        mean_levels=difference.mean_levels,
+        max_levels=difference.max_levels,
+        events=dict(tally.events),
+        audio_left_out=source.audio,
+    )
+
+
+def check_names(files: RefineFiles) -> None:
+    """Refuse results that exist, that are inputs, or that are one file; and a missing folder.
+
+    Raises:
+        InputError: Naming the option.
+    """
+    resolved = {path.resolve(): role for role, path in files.inputs.items()}
+    for role, path in files.results.items():
+        taken = resolved.get(path.resolve())
+        if taken is not None:
+            raise InputError(DOING, str(path), f"the {role} would be written over the {taken}", "give the result a name of its own")
+        resolved[path.resolve()] = role
+        if not path.parent.is_dir():
+            raise InputError(DOING, str(path), f"no folder {path.parent}", "make it first")
+        if path.is_dir():
+            raise InputError(DOING, str(path), f"the {role} is a folder", "name a file in it")
+        if path.exists() and not files.overwrite:
+            raise InputError(DOING, str(path), f"the {role} exists already", "choose another name, or pass --overwrite")
+        if path.suffix.lower() != ".mp4":
+            raise InputError(DOING, str(path), f"suffix {path.suffix!r} of the {role}", "results are MP4 files: name it .mp4")
+
+
+def check_formats(readers: Mapping[str, VideoReader]) -> None:
+    """Refuse side videos whose size, frame rate or claimed number of frames is not the source's.
+
+    Raises:
+        InputError: With both values.
+    """
+    source = readers["input"].format
+    for role, reader in readers.items():
+        mine = reader.format
+        if (mine.width, mine.height) != (source.width, source.height):
+            found = f"the {role} is {mine.width}x{mine.height}, the input {source.width}x{source.height}"
+            raise InputError(DOING, str(reader.path), found, "give both at one size")
+        if mine.frames and source.frames and mine.frames != source.frames:
+            raise _lengths_differ(role, reader.path, f"{mine.frames} frames, the input {source.frames}")
+        several = (source.frames or 2) > 1  # the rate of a single frame means nothing
+        if several and mine.rate and source.rate and abs(mine.rate / source.rate - 1) > SAME_RATE:
+            found = f"the {role} has {float(mine.rate):.3f} frames per second, the input {float(source.rate):.3f}"
+            raise InputError(DOING, str(reader.path), found, "give both at one frame rate")
+
+
+def _joined(readers: Mapping[str, VideoReader], timing: list[TimedFrame]) -> Iterator[tuple[Frame, U8 | None]]:
+    """Yield the source's frames with opacity and map; their times are appended to ``timing``."""
+    roles = list(readers)
+    starts: list[Fraction] = []
+    for index, row in enumerate(zip_longest(*readers.values())):
+        ended = [role for role, timed in zip(roles, row, strict=True) if timed is None]
+        if ended:
+            going = [role for role in roles if role not in ended]
+            raise _lengths_differ(ended[0], readers[ended[0]].path, f"{index} frames, the {going[0]} more")
+        times = [timed.time * reader.format.time_base for timed, reader in zip(row, readers.values(), strict=True)]
+        starts = starts or times
+        _check_times(index, dict(zip(roles, [t - start for t, start in zip(times, starts, strict=True)], strict=True)), readers)
+        given = dict(zip(roles, row, strict=True))
+        timed = given["input"]
+        timing.append(timed)
+        alpha = _alpha(given["opacity"].image, index, readers["opacity"].path) if "opacity" in given else None
+        sdmap = given["sdmap"].image if "sdmap" in given else None
+        yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
+
+
+def _check_times(index: int, times_s: Mapping[str, Fraction], readers: Mapping[str, VideoReader]) -> None:
+    rate = readers["input"].format.rate
+    for role, time_s in times_s.items():
+        if rate and abs(time_s - times_s["input"]) > 1 / (2 * rate):
+            found = f"frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s"
+            raise InputError(DOING, str(readers[role].path), found, "give videos of the same frames at the same times")
+
+
+def _alpha(image: U8, index: int, path: Path) -> F32:
+    sample = image[::8, ::8].astype(np.int16)
+    if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
+        do = "give the accumulated opacity as a grey video, white where the input is reliable"
+        raise InputError(DOING, str(path), f"frame {index} of the opacity is coloured", do)
+    return image[..., 1].astype(np.float32) / np.float32(255)
+
+
+def _lengths_differ(role: str, path: Path, counts: str) -> InputError:
+    return InputError(DOING, str(path), f"the {role} has {counts}", "give videos of the same frames")

@@ -1,0 +1,50 @@
+"""Numbers that a refined stream adds up to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.fixers.refine import Difference, StreamTally, refine_frames
+from alpasim_plugin.types import Frame
+
+
+def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_them() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.integers(0, 256, (2, 5, 9, 7, 3), dtype=np.uint8)
+    a[2] = b[2]
+    difference = Difference()
+    for x, y in zip(a, b, strict=True):
+        difference.add(x, y)
+    d = a.astype(np.float64) - b
+    assert difference.psnr_db == pytest.approx(10 * np.log10(255**2 / np.mean(d**2)), rel=1e-12)
+    assert difference.mean_levels == pytest.approx(np.abs(d).mean(), rel=1e-12)
+    assert difference.max_levels == np.abs(d).max()
+
+
+def test_equal_streams_have_no_difference() -> None:
+    difference = Difference()
+    difference.add(np.full((4, 4, 3), 200, np.uint8), np.full((4, 4, 3), 200, np.uint8))
+    assert difference.psnr_db == float("inf")
+    assert (difference.mean_levels, difference.max_levels) == (0, 0)
+
+
+def test_a_stream_without_frames_yields_no_block() -> None:
+    assert list(refine_frames([], make_fixer("identity", scene_id="video"))) == []
+
+
+def test_blocks_are_made_as_they_are_asked_for() -> None:
+    taken = []
+
+    def frames() -> object:
+        for i in range(30):
+            taken.append(i)
+            yield Frame(i, "video", np.zeros((16, 16, 3), np.uint8)), None
+
+    tally = StreamTally()
+    for block in refine_frames(frames(), make_fixer("identity", scene_id="video")):  # type: ignore[arg-type]
+        tally.add(block)
+        assert len(taken) == tally.frames
+    assert tally.frames == 30
+    assert len(tally.ms_per_frame) == 5
