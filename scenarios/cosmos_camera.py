@@ -113,15 +113,19 @@ def project_ftheta(camera: RecordedLens, points: F64) -> F64:
     return np.asarray(np.where((theta <= camera.lens.max_angle_rad)[:, None], pixels, np.nan))
 
 
-def front_camera(lens: RecordedLens) -> CameraSpec:
+def front_camera(lens: RecordedLens, T_rig_camera: F64 = T_RIG_FRONT_WIDE) -> CameraSpec:
     """Return the pinhole of 90 degrees width inside the front wide lens.
 
     Its principal point is the recorded one scaled to the rendered size, so every rendered pixel lies inside the recorded image.
+
+    Args:
+        lens: The calibrated lens.
+        T_rig_camera: ``(4, 4)`` mount; by default that of another car of the fleet.
     """
     focal = WIDTH / 2 / np.tan(HORIZONTAL_FOV_RAD / 2)
     cx, cy = lens.cx * WIDTH / lens.width, lens.cy * HEIGHT / lens.height
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    return CameraSpec(FRONT_WIDE, WIDTH, HEIGHT, K, orthonormal(T_RIG_FRONT_WIDE), ftheta=lens.lens)
+    return CameraSpec(FRONT_WIDE, WIDTH, HEIGHT, K, orthonormal(T_rig_camera), ftheta=lens.lens)
 
 
 def orthonormal(transform: F64) -> F64:

@@ -182,7 +182,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
         _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
         _rates(spec), start, end, spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
-        _hash(document, spec, chosen_id, record.content_hash), record.notes,
+        _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map,
     )  # fmt: skip
 
 

@@ -85,9 +85,13 @@ class SourceFiles:
             raise self.fail(path, f"it cannot be read: {error.strerror}", "check its type and permissions") from error
         if not data:
             raise self.fail(path, "an empty file", "fetch the file again")
-        self._hash.update(f"{path.name}:{len(data)}\n".encode())
-        self._hash.update(data)
+        self.note_bytes(path.name, data)
         return data
+
+    def note_bytes(self, name: str, data: bytes) -> None:
+        """Enter bytes that were read under a name into the hash."""
+        self._hash.update(f"{name}:{len(data)}\n".encode())
+        self._hash.update(data)
 
     def read_json(self, path: Path) -> Any:
         """Read a JSON document."""
@@ -158,7 +162,10 @@ class SourceFiles:
         Raises:
             InputError: The document is malformed or truncated, or declares a DOCTYPE.
         """
-        data = self.read_bytes(path)
+        return self.parse_xml(self.read_bytes(path), path)
+
+    def parse_xml(self, data: bytes, path: Path | str) -> ElementTree.Element:
+        """Parse an XML document that came out of ``path``; see `read_xml`."""
 
         def refuse(*_: Any) -> None:
             raise self.fail(path, "a DOCTYPE declaration", "remove it: entities are not accepted in scenario files")

@@ -16,7 +16,7 @@ class RecordedLog:
     """
 
     scene_id: str
-    source: str  # argoverse | commonroad | cosmos
+    source: str  # argoverse | commonroad | cosmos | usdz
     lane_map: LaneMap
     ground: HeightField
     ego_log: Trajectory  # rig poses, world
@@ -26,3 +26,4 @@ class RecordedLog:
     world_origin: tuple[float, float, float]
     content_hash: str  # sha256 over the bytes that were read
     notes: tuple[str, ...] = ()
+    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs

@@ -11,6 +11,7 @@ from scenarios.argoverse import read_argoverse
 from scenarios.commonroad import read_commonroad
 from scenarios.cosmos import read_cosmos
 from scenarios.recorded import RecordedLog
+from scenarios.usdz import read_usdz
 
 
 @dataclass(frozen=True)
@@ -20,13 +21,6 @@ class Source:
     help: str
     matches: Callable[[Path], bool]
     read: Callable[[Path, str | None], RecordedLog]
-
-
-def _usdz(path: Path, ego: str | None) -> RecordedLog:
-    raise InputError(
-        "reading a scenario", str(path), "an AlpaSim .usdz scene; this version has no reader for it",
-        "use a scenario YAML, an Argoverse 2 log folder, a CommonRoad XML or a Cosmos-Drive-Dreams folder",
-    )  # fmt: skip
 
 
 SOURCES: dict[str, Source] = {
@@ -41,7 +35,7 @@ SOURCES: dict[str, Source] = {
         lambda p: p.is_dir() and any((p / name).is_dir() for name in ("vehicle_pose", "3d_lanes", "pinhole_intrinsic")),
         lambda p, ego: read_cosmos(p),
     ),
-    "usdz": Source("AlpaSim scene", lambda p: p.suffix == ".usdz", _usdz),
+    "usdz": Source("AlpaSim scene", lambda p: p.suffix == ".usdz", lambda p, ego: read_usdz(p)),
 }
 
 

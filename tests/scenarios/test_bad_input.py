@@ -170,7 +170,7 @@ def test_missing_file_gives_the_nearest_shipped_names() -> None:
 
 def test_usdz_and_unknown_files_are_refused_with_what_can_be_read(tmp_path: Path) -> None:
     (tmp_path / "a.usdz").write_bytes(b"PK")
-    with pytest.raises(InputError, match="no reader for it"):
+    with pytest.raises(InputError, match="no readable ZIP"):
         load_scenario(tmp_path / "a.usdz")
     (tmp_path / "a.bin").write_bytes(b"?")
     with pytest.raises(InputError) as e:

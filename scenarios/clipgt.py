@@ -1,0 +1,127 @@
+"""Lane maps from the parquet tables of an AlpaSim scene (``map_data``, ``clipgt`` or ``fastmap``).
+
+Layout: structs ``key`` and one named after the table. Lanes have a left and a right rail with the same number of points, seen in driving
+direction; the centre is halfway, point by point. Vertices are set as AlpaSim's loader sets them (`scenarios.vertices`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.types import F64, Box, Lane, LaneMap
+from scenarios.usdz_archive import Archive
+from scenarios.vertices import with_vertices
+
+FOLDERS = ("map_data", "clipgt", "fastmap")  # the first usable one counts
+TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
+SIGN = Box(0.1, 0.75, 0.75)  # the table has no size
+
+
+def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
+    """Return the lane map of the first usable folder of tables, with notes; None where there is none.
+
+    A folder is usable if it has all six tables and at least one lane.
+
+    Raises:
+        InputError: A lane lacks a rail, its rails differ in length, or a coordinate is not finite.
+    """
+    notes: list[str] = []
+    for folder in FOLDERS:
+        missing = [table for table in TABLES if f"{folder}/{table}.parquet" not in archive]
+        if len(missing) == len(TABLES):
+            continue
+        if missing:
+            notes.append(f"map tables in {folder}/ passed over: no {', '.join(missing)}")
+            continue
+        lanes = archive.table(f"{folder}/lane.parquet")
+        if not lanes:
+            notes.append(f"map tables in {folder}/ passed over: no lane")
+            continue
+        notes += ["fastmap tables: heights are taken as stored, not from the ground mesh"] if folder == "fastmap" else []
+        return _read(archive, folder, lanes), tuple(notes)
+    return None, tuple(notes)
+
+
+def _read(archive: Archive, folder: str, rows: list[dict[str, Any]]) -> LaneMap:
+    where = f"{archive.path}, {folder}/lane.parquet"
+    links = _links(archive, folder)
+    lanes: dict[str, Lane] = {}
+    for row in rows:
+        key = str(row["key"]["map_id"])
+        fields = row.get("lane") or {}
+        absent = [side for side in ("left_rail", "right_rail") if not fields.get(side)]
+        if absent:
+            found = f"lane {key} without {absent[0]}, only {', '.join(fields) or 'nothing'}"
+            raise archive.files.fail(where, found, "use a map whose lanes have both rails; AlpaSim refuses this scene too")
+        left, right = (points(archive, f"{where}, lane {key}", fields[side]) for side in ("left_rail", "right_rail"))
+        if len(left) != len(right) or len(left) < 2:
+            found = f"lane {key} with rails of {len(left)} and {len(right)} points"
+            raise archive.files.fail(where, found, "give both rails the same number of points, at least two")
+        lanes[key] = Lane(
+            key, with_vertices((left + right) / 2), with_vertices(left), with_vertices(right),
+            successors=links.get(("NEXT_LANE", key), ()),
+            left_neighbour=next(iter(links.get(("LEFT_LANE", key), ())), None),
+            right_neighbour=next(iter(links.get(("RIGHT_LANE", key), ())), None),
+        )  # fmt: skip
+    edges: dict[str, F64] = {}
+    for row in archive.table(f"{folder}/road_boundary.parquet"):
+        edges.setdefault(str(row["key"]["map_id"]), _line(archive, folder, "road_boundary", row))  # the first of an id counts
+    stops = [row for row in archive.table(f"{folder}/wait_line.parquet") if (row.get("wait_line") or {}).get("is_implicit") is not True]
+    return LaneMap(
+        {key: _known(lane, lanes) for key, lane in lanes.items()},
+        tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
+        stop_lines=tuple(line for line in (_line(archive, folder, "wait_line", row) for row in stops) if len(line) > 1),
+        signs=tuple(sign for row in archive.table(f"{folder}/traffic_sign.parquet") if (sign := _sign(row)) is not None),
+    )  # fmt: skip
+
+
+def without_rails(lane_map: LaneMap) -> LaneMap:
+    """Return a map whose lanes have only their centres, so that scorers widen those by 1.85 m."""
+    return replace(lane_map, lanes={key: replace(lane, left=None, right=None) for key, lane in lane_map.lanes.items()})
+
+
+def points(archive: Archive, where: str, raw: Any) -> F64:
+    """Return points ``(N, 3)`` of a list of structs or of a struct of lists."""
+    try:
+        if isinstance(raw, dict):
+            xyz = np.stack([np.asarray(raw[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+        else:
+            xyz = np.array([[p["x"], p["y"], p["z"]] for p in raw], dtype=np.float64).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise archive.files.fail(where, f"points that are no x, y, z: {error}", "write the table again") from error
+    if not np.isfinite(xyz).all():
+        raise archive.files.fail(where, "a coordinate that is not finite", "repair the coordinates of this table")
+    return xyz
+
+
+def _line(archive: Archive, folder: str, table: str, row: dict[str, Any]) -> F64:
+    where = f"{archive.path}, {folder}/{table}.parquet, {(row.get('key') or {}).get('map_id')}"
+    return points(archive, where, (row.get(table) or {}).get("location") or [])
+
+
+def _links(archive: Archive, folder: str) -> dict[tuple[str, str], tuple[str, ...]]:
+    """Return (kind, lane) -> lanes; of several rows for a lane and kind the first counts."""
+    out: dict[tuple[str, str], tuple[str, ...]] = {}
+    for row in archive.table(f"{folder}/association.parquet"):
+        what = row.get("association") or {}
+        kind, subject = (row.get("key") or {}).get("kind"), what.get("subjects")
+        if kind and subject is not None:
+            out.setdefault((str(kind), str(subject)), tuple(str(one) for one in what.get("objects") or ()))
+    return out
+
+
+def _known(lane: Lane, lanes: dict[str, Lane]) -> Lane:
+    left, right = (n if n in lanes else None for n in (lane.left_neighbour, lane.right_neighbour))
+    return replace(lane, successors=tuple(s for s in lane.successors if s in lanes), left_neighbour=left, right_neighbour=right)
+
+
+def _sign(row: dict[str, Any]) -> tuple[F64, Box] | None:
+    centre = (row.get("traffic_sign") or {}).get("center")
+    if not centre or any(centre.get(axis) is None for axis in "xyz"):
+        return None
+    pose = np.eye(4)
+    pose[:3, 3] = [centre[axis] for axis in "xyz"]
+    return pose, SIGN

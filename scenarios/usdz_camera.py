@@ -1,0 +1,72 @@
+"""The front wide camera of an AlpaSim scene, from its calibration table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.types import F64, CameraSpec
+from scenarios.cosmos_camera import FRONT_WIDE, front_camera, lens_of
+from scenarios.usdz_archive import Archive
+
+TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
+# Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
+_FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...]]:
+    """Return the front wide camera where the scene holds its calibration, with notes.
+
+    Raises:
+        InputError: The table is there, but damaged or its front wide camera is no f-theta camera.
+    """
+    member = next((name for name in TABLES if name in archive), None)
+    if member is None:
+        return (), ("no camera calibration in this scene: the default front camera is used",)
+    where = f"{archive.path}, {member}"
+    rows = archive.table(member)
+    try:
+        rig = archive.files.parse_json(str(rows[0]["calibration_estimate"]["rig_json"]).encode(), where)
+        sensors = {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
+    except (IndexError, KeyError, TypeError) as error:
+        raise archive.files.fail(where, f"{type(error).__name__}: {error}", "give one row with rig_json") from error
+    sensor = sensors.get(FRONT_WIDE)
+    if sensor is None:
+        return (), (f"no {FRONT_WIDE} among {len(sensors)} calibrated sensors: the default front camera is used",)
+    try:
+        camera = front_camera(lens_of(_lens_numbers(sensor["properties"])), mount(sensor))
+    except (KeyError, TypeError, ValueError) as error:
+        raise archive.files.fail(f"{where}, {FRONT_WIDE}", f"{type(error).__name__}: {error}", "give an f-theta calibration") from error
+    return (camera,), ("rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",)
+
+
+def _lens_numbers(properties: dict[str, Any]) -> F64:
+    if properties.get("Model") != "ftheta":
+        raise ValueError(f"camera model {properties.get('Model')!r}")
+    coefficients = [float(v) for v in str(properties["polynomial"]).split()]
+    if not 1 <= len(coefficients) <= 6:
+        raise ValueError(f"a polynomial of {len(coefficients)} coefficients")
+    backward = str(properties.get("polynomial-type", "pixeldistance-to-angle")) == "pixeldistance-to-angle"
+    size = [float(properties[name]) for name in ("cx", "cy", "width", "height")]
+    return np.array([*size, *coefficients, *[0.0] * (6 - len(coefficients)), float(backward)])
+
+
+def mount(sensor: dict[str, Any]) -> F64:
+    """Return the ``(4, 4)`` pose of a camera in the rig: the nominal mount, turned and shifted by the estimated corrections."""
+    nominal = sensor["nominalSensor2Rig_FLU"]
+    turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
+    shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
+    out = np.eye(4)
+    out[:3, :3] = _rotation(nominal["roll-pitch-yaw"]) @ _rotation(turn) @ _FLU_FROM_CAMERA
+    out[:3, 3] = np.asarray(nominal["t"], dtype=np.float64) + np.asarray(shift, dtype=np.float64)
+    return out
+
+
+def _rotation(roll_pitch_yaw_deg: Any) -> F64:
+    """Return Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cr, cp, cy), (sr, sp, sy) = (f(np.deg2rad(np.asarray(roll_pitch_yaw_deg, dtype=np.float64))) for f in (np.cos, np.sin))
+    x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return np.asarray(z @ y @ x)
