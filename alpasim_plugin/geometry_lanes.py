@@ -28,10 +28,14 @@ def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
         xy = np.ascontiguousarray(lane.centre[:, :2])
         line = shapely.linestrings(xy) if len(xy) > 1 else shapely.points(xy[0])
         return shapely.buffer(line, half_width_m, quad_segs=16)
-    ring = np.concatenate([lane.left[:, :2], lane.right[::-1, :2]])
+    return ring_area(np.concatenate([lane.left[:, :2], lane.right[::-1, :2]]))
+
+
+def ring_area(ring: F64) -> Any:
+    """Return the plan-view area inside a ring ``(N, 2+)``, repaired as in `lane_polygon`."""
     if len(ring) < 3:
         return shapely.Polygon()
-    polygon = shapely.polygons(np.ascontiguousarray(ring))
+    polygon = shapely.polygons(np.ascontiguousarray(ring[:, :2]))
     return polygon if shapely.is_valid(polygon) else areal_parts(shapely.make_valid(polygon))
 
 

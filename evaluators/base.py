@@ -97,7 +97,12 @@ def series(
 
 def relevant(rollout: RolloutLog) -> Bool:
     """Return for every ego time ``(T,)`` whether the warm-up with the forced recording is over."""
-    return np.asarray(rollout.ego.t_us >= rollout.render_start_us + rollout.force_gt_us)
+    return np.asarray(rollout.ego.t_us >= handover_us(rollout))
+
+
+def handover_us(rollout: RolloutLog) -> int:
+    """Return the time at which the policy takes over."""
+    return rollout.render_start_us + rollout.force_gt_us
 
 
 def check_rollout(rollout: RolloutLog) -> None:

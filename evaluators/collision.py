@@ -1,113 +1,127 @@
-"""Contact with other actors: which step, which actor, which side of the ego; and the least gap.
+"""Contact with other actors: flags by side, the least gap, and where contact is searched between steps, time and place.
 
-Protocol (paper, appendix "Collision"): at each step the plan-view polygons of ego and actors are intersected; an actor that touches the
-front-bumper segment is a front contact, else one that touches the rear-bumper segment a rear contact, else a lateral one. At fault is
-front or lateral. Touching counts as contact. Only logged instants are looked at.
-
-All pairs of a rollout are handled at once: centre distances rule out nearly all of them, shapely's exact predicates decide the rest.
+At fault is front or lateral. By the paper's protocol only logged instants are looked at (`evaluators.step_contact`); preset ``strict``
+searches the motion between them as well (`evaluators.swept_contact`), and a row then says what happened since the row before.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import shapely
 
 from alpasim_plugin.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
-from evaluators.base import register, series
-from evaluators.footprint import ActorTable, Footprints, ego_footprints, origin_of
+from evaluators.base import handover_us, register, series
+from evaluators.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.presets import Preset
+from evaluators.presets import preset as find_preset
+from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts, last_per_step
+from evaluators.swept_contact import SweptContacts, find_swept
 
-FRONT, REAR, LATERAL = 0, 1, 2
-# Slack of the distance filter: far above rounding, far below any size, so that the filter never rules out a touching pair.
-_SLACK_M = 1e-6
+SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
+NO_CONTACT = "nothing touches the ego"
 
 
 @dataclass(frozen=True)
-class Contacts:
-    """Touching pairs, by step and then in the actors' order."""
+class ContactEvent:
+    """One actor begins to touch the ego."""
 
-    step: I64  # (M,) index into the ego's times
-    actor: I64  # (M,) index into the actor table
-    side: I64  # (M,) FRONT, REAR or LATERAL
+    actor_id: str
+    t_s: float  # since the log's first ego pose
+    side: str  # front | rear | lateral
+    x_m: float  # where on the footprint: rig frame, forward of the rear axle
+    y_m: float  # rig frame, left
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields by name, for a manifest; micrometres and tenths of microseconds are rounded away."""
+        return {
+            "actor_id": self.actor_id,
+            "t_s": round(self.t_s, 6),
+            "side": self.side,
+            "x_m": round(self.x_m, 5),
+            "y_m": round(self.y_m, 5),
+        }
 
 
-def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Contacts, F64]:
-    """Find all contacts and the least gap per step.
+def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tuple[ContactEvent, ...]:
+    """Return the beginning of every contact at or between steps, in order of time.
 
     Args:
-        ego: Footprints at the times.
-        actors: Everybody else.
-        t_us: ``(T,)`` times.
+        rollout: A log that `evaluators.base.check_rollout` accepts.
+        preset: Sizes of the footprints.
 
     Returns:
-        The contacts, and ``(T,)`` metres from the ego to the nearest actor: 0 on touch, inf where nobody is present.
+        One entry each time an actor begins to touch the ego, however short; the warm-up included.
     """
-    gap_m = np.full(len(t_us), np.inf)
-    none = np.zeros(0, dtype=np.int64)
-    if len(actors) == 0:
-        return Contacts(none, none, none), gap_m
-    there = actors.at(t_us)
-    centre_m = there.centre_distance_m(ego.xy)  # (A, T)
-    at_least = centre_m - ego.radius_m[None] - actors.radius_m[:, None]
-    at_most = centre_m - ego.inner_radius_m[None] - actors.inner_radius_m[:, None]
-    # The nearest footprint is among those that could be as near as the surest one; every touching one is among them too.
-    candidate = there.present & (at_least <= np.maximum(at_most.min(axis=0), 0.0)[None] + _SLACK_M)
-    step, actor = np.nonzero(candidate.T)
-    ego_shapes = ego.shapes()
-    boxes = there.footprints(actor, step).shapes()
-    distance_m = shapely.distance(ego_shapes[step], boxes)
-    np.minimum.at(gap_m, step, distance_m)
-    # Distance 0 and "intersects" may differ by rounding; the predicate is exact and decides, and the gap follows it.
-    touch = shapely.intersects(ego_shapes[step], boxes)
-    gap_m[step[touch]] = 0.0
-    step, actor, boxes = step[touch], actor[touch], boxes[touch]
-    front, rear = ego.take(step).bumpers()
-    side = np.where(shapely.intersects(boxes, front), FRONT, np.where(shapely.intersects(boxes, rear), REAR, LATERAL))
-    return Contacts(step, actor, side.astype(np.int64)), gap_m
+    chosen = find_preset(preset)
+    origin = origin_of(rollout.ego, chosen)
+    ego, actors = ego_footprints(rollout, chosen, origin), ActorTable(rollout, chosen, origin)
+    at_steps, _ = find_contacts(ego, actors, rollout.ego.t_us)
+    begun = find_swept(ego, actors, rollout.ego.t_us, at_steps, handover_us(rollout)).beginnings
+    places = in_rig(begun.xy, rollout)
+    return tuple(
+        ContactEvent(actors.ids[begun.actor[k]], float(begun.t_s[k]), SIDES[int(begun.side[k])], float(places[k, 0]), float(places[k, 1]))
+        for k in np.argsort(begun.t_s, kind="stable")
+    )
 
 
 @register("collision", "contact with other actors, by side, and the least gap")
 def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step."""
+    """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*`` where motion is searched too."""
     origin = origin_of(rollout.ego, preset)
     t_us = rollout.ego.t_us
     ego, actors = ego_footprints(rollout, preset, origin), ActorTable(rollout, preset, origin)
     contacts, gap_m = find_contacts(ego, actors, t_us)
+    if preset.contact == "between_steps":
+        swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
+        gap_m[swept.step] = 0.0
+        return [*_flags(t_us, swept.step, swept.side, preset), _gap(t_us, gap_m, preset), *_first_contacts(rollout, swept)]
     if preset.hits == "last":
-        contacts = _last_per_step(contacts, ego, actors, t_us)
-    front, rear, lateral = (_any_per_step(contacts, side, len(t_us)) for side in (FRONT, REAR, LATERAL))
+        contacts = last_per_step(contacts, ego, actors, t_us)
+    return [*_flags(t_us, contacts.step, contacts.side, preset), _gap(t_us, gap_m, preset)]
+
+
+def _flags(t_us: I64, step: I64, side: I64, preset: Preset) -> list[MetricSeries]:
+    front, rear, lateral = (_any_per_step(step[side == one], len(t_us)) for one in (FRONT, REAR, LATERAL))
     return [
         series("collision_any", t_us, front | rear | lateral),
         *([] if preset.hits == "last" else [series("collision_at_fault", t_us, front | lateral)]),
         series("collision_front", t_us, front),
         series("collision_lateral", t_us, lateral),
         series("collision_rear", t_us, rear),
-        series(
-            "min_distance_to_obstacle_m", t_us, gap_m, np.isfinite(gap_m), "no other actor is present", keep_values=not preset.honour_valid
-        ),
     ]
 
 
-def _any_per_step(contacts: Contacts, side: int, n_steps: int) -> Bool:
-    out = np.zeros(n_steps, dtype=np.bool_)
-    out[contacts.step[contacts.side == side]] = True
+def _gap(t_us: I64, gap_m: F64, preset: Preset) -> MetricSeries:
+    there = np.isfinite(gap_m)
+    return series("min_distance_to_obstacle_m", t_us, gap_m, there, "no other actor is present", keep_values=not preset.honour_valid)
+
+
+def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSeries]:
+    """Give time and place of the earliest begun among the contacts of each row."""
+    t_us = rollout.ego.t_us
+    began = swept.beginnings
+    order = np.lexsort((began.t_s[swept.begin], swept.step))
+    step, first = np.unique(swept.step[order], return_index=True)
+    begin = swept.begin[order][first]
+    touched = np.zeros(len(t_us), dtype=np.bool_)
+    touched[step] = True
+    x_m, y_m = in_rig(began.xy[begin], rollout).T
+    out = []
+    for name, values in (("contact_time_s", began.t_s[begin]), ("contact_x_m", x_m), ("contact_y_m", y_m)):
+        full = np.full(len(t_us), np.nan)
+        full[step] = values
+        out.append(series(name, t_us, full, touched, NO_CONTACT))
     return out
 
 
-def _last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us: I64) -> Contacts:
-    """Keep of each step's contacts the one that the spatial index names last.
+def in_rig(xy: F64, rollout: RolloutLog) -> F64:
+    """Return points ``(N, 2)`` of the ego's box frame in its rig frame."""
+    return np.asarray(xy @ rollout.T_rig_box[:2, :2].T + rollout.T_rig_box[:2, 3])
 
-    AlpaSim builds an STRtree of the ego and all present actors at every step, in the log's order, and lets the last answer decide. The
-    order depends on the tree's layout, so the tree is built the same way here, for the steps with more than one contact.
-    """
-    keep = np.ones(len(contacts.step), dtype=np.bool_)
-    there = actors.at(t_us)
-    for step in np.flatnonzero(np.bincount(contacts.step, minlength=len(t_us)) > 1):
-        present = np.flatnonzero(there.present[:, step])
-        shapes = np.concatenate([ego.take(np.array([step])).shapes(), there.footprints(present, np.full(len(present), step)).shapes()])
-        order = [i for i in shapely.STRtree(shapes).query(shapes[0], predicate="intersects") if i != 0]
-        rows = np.flatnonzero(contacts.step == step)
-        keep[rows[contacts.actor[rows] != present[order[-1] - 1]]] = False
-    return Contacts(contacts.step[keep], contacts.actor[keep], contacts.side[keep])
+
+def _any_per_step(step: I64, n_steps: int) -> Bool:
+    out = np.zeros(n_steps, dtype=np.bool_)
+    out[step] = True
+    return out

@@ -145,16 +145,47 @@ class ActorTable:
         row = np.zeros(shape, dtype=np.int64)
         fraction = np.zeros(shape)
         present = np.zeros(shape, dtype=np.bool_)
-        for a, track_t in enumerate(self._t):
-            i = np.searchsorted(track_t, t_us, side="right") - 1
-            present[a] = (i >= 0) & (t_us <= track_t[-1])
-            i = np.clip(i, 0, len(track_t) - 1)
-            follows = np.minimum(i + 1, len(track_t) - 1)
-            span = (track_t[follows] - track_t[i]).astype(np.float64)
-            passed = np.where(present[a], t_us - track_t[i], 0).astype(np.float64)
-            fraction[a] = np.divide(passed, span, out=np.zeros_like(span), where=span > 0)
-            row[a] = self._start[a] + i
+        for a in range(len(self)):
+            row[a], fraction[a], present[a] = self._locate(a, t_us)
         return ActorsAt(self, row, fraction, present)
+
+    def boxes(self, actor: I64, t_us: I64) -> Footprints:
+        """Return the boxes ``(M,)`` of actors at times ``(M,)`` at which they are present."""
+        row, fraction = np.zeros(len(actor), dtype=np.int64), np.zeros(len(actor))
+        for a in np.unique(actor):
+            mine = np.flatnonzero(actor == a)
+            row[mine], fraction[mine], _ = self._locate(int(a), t_us[mine])
+        return self.boxes_at(actor, row, fraction)
+
+    def boxes_at(self, actor: I64, row: I64, fraction: F64) -> Footprints:
+        """Return the boxes ``(M,)`` of actors at a share ``(M,)`` of the way from logged rows ``(M,)`` to the rows after them."""
+        follows = np.where(fraction > 0, row + 1, row)
+        xy = self._xy[row] * (1 - fraction)[:, None] + self._xy[follows] * fraction[:, None]
+        yaw = yaw_from_quat(self._quat[row])
+        between = np.flatnonzero(fraction)
+        if len(between):
+            yaw[between] = yaw_from_quat(slerp(self._quat[row[between]], self._quat[follows[between]], fraction[between]))
+        return Footprints(held(xy, self.preset), yaw, self.size[actor], self.preset.roundness, self.preset.float32)
+
+    def times_of(self, actor: int) -> I64:
+        """Return the logged times of one actor."""
+        return self._t[actor]
+
+    def path_of(self, actor: int) -> F64:
+        """Return the logged centres ``(N, 2)`` of one actor."""
+        return self._xy[self._start[actor] : self._start[actor + 1]]
+
+    def _locate(self, actor: int, t_us: I64) -> tuple[I64, F64, Bool]:
+        """Return per time ``(Q,)`` the logged row before or at it, the share of the way to the next row, and whether the actor is there."""
+        track_t = self._t[actor]
+        i = np.searchsorted(track_t, t_us, side="right") - 1
+        present = (i >= 0) & (t_us <= track_t[-1])
+        i = np.clip(i, 0, len(track_t) - 1)
+        follows = np.minimum(i + 1, len(track_t) - 1)
+        span = (track_t[follows] - track_t[i]).astype(np.float64)
+        passed = np.where(present, t_us - track_t[i], 0).astype(np.float64)
+        fraction = np.divide(passed, span, out=np.zeros_like(span), where=span > 0)
+        return np.asarray(self._start[actor] + i), fraction, np.asarray(present)
 
 
 @dataclass(frozen=True)
@@ -180,14 +211,7 @@ class ActorsAt:
 
     def footprints(self, actor: I64, query: I64) -> Footprints:
         """Return the boxes of pairs ``(M,)`` of actor and time."""
-        row, f = self.row[actor, query], self.fraction[actor, query]
-        follows = self._next()[actor, query]
-        xy = self.table._xy[row] * (1 - f)[:, None] + self.table._xy[follows] * f[:, None]
-        yaw = yaw_from_quat(self.table._quat[row])
-        between = np.flatnonzero(f)
-        if len(between):
-            yaw[between] = yaw_from_quat(slerp(self.table._quat[row[between]], self.table._quat[follows[between]], f[between]))
-        return Footprints(held(xy, self.table.preset), yaw, self.table.size[actor], self.table.preset.roundness, self.table.preset.float32)
+        return self.table.boxes_at(actor, self.row[actor, query], self.fraction[actor, query])
 
     def _next(self) -> I64:
         return np.asarray(np.where(self.fraction > 0, self.row + 1, self.row))

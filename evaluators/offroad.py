@@ -5,6 +5,8 @@ whatever their direction. A step is on the road if one nearby lane's area contai
 inside), or else if the union of all nearby areas does. Only if neither holds, the road edges decide: the step is off-road if the footprint
 is nearer than 1 mm to a road-edge polyline. "Off-road" thus means *touching the edge* outside the lanes: far beyond the edge, where nothing
 is touched, a step counts as on the road. The drive to there has crossed the edge, and steps after the first event are dropped.
+
+Preset ``strict`` asks instead whether the footprint sticks out of the drivable surface, and by how much (`evaluators.surface`).
 """
 
 from __future__ import annotations
@@ -14,12 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
+from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.geometry import wrap_angle, yaw_from_quat
 from alpasim_plugin.types import F64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.base import register, series
 from evaluators.footprint import Geometries, ego_footprints, origin_of
 from evaluators.presets import Preset
 from evaluators.road import Road, road_of
+from evaluators.surface import MARGIN_M
 
 WRONG_HEADING_RAD = 2 * np.pi / 3
 
@@ -82,15 +86,32 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     """Give ``offroad``, ``wrong_lane`` and ``min_distance_to_lane_boundary_m`` per step; a missing map is invalid, never zero."""
     t_us = rollout.ego.t_us
     names = ("offroad", "wrong_lane", "min_distance_to_lane_boundary_m")
-    if not scene.lane_map.lanes:
+    lane_map = scene.alpasim_map if preset.alpasim_map and scene.alpasim_map is not None else scene.lane_map
+    if not lane_map.lanes:
         if preset.missing_road == "absent":
             return []
+        if preset.missing_road == "error":
+            raise EvaluatorError(
+                "scoring lane keeping",
+                f"scene {rollout.scene_id!r}, preset {preset.name!r}",
+                NO_LANES,
+                "score with a scene that has a map, or with a preset that can do without (paper, alpasim)",
+            )
         return [series(name, t_us, np.nan, False, NO_LANES) for name in names]
     origin = origin_of(scene.ego_log, preset)
-    road = road_of(scene.lane_map, origin, preset)
+    road = road_of(lane_map, origin, preset)
     ego = ego_footprints(rollout, preset, origin)
     shapes = ego.shapes()
     xyz = rollout.ego.xyz - origin
+    if preset.offroad_rule == "margin":
+        margin_m = road.surface.margin_m(shapes, xyz)
+        against = wrong_lane(road, road.lanes_near(xyz), ego.centres(), ego.yaw, preset)
+        return [
+            series("offroad", t_us, margin_m < -MARGIN_M),
+            series("offroad_margin_m", t_us, margin_m),
+            series("wrong_lane", t_us, against),
+            series("min_distance_to_lane_boundary_m", t_us, np.maximum(margin_m, 0.0)),
+        ]
     held = containment(road, shapes, xyz)
     off = np.zeros(len(t_us), dtype=np.bool_)
     known = held.in_one | held.in_union

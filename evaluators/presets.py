@@ -1,6 +1,7 @@
 """Evaluator presets: every convention that changes a number, in one frozen record that is stamped on the results.
 
-`paper` follows the closed-loop appendix of the OneFixer paper. A preset only selects; the evaluators hold the code of each choice.
+`paper` follows the closed-loop appendix of the OneFixer paper, `alpasim` AlpaSim's code with its quirks, and `strict` is what we hold to be
+right. A preset only selects; the evaluators hold the code of each choice.
 """
 
 from __future__ import annotations
@@ -23,16 +24,22 @@ class Preset:
     roundness: float = 0.0
     # Collision. "every": each touching actor is classified. "last": only the last one of the spatial index's answer is.
     hits: Literal["every", "last"] = "every"
+    # "at_steps": logged instants only. "between_steps": the motion between them too.
+    contact: Literal["at_steps", "between_steps"] = "at_steps"
     # Road. Lanes whose centre passes within lane_radius_m (3-D) of the ego box centre: its line, or only its stored vertices.
     lane_radius_m: float = 6.0
     lane_query: Literal["line", "vertices"] = "line"
     lane_half_width_m: float = 1.85  # buffer of the centre where an edge is missing
-    seam_m: float = 1e-6  # gaps between nearby lanes up to this wide are rounding and are closed
+    seam_m: float = 1e-6  # gaps between lanes up to this wide are closed; 1 um is rounding
+    # Off the road. "edge_touch": no nearby lane holds the footprint and it touches a road edge. "margin": it sticks out of the drivable
+    # surface, all lanes and drivable areas of the ego's level.
+    offroad_rule: Literal["edge_touch", "margin"] = "edge_touch"
     edge_touch_m: float = 0.001  # off-road below this distance from a road edge, if no lane contains the footprint
     edge_query: Literal["any", "nearest_vertex"] = "any"
-    edge_height_m: float = 3.0  # edge_query "any": edges farther above or below the box centre belong to another road
+    edge_height_m: float = 3.0  # edges and surfaces farther above or below the box centre belong to another road
+    alpasim_map: bool = False  # read the road as AlpaSim's own loader does, where the scene says that this differs
     # Wrong lane. "none_agrees": no lane under the ego runs its way. "any_opposes": at least one runs against it.
-    missing_road: Literal["invalid", "absent"] = "invalid"  # no map, or an edge is needed and there is none
+    missing_road: Literal["invalid", "absent", "error"] = "invalid"  # no map, or an edge is needed and there is none
     wrong_lane_rule: Literal["none_agrees", "any_opposes"] = "none_agrees"
     wrap_heading: bool = True  # compare headings modulo a full turn
     # Precision. False: float64 relative to a local origin. True: coordinates as they stand, poses and corners in float32.
@@ -59,6 +66,15 @@ class Preset:
     stop_beyond_gt_m: float | None = None  # rows after the first one this far from the recorded path are dropped
     drop_black: bool = False  # a black image in a scored row removes the rollout
 
+    def __post_init__(self) -> None:
+        if self.roundness > 0 and (self.contact == "between_steps" or self.offroad_rule == "margin"):
+            raise InputError(
+                "building an evaluator preset",
+                f"preset {self.name!r}",
+                f"roundness {self.roundness} together with contact {self.contact!r} and off-road rule {self.offroad_rule!r}",
+                "set roundness to 0: motion between steps and the off-road margin are worked out for sharp corners only",
+            )
+
     def as_dict(self) -> dict[str, Any]:
         """Return every convention by name, for run.json."""
         return dataclasses.asdict(self)
@@ -74,6 +90,7 @@ PRESETS: dict[str, Preset] = {
         lane_query="vertices",
         seam_m=0.0,
         edge_query="nearest_vertex",
+        alpasim_map=True,
         missing_road="absent",
         wrong_lane_rule="any_opposes",
         wrap_heading=False,
@@ -89,6 +106,7 @@ PRESETS: dict[str, Preset] = {
         stop_beyond_gt_m=4.0,
         drop_black=True,
     ),
+    "strict": Preset(name="strict", contact="between_steps", seam_m=0.1, offroad_rule="margin", missing_road="error"),
 }
 
 

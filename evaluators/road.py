@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 import weakref
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
-from alpasim_plugin.geometry_lanes import lane_polygon
+from alpasim_plugin.geometry_lanes import lane_polygon, ring_area
 from alpasim_plugin.types import F64, I64, Bool, Lane, LaneMap
 from evaluators.footprint import Geometries
 from evaluators.presets import Preset
+from evaluators.surface import Surface, segment_distance
 
 
 class Road:
@@ -34,6 +36,15 @@ class Road:
         self.edges: Geometries = np.array([_line(edge[:, :2] - origin[:2]) for edge in lane_map.road_edges], dtype=object)
         self._edge = _Polylines([edge - origin for edge in lane_map.road_edges])
         self._unions: dict[bytes, Any] = {}
+        self._lines = [lane.centre for lane in lanes]
+        self._rings = [ring - origin for ring in lane_map.drivable_areas]
+
+    @cached_property
+    def surface(self) -> Surface:
+        """All lanes and drivable areas as one surface."""
+        rings = [ring_area(ring) for ring in self._rings]
+        areas = np.array([*self.areas, *rings], dtype=object)
+        return Surface(areas, [*self._lines, *self._rings], self._preset.seam_m, self._preset.edge_height_m)
 
     def lanes_near(self, xyz: F64) -> Bool:
         """Return which lanes ``(T, L)`` pass near points ``(T, 3)``, by the preset's radius and query, in 3-D whatever their direction."""
@@ -91,7 +102,7 @@ class _Polylines:
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         # Plan-view distance is never above the 3-D one; the slack keeps rounding from hiding a segment.
         point, segment = self._tree.query(shapely.points(xyz[:, :2]), predicate="dwithin", distance=radius_m + 1e-6)
-        near = _segment_distance(self.start[segment], self.end[segment], xyz[point]) <= radius_m
+        near = segment_distance(self.start[segment], self.end[segment], xyz[point]) <= radius_m
         out[point[near], self.owner[segment[near]]] = True
         return out
 
@@ -127,15 +138,6 @@ def join(areas: Geometries, seam_m: float) -> Any:
     """
     shape = areas[0] if len(areas) == 1 else shapely.union_all(areas)
     return shapely.buffer(shape, seam_m / 2, join_style="mitre") if seam_m > 0 and len(areas) > 1 else shape
-
-
-def _segment_distance(start: F64, end: F64, points: F64) -> F64:
-    """Return distances ``(M,)`` between points ``(M, 3)`` and segments ``(M, 3)``, ``(M, 3)``."""
-    along, offset = end - start, points - start
-    length2 = np.einsum("ij,ij->i", along, along)
-    f = np.einsum("ij,ij->i", along, offset)
-    f = np.clip(np.divide(f, length2, out=np.zeros_like(f), where=length2 > 0), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(offset - f[:, None] * along, axis=1))
 
 
 def _moved(lane: Lane, origin: F64) -> Lane:

@@ -11,8 +11,8 @@ import shapely
 from alpasim_plugin.geometry import yaw_from_quat
 from alpasim_plugin.types import RolloutLog
 from evaluators import PRESETS, score
-from evaluators.collision import find_contacts
 from evaluators.footprint import ActorTable, corners, ego_footprints, origin_of
+from evaluators.step_contact import find_contacts
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
 
 PAPER = PRESETS["paper"]

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.types import Box
 from evaluators import PRESETS, score
-from evaluators.collision import FRONT, LATERAL, REAR, find_contacts
 from evaluators.footprint import ActorTable, corners, ego_footprints, origin_of
 from evaluators.reference import contacts_by_step
+from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 
 PAPER = PRESETS["paper"]

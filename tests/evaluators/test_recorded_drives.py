@@ -12,8 +12,8 @@ import pytest
 from alpasim_plugin.geometry import interpolate, inverse, offset_trajectory, se3, trajectory_from_poses
 from alpasim_plugin.types import LaneMap, RolloutLog, Scene
 from evaluators import PRESETS, rollout_values, score
-from evaluators.collision import find_contacts
 from evaluators.footprint import ActorTable, ego_footprints
+from evaluators.step_contact import find_contacts
 from scenarios.argoverse import read_argoverse
 from scenarios.commonroad import read_commonroad
 from scenarios.cosmos import read_cosmos

@@ -1,0 +1,180 @@
+"""The drivable surface of a map as one shape, and the signed margin of footprints to its border.
+
+The surface is the union of all lane areas and drivable areas on the ego's level. Gaps between them up to the preset's ``seam_m`` wide are
+closed; the border elsewhere stays where the map has it. The margin is the least over the footprint's points of the signed distance to the
+border, positive inside: inside, the gap to the border; outside, minus how far the point that sticks out most is from the surface. It is
+continuous and defined however far from the map the ego is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+import shapely
+
+from alpasim_plugin.geometry import arc_lengths
+from alpasim_plugin.types import F64, I64, Bool
+from evaluators.footprint import Geometries
+
+MARGIN_M = 1e-6  # accuracy of the margin
+SLOPE = 0.2  # a road on the ego's level may lie this much higher or lower per metre of distance
+_GRID_M = 1e-7  # shared edges that differ by rounding only are joined on this grid
+_MOUTH = 0.35  # a gap is open along less than this share of its outline; what closing adds to bends of the outer border is open to more
+_N_FEATURES = 6
+
+
+class Surface:
+    """Everything drivable of one map, metres relative to its origin."""
+
+    def __init__(self, areas: Geometries, outlines: Sequence[F64], seam_m: float, level_m: float) -> None:
+        """Take shapes and their outlines in space.
+
+        Args:
+            areas: ``(B,)`` plan-view polygons.
+            outlines: B polylines ``(N, 3)`` that tell their heights.
+            seam_m: Widest gap to close.
+            level_m: What lies farther above or below than this, and `SLOPE` per metre of distance, is another road.
+        """
+        self._areas, self._seam_m, self._level_m = areas, seam_m, level_m
+        self._outlines = [np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in outlines]
+        self._regions: dict[bytes, Region] = {}
+
+    def margin_m(self, footprints: Geometries, xyz: F64) -> F64:
+        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with box centres ``(T, 3)``."""
+        level = self.on_level(xyz)
+        out = np.full(len(footprints), -np.inf)
+        _, first, group = np.unique(np.packbits(level, axis=1), axis=0, return_index=True, return_inverse=True)
+        group = group.reshape(-1)
+        for g, representative in enumerate(first):
+            if level[representative].any():
+                rows = np.flatnonzero(group == g)
+                out[rows] = self.region(level[representative]).margin_m(footprints[rows])
+        return out
+
+    def on_level(self, xyz: F64) -> Bool:
+        """Return which areas ``(T, B)`` are on the level of points ``(T, 3)``: not on a bridge above nor on a road below."""
+        out = np.ones((len(xyz), len(self._areas)), dtype=np.bool_)
+        low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
+        points = shapely.points(xyz[:, :2])
+        for b, line in enumerate(self._outlines):
+            if max(high - line[:, 2].min(), line[:, 2].max() - low) <= self._level_m:
+                continue  # near enough everywhere
+            flat = shapely.linestrings(line[:, :2])
+            z = np.interp(shapely.line_locate_point(flat, points), arc_lengths(line), line[:, 2])
+            out[:, b] = np.abs(z - xyz[:, 2]) <= self._level_m + SLOPE * shapely.distance(flat, points)
+        return out
+
+    def region(self, chosen: Bool) -> Region:
+        """Return the joined areas marked in ``(B,)``; kept, as neighbouring steps share them."""
+        key = np.packbits(chosen).tobytes()
+        if key not in self._regions:
+            self._regions[key] = Region(closed_union(self._areas[chosen], self._seam_m))
+        return self._regions[key]
+
+
+class Region:
+    """A plan-view shape with its border indexed by segments."""
+
+    def __init__(self, shape: Any) -> None:
+        self.shape = shape
+        shapely.prepare(shape)
+        rings = [shapely.get_coordinates(ring) for part in shapely.get_parts(shape) for ring in shapely.get_rings(part)]
+        self._start = np.concatenate([np.zeros((0, 2)), *(ring[:-1] for ring in rings)])
+        self._end = np.concatenate([np.zeros((0, 2)), *(ring[1:] for ring in rings)])
+        self._tree = shapely.STRtree(shapely.linestrings(np.stack([self._start, self._end], axis=1)))
+
+    def margin_m(self, footprints: Geometries) -> F64:
+        """Return the signed margins ``(T,)`` of polygons, -inf where the shape is empty."""
+        out = np.full(len(footprints), -np.inf)
+        if not len(self._start):
+            return out
+        inside = shapely.contains(self.shape, footprints)
+        out[inside] = self._nearest(footprints[inside])[1]
+        out[~inside] = -self._depth_m(footprints[~inside])
+        return out
+
+    def _nearest(self, shapes: Geometries) -> tuple[I64, F64]:
+        """Return the nearest border segment and its distance per shape; among equally near ones any."""
+        (_, segment), distance = self._tree.query_nearest(shapes, return_distance=True, all_matches=False)
+        return np.asarray(segment), np.asarray(distance)
+
+    def _depth_m(self, footprints: Geometries) -> F64:
+        """Return how far ``(N,)`` footprints stick out: the greatest distance to the shape among their points, to `MARGIN_M`.
+
+        What sticks out is cut into ever smaller pieces. The distance to one border segment is convex, and so is the mean of two; over a
+        piece neither exceeds its greatest value at the piece's corners, and the distance to the shape exceeds neither. Pieces that
+        cannot hold a greater distance than one already found are dropped. Two segments are needed for gaps: halfway between two parallel
+        borders no single one bounds the distance well.
+        """
+        best = np.zeros(len(footprints))
+        pieces = shapely.difference(footprints, self.shape)
+        owner = np.flatnonzero(~shapely.is_empty(pieces))
+        pieces = pieces[owner]
+        while len(owner):
+            corner, piece = shapely.get_coordinates(pieces, return_index=True)
+            nearest, distance = self._nearest(shapely.points(corner))
+            np.maximum.at(best, owner[piece], distance)
+            bound = self._bound_m(pieces, corner, piece, nearest, distance)
+            rows = np.flatnonzero(bound > best[owner] + MARGIN_M)
+            owner, pieces = _quartered(owner[rows], pieces[rows])
+        return best
+
+    def _bound_m(self, pieces: Geometries, corner: F64, piece: I64, nearest: I64, distance: F64) -> F64:
+        """Return for each piece a distance ``(M,)`` that none of its points exceeds."""
+        n = np.bincount(piece, minlength=len(pieces))
+        begin = np.cumsum(n) - n
+        deepest = np.lexsort((distance, piece))[begin + n - 1]
+        spread = [begin + (k * n) // 4 for k in range(4)]
+        middle, _ = self._nearest(shapely.centroid(pieces))
+        features = np.stack([middle, *(nearest[v] for v in (deepest, *spread))], axis=1)  # (M, _N_FEATURES)
+        away = np.stack([segment_distance(self._start[f], self._end[f], corner) for f in features[piece].T], axis=1)
+        bound = np.full(len(pieces), np.inf)
+        for i, j in combinations_with_replacement(range(_N_FEATURES), 2):
+            np.minimum(bound, np.maximum.reduceat((away[:, i] + away[:, j]) / 2, begin), out=bound)
+        return bound
+
+
+def closed_union(areas: Geometries, seam_m: float) -> Any:
+    """Return the union of areas with the gaps between them up to ``seam_m`` wide filled.
+
+    Filled is what a disc of that diameter cannot reach from outside (morphological closing). Closing also rounds off bends of the outer
+    border by hairs; those are told from gaps by being open to the outside along much of their outline, and are left out, so that the
+    outer border is the map's own.
+    """
+    shape = shapely.union_all(areas, grid_size=_GRID_M)
+    if seam_m <= 0 or shapely.is_empty(shape):
+        return shape
+    radius_m = 0.505 * seam_m  # arcs are drawn as polygons inside the circle; a gap of seam_m must close all the same
+    wide = shapely.buffer(shape, radius_m, quad_segs=16)
+    added = shapely.get_parts(shapely.difference(shapely.buffer(wide, -radius_m, quad_segs=16), shape))
+    added = added[shapely.area(added) > 0]
+    if not len(added):
+        return shape
+    outline = shapely.boundary(added)
+    thick = shapely.buffer(shapely.boundary(shape), 10 * _GRID_M, quad_segs=2)
+    shapely.prepare(thick)
+    mouths = shapely.length(shapely.difference(outline, thick)) / shapely.length(outline)
+    gaps = shapely.buffer(added[mouths < _MOUTH], 5 * _GRID_M, join_style="mitre")
+    return shapely.union_all(np.concatenate([[shape], gaps]), grid_size=_GRID_M)
+
+
+def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:
+    """Cut pieces at the middle of their bounds; empty quarters are left out."""
+    low_x, low_y, high_x, high_y = shapely.bounds(pieces).reshape(-1, 4).T
+    x, y = (low_x + high_x) / 2, (low_y + high_y) / 2
+    quarters = [(low_x, low_y, x, y), (x, low_y, high_x, y), (low_x, y, x, high_y), (x, y, high_x, high_y)]
+    cut = np.concatenate([shapely.intersection(pieces, shapely.box(*quarter)) for quarter in quarters])
+    keep = np.flatnonzero(~shapely.is_empty(cut))
+    return np.tile(owner, 4)[keep], cut[keep]
+
+
+def segment_distance(start: F64, end: F64, points: F64) -> F64:
+    """Return distances ``(M,)`` between points ``(M, D)`` and segments ``(M, D)``, ``(M, D)``."""
+    along, offset = end - start, points - start
+    length2 = np.einsum("ij,ij->i", along, along)
+    f = np.einsum("ij,ij->i", along, offset)
+    f = np.clip(np.divide(f, length2, out=np.zeros_like(f), where=length2 > 0), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - f[:, None] * along, axis=1))
