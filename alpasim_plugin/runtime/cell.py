@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 
+from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.plan import Cell, RunOptions
@@ -17,7 +20,7 @@ from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
-from alpasim_plugin.types import Scenario
+from alpasim_plugin.types import Policy, Renderer, Scenario
 from policies import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
@@ -25,7 +28,37 @@ from scenarios.suite import ScenarioRef
 MANIFEST = "manifest.json"
 
 
-def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Parts:
+    """What one rollout is made of.
+
+    Attributes:
+        session: Names the rollout in its log; equal rollouts have equal names.
+        names: What the log's header says of each service.
+        controller: None takes what the policy asks for.
+    """
+
+    renderer: Renderer
+    policy: Policy
+    session: str
+    names: Mapping[str, str]
+    controller: Controller | None = None
+
+
+PartsOf = Callable[[Cell, RunOptions, Scenario, int], Parts]
+
+
+def own_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
+    """Make the parts that a cell names."""
+    return Parts(
+        make_renderer(cell.renderer, scenario, seed=cell.seed, device=options.device, threads=threads),
+        make_policy(cell.policy, scenario),
+        cell.rollout_key,
+        {"sensorsim": cell.renderer, "egodriver": cell.policy},
+    )
+
+
+def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of: PartsOf = own_parts) -> dict[str, Any]:
     """Run and score one cell and return its manifest, which is written last: a folder without one is unfinished.
 
     A failure of any part is a result as well: its manifest has ``status: failed``, the four parts and the traceback.
@@ -47,15 +80,9 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int) -> dict[
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).unlink(missing_ok=True)
         scenario = _scenario(cell.ref)
-        parts = {"sensorsim": cell.renderer, "egodriver": cell.policy}
-        with Recorder(scenario, cell.seed, folder, cell.rollout_key, options.images, options.video != "none", parts) as recorder:
-            run_rollout(
-                scenario,
-                make_renderer(cell.renderer, scenario, seed=cell.seed, device=options.device, threads=threads),
-                make_policy(cell.policy, scenario),
-                cell.seed,
-                recorder,
-            )
+        parts = parts_of(cell, options, scenario, threads)
+        with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
+            run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
         manifest |= recorder.facts()
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
