@@ -29,8 +29,6 @@ OTHER = replace(
     min_ade_target="self",
     min_ade_horizons_s=(0.4, 2.0, 3.1),
 )
-ROAD = {"offroad", "wrong_lane", "min_distance_to_lane_boundary_m"}
-NO_MAP_READER = {"synthetic-opendrive-a"}  # its map is OpenDRIVE: everything but the road metrics is compared
 IDS = {"clipgt_id", "rollout_id", "run_name", "run_uuid"}
 SCENES = (
     *("black-frame-a", "curve-offroad-a", "curve-offroad-c", "cut-in-a", "cut-in-c", "drift-a", "front-brake-a", "heading-pi-a"),
@@ -53,9 +51,8 @@ def scored(log: Path, archive: Path, preset: Preset, rails: bool = True) -> tupl
 def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True) -> None:
     found = {one.name: one for one in scored(log, archive, preset, rails)}
     want = expected(log)
-    skipped = ROAD if archive.stem in NO_MAP_READER else set()
-    assert set(found) - skipped == set(want) - skipped
-    for name in set(want) - skipped:
+    assert set(found) == set(want)
+    for name in want:
         t_us, value, valid = want[name]
         one = found[name]
         np.testing.assert_array_equal(one.t_us, t_us, err_msg=name)
@@ -69,13 +66,7 @@ def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True) -
 
 def assert_reduced(log: Path, archive: Path, preset: Preset, want: dict, rails: bool = True, skip: frozenset[str] = frozenset()) -> None:
     values = {name: one.value for name, one in reduce_rollout(scored(log, archive, preset, rails), preset).values.items() if one.valid}
-    road = ROAD | {"offroad_or_collision", "offroad_or_collision_at_fault"} if archive.stem in NO_MAP_READER else set()
-    if road:
-        # Off-road ends a rollout, so without the map only rollouts that stay on the road can be compared.
-        if want["offroad"]:
-            return
-        values = {name: value for name, value in values.items() if name not in road}
-    for name in (set(values) | set(want)) - IDS - road - skip:
+    for name in (set(values) | set(want)) - IDS - skip:
         got, value = values.get(name), want.get(name)
         if value is None:  # AlpaSim writes null for inf and NaN
             assert got is None or not np.isfinite(got), name
