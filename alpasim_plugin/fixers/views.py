@@ -38,6 +38,11 @@ class Views:
         """Frames, height and width."""
         return ClipSize(*self.rgb.shape[1:4])
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.size.height, self.size.width
+
     def same(self, other: Views | None) -> bool:
         """Say whether two blocks are equal bit for bit."""
         return other is not None and all(_same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))

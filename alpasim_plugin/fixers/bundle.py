@@ -1,0 +1,94 @@
+"""Everything a trained fixer is, in one safetensors file: transformer, autoencoder, prompt, and what it was trained for.
+
+Keys carry their part: ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's), ``prompt.text``. The header holds ``format``,
+``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained for. Only safetensors is read: a pickle is
+refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.nets.checkpoints import StateDict, load_weights, read_metadata, save_weights
+
+FORMAT = "simrun-fixer-1"
+PARTS = ("dit", "vae", "decoder", "prompt")
+MUST_MATCH = ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled")  # other values give wrong pictures
+MAY_DIFFER = ("steps", "history", "window", "sink", "holes", "uses_map")  # named in the label
+DOING = "loading a fixer's weights"
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What a file holds."""
+
+    parts: Mapping[str, StateDict]  # by part, keys without it
+    trained: bool
+    note: str  # what it is, and what is set otherwise than it was trained for
+
+
+def save_bundle(
+    path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: OneFixerSettings, *, trained: bool, note: str = ""
+) -> None:
+    """Write a bundle, whole or not at all.
+
+    Args:
+        path: A ``.safetensors`` file.
+        parts: State dicts by part: ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``: tokens, text_width).
+        settings: What the weights were trained for.
+        trained: Whether they were learned.
+        note: A few words on them, for labels.
+
+    Raises:
+        InputError: A part that is not known, or no transformer or autoencoder.
+    """
+    unknown, missing = sorted(set(parts) - set(PARTS)), sorted({"dit", "vae"} - set(parts))
+    if unknown or missing:
+        found = f"parts {sorted(parts)}"
+        raise InputError("saving a fixer's weights", str(path), found, f"give dit and vae, and nothing but {', '.join(PARTS)}")
+    tensors = {f"{part}.{key}": value for part, sd in parts.items() for key, value in sd.items()}
+    plain = settings.model_dump(mode="json", exclude={"weights"})
+    save_weights(path, tensors, {"format": FORMAT, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)})
+
+
+def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
+    """Read a bundle for use with some settings.
+
+    Raises:
+        InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
+    """
+    header = read_metadata(path)
+    if header.get("format") != FORMAT:
+        found = f"format {header.get('format')!r} in its header"
+        do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
+        raise InputError(DOING, str(path), found, do)
+    made_for = json.loads(header.get("settings", "{}"))
+    differs = [(key, _at(made_for, key), _at(settings.model_dump(mode="json"), key)) for key in (*MUST_MATCH, *MAY_DIFFER)]
+    wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in MUST_MATCH]
+    if wrong:
+        raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
+    parts: dict[str, StateDict] = {}
+    for key, value in load_weights(path, sha256=settings.weights.sha256.bundle).items():
+        part, _, rest = key.partition(".")
+        parts.setdefault(part, {})[rest] = value
+    unknown, missing = sorted(set(parts) - set(PARTS)), sorted({"dit", "vae"} - set(parts))
+    if unknown or missing:
+        found = "; ".join([f"no {part}.*" for part in missing] + [f"unknown part {part}.*" for part in unknown])
+        raise InputError(DOING, str(path), found, f"write it with save_bundle (parts {', '.join(PARTS)})")
+    trained = header.get("trained") == "true"
+    others = [f"{key} {used} instead of {due}" for key, due, used in differs if due != used and key in MAY_DIFFER]
+    note = ", ".join(text for text in ("" if trained else "untrained", header.get("note", ""), *others) if text)
+    return Bundle(parts, trained, note or "trained")
+
+
+def _at(data: object, key: str) -> object:
+    for part in key.split("."):
+        data = data.get(part) if isinstance(data, dict) else None
+    return data

@@ -1,0 +1,68 @@
+"""A fixer that fails is seen: every frame is looked at, and a broken one is replaced by the raw frame, with an event that says why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from torch import Tensor
+
+from alpasim_plugin.types import U8
+
+NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"
+LIMIT = 1.5  # a quarter of the range from black to white beyond either end
+SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
+BLACK_LEVEL = 10  # every byte at or below this is a black frame, as the raw frames' guard has it
+MOVED = 0.5  # grey levels of mean change in the raw frames that an unchanged output cannot answer
+
+
+def failures(video: Tensor) -> list[str]:
+    """Look at a view's decoded frames before they are cut to the range.
+
+    Args:
+        video: ``(3, T, H, W)``, meant to lie in [-1, 1].
+
+    Returns:
+        T events, "" where a frame is fine.
+    """
+    low, high = (x.float() for x in (video.amin((0, 2, 3)), video.amax((0, 2, 3))))  # NaN anywhere in a frame is the result
+    events = np.where((low.isfinite() & high.isfinite()).cpu().numpy(), "", NAN)
+    beyond = ((low < -LIMIT) | (high > LIMIT)).cpu().numpy() & (events == "")
+    for t in np.flatnonzero(beyond):
+        if float((video[:, t].abs() > LIMIT).float().mean()) > SHARE:
+            events[t] = RANGE
+    return [str(event) for event in events]
+
+
+def black(fixed: U8, raw: U8) -> bool:
+    """Say whether an image went black that was not."""
+    return int(fixed.max()) <= BLACK_LEVEL < int(raw.max())
+
+
+def frozen(fixed: U8, before: U8, raw: U8, raw_before: U8) -> bool:
+    """Say whether an output repeats the one before it bit for bit although the raw frame changed."""
+    if not np.array_equal(fixed, before):
+        return False
+    return float(np.abs(raw.astype(np.int16) - raw_before).mean()) > MOVED
+
+
+def judge(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
+    """Name what is wrong with each frame of one view.
+
+    Args:
+        video: ``(3, T, H, W)`` as decoded.
+        fixed: ``(T, H, W, 3)`` the same as images.
+        raw: ``(T, H, W, 3)`` what the fixer was given.
+        before: The last fixed and raw frame of the block before, if there was one.
+
+    Returns:
+        T events, "" where a frame is fine.
+    """
+    events = failures(video)
+    for t, event in enumerate(events):
+        last = (fixed[t - 1], raw[t - 1]) if t else before
+        if not event and black(fixed[t], raw[t]):
+            events[t] = BLACK
+        elif not event and last is not None and frozen(fixed[t], last[0], raw[t], last[1]):
+            events[t] = FROZEN
+    return events

@@ -1,0 +1,155 @@
+"""The networks of a fixer, from weights or untrained, loaded once per process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import FixerError, InputError
+from alpasim_plugin.fixers.bundle import read_bundle
+from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
+from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
+from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.nets.init import initial_weights
+from alpasim_plugin.nets.schedule import CONTEXT_STEP, from_names
+from alpasim_plugin.nets.wan_vae_layout import WanLayout
+from alpasim_plugin.seeding import derive_seed
+
+DOING = "loading the networks of a fixer"
+PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+TAEHV_WIDTHS = (256, 128, 64, 64)
+LATENT = 16
+
+
+Codec = TinyVAE | WanVAE
+
+
+@dataclass(frozen=True, eq=False)
+class Networks:
+    """Everything that blocks run through; read-only and free of state, so rollouts share it."""
+
+    dit: CosmosCausalDiT  # folded where there is one step
+    finalise_dit: CosmosCausalDiT  # the same weights for the cache write
+    vae: Codec
+    decoder: Codec | TinyDecoder
+    text: TextContext
+    trained: bool
+    note: str  # what the weights are, for labels
+
+    @property
+    def device(self) -> torch.device:
+        """Where they run."""
+        return self.dit.device
+
+
+def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
+    """Build the networks that the settings name, or return them if this process has built them before.
+
+    Raises:
+        InputError: Weights that are missing or do not fit.
+        FixerError: The device does not work.
+    """
+    if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
+        raise FixerError(DOING, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
+    loop = FixerSettings(name="")  # how the loop uses a fixer has no part in what its networks are
+    return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
+
+
+@lru_cache(maxsize=4)
+def _load(settings: OneFixerSettings, device: str) -> Networks:
+    parts = _Parts(settings)
+    plain = parts.dit()
+    with torch.inference_mode():
+        plain.to(device)
+        text = plain.encode_text(parts.prompt(plain.sizes).to(device))
+        fold = settings.fold and len(settings.steps) == 1
+        dit = plain.folded(from_names(settings.steps)[0].t) if fold else plain
+        finalise = plain.folded(CONTEXT_STEP) if fold and settings.history == "finalise" else plain
+    vae = parts.vae().to(device)
+    decoder = parts.decoder(vae).to(device)
+    return Networks(dit, finalise, vae, decoder, text, parts.trained, parts.note)
+
+
+class _Parts:
+    """Find every part's weights: in the bundle, in a file of its own, or made up as ``untrained`` says."""
+
+    def __init__(self, settings: OneFixerSettings) -> None:
+        self.settings, self.weights = settings, settings.weights
+        self.bundle = read_bundle(self.weights.bundle, settings) if self.weights.bundle is not None else None
+        self.trained = self.bundle.trained if self.bundle else self.weights.dit is not None
+        self.note = self.bundle.note if self.bundle else f"weights of {Path(self.weights.dit).name}" if self.weights.dit else ""
+        self.note = self.note or f"untrained ({settings.untrained})"
+        self.seed = derive_seed("fixer", 0, settings.name)
+
+    def tensors(self, part: str) -> tuple[Mapping[str, Tensor], str] | None:
+        """Return a part's tensors and where they come from; None where no file is named."""
+        if self.bundle is not None:
+            found = self.bundle.parts.get(part)
+            return None if found is None else (found, f"{self.weights.bundle} ({part})")
+        path: str | None = getattr(self.weights, part)
+        return None if path is None else (load_weights(path, sha256=getattr(self.weights.sha256, part)), path)
+
+    def dit(self) -> CosmosCausalDiT:
+        """Build the transformer."""
+        settings = self.settings
+        given = self.tensors("dit")
+        if given is None:
+            self.made_up("dit")
+            sizes = DiTSizes(**settings.dit.model_dump())
+            given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
+        dtype = PRECISIONS.get(settings.precision, torch.float32)
+        return CosmosCausalDiT.from_state_dict(given[0], settings.rope_ratios, dtype=dtype, source=given[1])
+
+    def prompt(self, sizes: DiTSizes) -> Tensor:
+        """Return the prompt's features ``(1, tokens, text_width)``; a single zero token where none is given and none was learned."""
+        given = self.tensors("prompt")
+        if given is None:
+            if self.trained and self.bundle is None:
+                self.refuse("prompt", "its transformer needs the features of the prompt that it was trained with")
+            return torch.zeros(1, 1, sizes.text_width)
+        text = given[0].get("text")
+        if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
+            found = "no tensor 'text'" if text is None else f"text is {list(text.shape)}"
+            raise InputError(DOING, given[1], found, f"give 'text' of shape [tokens, {sizes.text_width}]")
+        return text.float()[None]
+
+    def vae(self) -> Codec:
+        """Build the autoencoder."""
+        given, dtype = self.tensors("vae"), PRECISIONS[self.settings.codec_precision]
+        if self.settings.vae.kind == "tiny":
+            if given is not None:
+                return TinyVAE.from_state_dict(given[0], dtype=dtype, source=given[1])
+            self.made_up("vae")
+            return TinyVAE.random(seed=self.seed).requires_grad_(False).to(dtype)
+        if given is not None:
+            return WanVAE.from_state_dict(given[0], dtype=dtype, source=given[1])
+        self.made_up("vae", always_random=True)
+        return WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed).to(dtype)
+
+    def decoder(self, vae: Codec) -> Codec | TinyDecoder:
+        """Build the decoder where it is not the autoencoder's own."""
+        settings = self.settings.decoder
+        if settings.kind != "taehv":
+            return vae
+        given, dtype = self.tensors("decoder"), PRECISIONS[self.settings.codec_precision]
+        if given is not None:
+            return TinyDecoder.from_state_dict(given[0], scaled=settings.scaled, dtype=dtype, source=given[1])
+        self.made_up("decoder", always_random=True)
+        return TinyDecoder.random(LATENT, TAEHV_WIDTHS, settings.scaled, self.seed).to(dtype)
+
+    def made_up(self, part: str, always_random: bool = False) -> None:
+        """Refuse to go without weights unless the settings allow what would stand in for them."""
+        if self.settings.untrained == "refuse":
+            self.refuse(part, "no weights, and settings.untrained is 'refuse'")
+        if always_random and self.settings.untrained == "identity":
+            self.refuse(part, "no weights, and an untrained one is not an identity")
+
+    def refuse(self, part: str, found: str) -> None:
+        """Raise the error for weights that are missing."""
+        do = f"give --set fixer.weights.{part}=FILE (or fixer.weights.bundle=FILE); for timing alone, fixer.untrained=random"
+        raise InputError(DOING, f"{self.settings.name}, weights.{part}", found, do)

@@ -1,0 +1,160 @@
+"""One block through the networks: encode, mix (Eq. 1), flow (Eq. 2), decode, write the history. Tensors in, tensors out.
+
+A run does not touch the past: it may be made again from the same state, with other frames, any number of times. Its result becomes the past
+when its new state is kept. Only one draft is open at a time, for the cache has one open block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.networks import Networks
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.nets import TinyVAE
+from alpasim_plugin.nets.carry import State
+from alpasim_plugin.nets.kv_cache import BlockCache
+from alpasim_plugin.nets.sampling import finalise, mixed_source, opacity_mask, sample_block, sources_needed
+from alpasim_plugin.nets.schedule import from_names
+
+Stage = Callable[[str], AbstractContextManager[object]]
+
+
+@dataclass(eq=False)
+class History:
+    """The transformer's cache, which of the states stands at its end, and how to keep the open block."""
+
+    cache: BlockCache
+    kept: PipelineState | None = None
+    draft: PipelineState | None = None
+    write: Callable[[], None] = field(default=lambda: None, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineState:
+    """Where a rollout stands before a block. Everything is immutable but the cache, which `History` guards."""
+
+    latent: int  # absolute index of the next block's first latent
+    encoder: State | None  # render and map views side by side
+    decoder: State | None
+    with_map: bool | None  # None before the first block
+    history: History
+
+
+class BlockPipeline:
+    """Run blocks of views through the networks of a fixer.
+
+    Args:
+        networks: Shared, never written to.
+        settings: Window, steps, history, source, decoder.
+        stage: Called as ``with stage(name):`` around ``encode``, ``source``, ``dit``, ``decode`` and ``cache write``, for timing.
+    """
+
+    def __init__(self, networks: Networks, settings: OneFixerSettings, stage: Stage = lambda name: nullcontext()) -> None:
+        self.networks, self.settings, self.stage = networks, settings, stage
+        self.schedule = from_names(settings.steps)
+
+    @property
+    def draws(self) -> int:
+        """How many draws of noise a block takes."""
+        return sources_needed(self.schedule, self.settings.history)
+
+    def start(self, batch: int, height: int, width: int) -> PipelineState:
+        """Return the state before a rollout's first block.
+
+        Args:
+            batch: Views side by side.
+            height, width: Pixels, multiples of 16.
+        """
+        cache = self.networks.dit.new_cache(batch, height // 8, width // 8, self.settings.window, self.settings.sink)
+        history = History(cache)
+        history.kept = PipelineState(0, None, None, None, history)
+        return history.kept
+
+    @torch.inference_mode()
+    def run(
+        self, state: PipelineState, rgb: Tensor, alpha: Tensor | None, sdmap: Tensor | None, noise: Sequence[Tensor]
+    ) -> tuple[Tensor, PipelineState]:
+        """Fix one block.
+
+        Args:
+            state: From `start` or an earlier run; a draft's state is kept first.
+            rgb: ``(B, 3, T, H, W)`` render in [-1, 1]; T is ``1 + 4 (block_latents - 1)`` in the first block, then ``4 block_latents``.
+            alpha: ``(B, 1, T, H, W)`` opacity, or None where all is opaque.
+            sdmap: ``(B, 3, T, H, W)`` semantic map in [-1, 1], or None for the whole rollout: the map then adds nothing to the tokens.
+            noise: `draws` standard normal tensors ``(B, 16, block_latents, H / 8, W / 8)``.
+
+        Returns:
+            ``(B, 3, T, H, W)``, not cut to [-1, 1], and the state after the block, still a draft.
+
+        Raises:
+            InputError: A state that has been overtaken, a map that comes or goes within a rollout, or another shape.
+        """
+        self.keep(state)
+        nets, settings = self.networks, self.settings
+        if state.with_map not in (None, sdmap is not None):
+            found = "a map after blocks without one" if sdmap is not None else "no map after blocks with one"
+            raise InputError("fixing a block", f"latent {state.latent}", found, "give the map in every block of a rollout, or in none")
+        with self.stage("encode"):
+            views = rgb if sdmap is None else torch.cat([rgb, sdmap])
+            latents, encoder = nets.vae.encode_next(views, state.encoder)
+            z_render, z_map = latents[: len(rgb)].float(), latents[len(rgb) :].float()
+            z_map = torch.zeros_like(z_render) if sdmap is None else z_map
+        with self.stage("source"):
+            mask = None if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=state.latent == 0)
+            sources = [z_render if mask is None else mixed_source(z_render, mask, eps) for eps in noise[: len(self.schedule)]]
+        with self.stage("dit"):
+            cache = state.history.cache
+            z_0 = sample_block(nets.dit, sources, nets.text, z_map, cache, self.schedule, "last-forward", commit=False)
+        with self.stage("decode"):
+            if settings.decoder.kind == "render":
+                assert isinstance(nets.decoder, TinyVAE), "settings allow no other decoder to see the render"
+                out, decoder = nets.decoder.decode_next(z_0, state.decoder, render=rgb, opacity=alpha, clamp=False)
+            else:
+                out, decoder = nets.decoder.decode_next(z_0, state.decoder, clamp=False)
+        new = PipelineState(state.latent + latents.shape[2], encoder, decoder, sdmap is not None, state.history)
+
+        def write() -> None:
+            if settings.history == "last-forward":
+                cache.commit()
+            else:
+                finalise(nets.finalise_dit, z_0, noise[-1], nets.text, z_map, cache)
+
+        state.history.draft, state.history.write = new, write
+        return out, new
+
+    @torch.inference_mode()
+    def keep(self, state: PipelineState) -> PipelineState:
+        """Make the block that led to ``state`` the past; nothing happens if it is already.
+
+        Raises:
+            InputError: Another run has been made since, or later blocks were kept.
+        """
+        history = state.history
+        if state is history.draft:
+            with self.stage("cache write"):
+                history.write()
+            history.kept, history.draft, history.write = state, None, lambda: None
+        elif state is not history.kept:
+            found = "a state that was overtaken by another run or by later blocks"
+            do = "continue from the newest state, or start a new rollout"
+            raise InputError("continuing a rollout", f"latent {state.latent}", found, do)
+        return state
+
+    @torch.inference_mode()
+    def forget(self, state: PipelineState) -> PipelineState:
+        """Return a state at the same latent whose past holds nothing that is not a number: no history, memories of codecs cleaned."""
+        history = state.history
+        history.cache.reset(state.latent)
+
+        def clean(memory: State | None) -> State | None:
+            return None if memory is None else tuple(torch.nan_to_num(part, 0.0, 0.0, 0.0) for part in memory)
+
+        history.kept = PipelineState(state.latent, clean(state.encoder), clean(state.decoder), state.with_map, history)
+        history.draft, history.write = None, lambda: None
+        return history.kept
