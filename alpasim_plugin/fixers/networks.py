@@ -16,12 +16,12 @@ from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
+from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
 from alpasim_plugin.nets.schedule import CONTEXT_STEP, from_names
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
 from alpasim_plugin.seeding import derive_seed
 
 DOING = "loading the networks of a fixer"
-PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 TAEHV_WIDTHS = (256, 128, 64, 64)
 LATENT = 16
 
@@ -62,16 +62,17 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
 
 @lru_cache(maxsize=4)
 def _load(settings: OneFixerSettings, device: str) -> Networks:
-    parts = _Parts(settings)
-    plain = parts.dit()
-    with torch.inference_mode():
-        plain.to(device)
-        text = plain.encode_text(parts.prompt(plain.sizes).to(device))
-        fold = settings.fold and len(settings.steps) == 1
-        dit = plain.folded(from_names(settings.steps)[0].t) if fold else plain
-        finalise = plain.folded(CONTEXT_STEP) if fold and settings.history == "finalise" else plain
-    vae = parts.vae().to(device)
-    decoder = parts.decoder(vae).to(device)
+    parts, precision = _Parts(settings), settings.precision
+    plain = parts.dit().to(device)
+    with torch.no_grad():
+        text = text_at_precision(plain.encode_text(parts.prompt(plain.sizes).to(device)), precision)
+    fold = settings.fold and len(settings.steps) == 1
+    # Folded at float32 and cast after that, so that every weight is rounded once.
+    dit = at_precision(plain.folded(from_names(settings.steps)[0].t) if fold else plain, precision)
+    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.history == "finalise" else dit
+    vae = codec_at_precision(parts.vae(), settings.codec_precision).to(device)
+    own = settings.decoder.kind != "taehv"
+    decoder = vae if own else codec_at_precision(parts.decoder(), settings.codec_precision).to(device)
     return Networks(dit, finalise, vae, decoder, text, parts.trained, parts.note)
 
 
@@ -102,8 +103,7 @@ class _Parts:
             self.made_up("dit")
             sizes = DiTSizes(**settings.dit.model_dump())
             given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
-        dtype = PRECISIONS.get(settings.precision, torch.float32)
-        return CosmosCausalDiT.from_state_dict(given[0], settings.rope_ratios, dtype=dtype, source=given[1])
+        return CosmosCausalDiT.from_state_dict(given[0], settings.rope_ratios, source=given[1])
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
         """Return the prompt's features ``(1, tokens, text_width)``; a single zero token where none is given and none was learned."""
@@ -120,27 +120,19 @@ class _Parts:
 
     def vae(self) -> Codec:
         """Build the autoencoder."""
-        given, dtype = self.tensors("vae"), PRECISIONS[self.settings.codec_precision]
-        if self.settings.vae.kind == "tiny":
-            if given is not None:
-                return TinyVAE.from_state_dict(given[0], dtype=dtype, source=given[1])
-            self.made_up("vae")
-            return TinyVAE.random(seed=self.seed).requires_grad_(False).to(dtype)
+        given, tiny = self.tensors("vae"), self.settings.vae.kind == "tiny"
         if given is not None:
-            return WanVAE.from_state_dict(given[0], dtype=dtype, source=given[1])
-        self.made_up("vae", always_random=True)
-        return WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed).to(dtype)
+            return (TinyVAE if tiny else WanVAE).from_state_dict(given[0], source=given[1])
+        self.made_up("vae", always_random=not tiny)
+        return TinyVAE.random(seed=self.seed) if tiny else WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed)
 
-    def decoder(self, vae: Codec) -> Codec | TinyDecoder:
-        """Build the decoder where it is not the autoencoder's own."""
-        settings = self.settings.decoder
-        if settings.kind != "taehv":
-            return vae
-        given, dtype = self.tensors("decoder"), PRECISIONS[self.settings.codec_precision]
+    def decoder(self) -> TinyDecoder:
+        """Build the tiny Wan decoder."""
+        given, scaled = self.tensors("decoder"), self.settings.decoder.scaled
         if given is not None:
-            return TinyDecoder.from_state_dict(given[0], scaled=settings.scaled, dtype=dtype, source=given[1])
+            return TinyDecoder.from_state_dict(given[0], scaled=scaled, source=given[1])
         self.made_up("decoder", always_random=True)
-        return TinyDecoder.random(LATENT, TAEHV_WIDTHS, settings.scaled, self.seed).to(dtype)
+        return TinyDecoder.random(LATENT, TAEHV_WIDTHS, scaled, self.seed)
 
     def made_up(self, part: str, always_random: bool = False) -> None:
         """Refuse to go without weights unless the settings allow what would stand in for them."""

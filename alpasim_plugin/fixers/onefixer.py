@@ -9,20 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.base import FIXERS, BlockRule
 from alpasim_plugin.fixers.networks import LATENT, load_networks
+from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
 from alpasim_plugin.fixers.views import DOING, SIDE, Views, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE as LATENT_SIDE
 from alpasim_plugin.nets.clips import crop_clip
-from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import U8, Frame
 
 
@@ -142,7 +140,10 @@ class OneFixer:
 
     def _fix(self, view: Views, past: Past) -> Draft:
         clip = to_clip(view, self.blocks.frames(self._done), self.networks.device)
-        noise = self._noise(view.cameras, past.state.latent, (clip.rgb.shape[3] // LATENT_SIDE, clip.rgb.shape[4] // LATENT_SIDE))
+        shape = (LATENT, clip.rgb.shape[3] // LATENT_SIDE, clip.rgb.shape[4] // LATENT_SIDE)
+        latents = range(past.state.latent, past.state.latent + self.settings.block_latents)
+        drawn = latent_noise(self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape)
+        noise = [eps.to(self.networks.device) for eps in drawn]
         video, state = self.pipeline.run(past.state, clip.rgb, clip.alpha, clip.maps, noise)
         video = crop_clip(video, view.size)
         images = to_images(video, view.size)
@@ -166,15 +167,3 @@ class OneFixer:
                     event = draft.events[b][t]
                     out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=draft.images[b, t])
         return tuple(out)
-
-    def _noise(self, cameras: Sequence[str], latent: int, size: tuple[int, int]) -> list[Tensor]:
-        """Draw a block's noise: ``(B, 16, block_latents, h, w)`` per draw, each latent of each camera from a stream of its own."""
-
-        def one(draw: int, camera: str, index: int) -> np.ndarray:
-            return stream(self.scene_id, self.seed, f"fixer/{camera}/{draw}", index).standard_normal((LATENT, *size), np.float32)
-
-        draws = []
-        for draw in range(self.pipeline.draws):
-            views = [np.stack([one(draw, camera, latent + i) for i in range(self.settings.block_latents)], axis=1) for camera in cameras]
-            draws.append(torch.from_numpy(np.stack(views)).to(self.networks.device))
-        return draws
