@@ -1,0 +1,42 @@
+"""Put a fixer over a renderer: what comes out is a renderer again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from alpasim_plugin.fixers.base import BlockFixer
+from alpasim_plugin.fixers.chunk import ChunkRenderer
+from alpasim_plugin.fixers.map_prepare import prepare_map
+from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.speculation import SpeculativeRenderer
+from alpasim_plugin.fixers.workshop import Workshop
+from alpasim_plugin.types import Frame, RenderRequest, Scenario
+
+FixedRenderer = SpeculativeRenderer | ChunkRenderer
+
+
+def fixed_renderer(
+    render: Callable[[RenderRequest], Frame],
+    make_fixer: Callable[[], BlockFixer],
+    settings: FixerSettings,
+    scenario: Scenario,
+    threads: int | None = None,
+) -> FixedRenderer:
+    """Return one rollout's renderer whose frames went through a fixer.
+
+    A fixer works in blocks (5 frames first, then 8), but the poses of a block's later frames are not known when its first frame falls
+    due. ``settings.mode`` says what to do about it: ``speculative`` (`alpasim_plugin.fixers.speculation`) or ``chunk``
+    (`alpasim_plugin.fixers.chunk`).
+
+    Args:
+        render: The base renderer of the same rollout; its frames are checked.
+        make_fixer: Makes a fixer without history; called once, and again for cameras of another rhythm.
+        settings: Mode, tolerances, and whether the fixer wants semantic maps.
+        scenario: Its map and its actors' boxes are what the semantic map shows.
+        threads: Threads of the map rasteriser; None leaves numba's number.
+    """
+    scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
+    workshop = Workshop(render, scene_map, scenario.actors, threads)
+    if settings.mode == "chunk":
+        return ChunkRenderer(workshop, make_fixer())
+    return SpeculativeRenderer(workshop, make_fixer, settings)
