@@ -8,7 +8,7 @@ import traceback
 
 import typer
 
-from alpasim_plugin.cli import bench, doctor, listing, refine, report, run
+from alpasim_plugin.cli import bench, doctor, fork, listing, refine, report, run
 from alpasim_plugin.errors import SimrunError
 
 app = typer.Typer(
@@ -25,9 +25,11 @@ app.command("report", epilog=report.EPILOG)(report.report)
 app.command("list", epilog=listing.EPILOG)(listing.list_parts)
 app.command("doctor", epilog=doctor.EPILOG)(doctor.doctor)
 app.command("refine", epilog=refine.EPILOG)(refine.refine)
+app.command("fork", epilog=fork.FORK_EPILOG)(fork.fork)
+app.command("probe", epilog=fork.PROBE_EPILOG)(fork.probe)
 app.add_typer(bench.app, name="bench")
 
-VERBS = ("run", "report", "list", "doctor", "refine", "bench")
+VERBS = ("run", "report", "list", "doctor", "refine", "fork", "probe", "bench")
 OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
 
 

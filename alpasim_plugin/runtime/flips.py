@@ -1,0 +1,86 @@
+"""For every cell whose outcome changed: when the plans of the two rollouts first parted, and both camera frames of that moment.
+
+Written into the run folder as ``flips.json`` and ``flips/*.jpg``, since the report reads no logs.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.log import decode_image, encode_image, read_asl
+from alpasim_plugin.runtime.probe_files import find_probe
+from alpasim_plugin.runtime.store import write_bytes, write_json
+from alpasim_plugin.types import RolloutLog
+from evaluators.plan_gap import DIVERGED_M, HORIZON_US, first_divergence
+from evaluators.report.flips import FLIPS_NAME, Flip, find_flips
+from evaluators.report.run_folder import read_run
+
+MAX_FLIPS = 60  # cells whose logs are read
+PICTURE_WIDTH = 560
+
+
+def write_flips(root: Path) -> Path:
+    """Look up the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
+
+    Where a probe of the same cell and renderers exists its answer is taken: it has both renderers at identical poses. Otherwise the two
+    logs are compared; their poses are the same until the plans part.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(root)
+    flips, compared = find_flips(run)
+    cells = []
+    for number, flip in enumerate(flips[:MAX_FLIPS]):
+        key = {"renderer": flip.other.renderer, "policy": flip.other.policy, "scene": flip.other.scene, "seed": flip.other.seed}
+        cells.append(key | {"baseline": flip.base.renderer} | _divergence(root, flip, f"flips/{number:03d}"))
+    _read.cache_clear()
+    about = {"threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "n_flips": len(flips), "n_pairs": compared}
+    write_json(root / FLIPS_NAME, about | {"cells": cells})
+    return root / FLIPS_NAME
+
+
+def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
+    probe = find_probe(root, flip.base, flip.other.renderer)
+    if probe is not None:
+        return dict(probe) | {"source": "probe"}
+    try:
+        logs = {r.renderer: _read(root / r.path / "rollout.asl") for r in (flip.base, flip.other)}
+    except SimrunError as error:
+        return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
+    one, other = logs.values()
+    if not one.plans or not other.plans:
+        return {"t_us": None, "reason": "a log without plans"}
+    found = first_divergence(one.plans, other.plans)
+    if found is None:
+        return {"t_us": None, "reason": f"the plans never part by more than {DIVERGED_M} m"}
+    answer: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
+    frames = {renderer: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (renderer, log) in enumerate(logs.items())}
+    if None in frames.values():
+        answer["frames_reason"] = "a log without camera images (--images none, or a policy that sees nothing)"
+    return answer | {"source": "logs", "ahead_us": found.ahead_us, "frames": {r: path for r, path in frames.items() if path}}
+
+
+def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
+    """Save what the first camera showed at a question; None where the log has no such image."""
+    if not log.images:
+        return None
+    camera = log.images[0].camera
+    shown = [image for image in log.images if image.camera == camera and image.end_us <= t_us]
+    if not shown:
+        return None
+    rgb = decode_image(shown[-1].data, f"camera {camera!r} at {shown[-1].end_us} us")
+    if rgb.shape[1] > PICTURE_WIDTH:
+        rgb = cv2.resize(rgb, (PICTURE_WIDTH, round(rgb.shape[0] * PICTURE_WIDTH / rgb.shape[1])), interpolation=cv2.INTER_AREA)
+    write_bytes(root / name, encode_image(rgb, "jpeg", 85))
+    return name
+
+
+@lru_cache(maxsize=4)  # flips of several renderers share the baseline's log
+def _read(path: Path) -> RolloutLog:
+    return read_asl(path)

@@ -1,0 +1,186 @@
+"""Continue a logged rollout from an instant on with another renderer, policy or seed.
+
+Up to that instant the rollout is made again by its own parts and compared with its log, component by component and to the bit; that is how
+the whole state is there: the ego's speed and steering, reactive actors, the policy's memory, the renderer's history. A log alone holds less
+(its poses are float32, it has no memory of a policy). Where the replay leaves the log, the component and the step are named and nothing is
+continued.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from alpasim_plugin.control import make_controller
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.log import read_facts
+from alpasim_plugin.log.trace import Difference, Trace, first_difference, trace_log
+from alpasim_plugin.runtime.cell import MANIFEST, Parts, own_parts, run_cell
+from alpasim_plugin.runtime.execute import thread_budget
+from alpasim_plugin.runtime.flips import write_flips
+from alpasim_plugin.runtime.past import PastRollout
+from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, digest
+from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.runtime.run import RunResult, write_run_info
+from alpasim_plugin.runtime.store import read_json, write_json
+from alpasim_plugin.runtime.switch import SwitchedController, SwitchedPolicy, SwitchedRenderer
+from alpasim_plugin.runtime.tables import write_tables
+from alpasim_plugin.types import Scenario
+from evaluators.report import write_junit, write_report, write_summary_md
+
+DOING = "continuing a logged rollout"
+UNCHANGED = "replay"
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is another from ``after_us`` after the first frame on; None: as it was."""
+
+    after_us: int
+    renderer: str | None = None
+    policy: str | None = None
+    seed: int | None = None
+
+    @property
+    def label(self) -> str:
+        """Name the continuation in tables, in the column of renderers."""
+        parts = [self.renderer or "", self.policy or "", f"seed {self.seed}" if self.seed is not None else ""]
+        return f"{', '.join(part for part in parts if part) or UNCHANGED} from {self.after_us * 1e-6:g} s"
+
+    def of(self, cell: Cell) -> Cell:
+        """Return the cell whose parts take over."""
+        return replace(
+            cell,
+            renderer=self.renderer or cell.renderer,
+            policy=self.policy or cell.policy,
+            seed=cell.seed if self.seed is None else self.seed,
+        )
+
+
+def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
+    """Continue a rollout and write a run folder with the original and the continuation side by side.
+
+    The continuation stands in the tables as a renderer of its own (`Change.label`), paired with the original: same policy name, scene and
+    seed. ``run.json`` and the manifest say under ``fork`` what was changed when, that the replay was equal to the log, and, where nothing
+    was changed, whether the continuation was.
+
+    Args:
+        past: The logged rollout.
+        change: What is another from which instant on.
+        root: Run folder to write; must not hold a run.
+        video: Whether to write the continuation's video.
+        command: For ``run.json``.
+
+    Raises:
+        InputError: The instant lies outside the rollout, its latency is measured, or ``root`` holds a run.
+        InfrastructureError: The replay is not equal to the log up to the instant, or a part failed.
+    """
+    _check(past, change, root)
+    began = time.perf_counter()
+    options = replace(past.options, video=video, baseline=past.cell.renderer)
+    original = _copied(past, root)
+    fork = Cell(
+        change.label, past.cell.policy, past.cell.scene, past.cell.seed, past.cell.ref, digest([past.cell.rollout_key, asdict(change)]), ""
+    )
+    fork = replace(fork, score_key=digest([fork.rollout_key, options.preset]))
+    threads = thread_budget(1, 1)
+    at_us = past.scenario.start_us + change.after_us
+    manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, change))
+    if manifest["status"] == "ok":
+        manifest["fork"] = asdict(change) | {"of": past.name} | _compared(past, change, at_us, root / fork.folder)
+        write_json(root / fork.folder / MANIFEST, manifest)
+    plan = RunPlan(
+        (past.cell, fork),
+        {past.cell.scene: past.scenario},
+        (past.cell.renderer, fork.renderer),
+        (past.cell.policy,),
+        (past.cell.seed,),
+        options,
+    )
+    write_run_info(root, plan, command, threads)
+    write_json(root / "run.json", read_json(root / "run.json") | {"fork": manifest.get("fork")})
+    summary = write_tables(root, [original, manifest], options.preset, past.cell.renderer, threads, time.perf_counter() - began)
+    write_flips(root)
+    write_summary_md(root)
+    write_junit(root)
+    write_report(root)
+    return RunResult(root, summary, 2, summary["failures"]["n_failed"])
+
+
+def _check(past: PastRollout, change: Change, root: Path) -> None:
+    scenario = past.scenario
+    length_us = scenario.end_us - scenario.start_us
+    if not 0 <= change.after_us < length_us:
+        found = f"the rollout lasts {length_us * 1e-6:g} s"
+        raise InputError(DOING, f"--at {change.after_us * 1e-6:g}", found, "choose an instant within it, in seconds after the first frame")
+    if scenario.latency.kind == "measured":
+        found = "its latency is measured: when a plan took effect depended on the machine"
+        raise InputError(DOING, past.name, found, "run it with --set latency.kind=fixed")
+    if (root / "run.json").exists():
+        raise InputError(DOING, f"--out {root}", "it holds a run already", "choose another --out")
+
+
+def _copied(past: PastRollout, root: Path) -> dict[str, Any]:
+    """Copy the original's folder and return its manifest."""
+    folder = root / past.cell.folder
+    shutil.copytree(past.folder, folder, dirs_exist_ok=True)
+    manifest = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
+    write_json(folder / MANIFEST, manifest)
+    return manifest
+
+
+def _parts(own: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
+    """Make the original's parts and those that take over, joined at the instant; a part that stays the same is one object."""
+    del fork
+    then, at_us = change.of(own), scenario.start_us + change.after_us
+    before = own_parts(own, options, scenario, threads)
+    after = before if then == own else own_parts(then, options, scenario, threads)
+    same_renderer = (then.renderer, then.seed) == (own.renderer, own.seed)
+    same_policy = (then.policy, then.seed) == (own.policy, own.seed)
+    first, second = (make_controller(getattr(p.policy, "controller", "bicycle"), scenario.vehicle) for p in (before, after))
+    next_policy = before.policy if same_policy else after.policy
+    return Parts(
+        SwitchedRenderer(before.renderer, before.renderer if same_renderer else after.renderer, at_us),
+        SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario.rates.camera_us),
+        own.rollout_key if then == own else digest([own.rollout_key, asdict(change)]),
+        before.names if then == own else after.names,
+        SwitchedController(first, second, at_us),
+    )
+
+
+def _compared(past: PastRollout, change: Change, at_us: int, folder: Path) -> dict[str, Any]:
+    """Compare the replay with the log up to the instant, and beyond it where nothing was changed.
+
+    Raises:
+        InfrastructureError: They differ before the instant.
+    """
+    one, other = (trace_log(f / LOG_NAME, read_facts(f / FRAMES_NAME)) for f in (past.folder, folder))
+    # Another policy may take more cameras; what was not logged before says nothing about the replay.
+    other["frames"] = {key: value for key, value in other["frames"].items() if key in one["frames"] or key[0] >= at_us}
+    where = (past.scenario.start_us, past.scenario.rates.control_us)
+    # The pose at the instant itself follows from what was before it; its frames and its plan belong to the parts that take over.
+    until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
+    difference = first_difference(one, other, *where, until)
+    if difference is not None:
+        (folder / MANIFEST).unlink()
+        raise InfrastructureError(
+            DOING,
+            past.name,
+            f"its replay differs from the log before the change: {difference}",
+            "continue it on the machine and with the versions that run.json names, or run the rollout again",
+        )
+    if change == Change(change.after_us):
+        return {"replay": "equal", "continuation": _word(one, other, past, folder, where)}
+    return {"replay": "equal"}
+
+
+def _word(one: Trace, other: Trace, past: PastRollout, folder: Path, where: tuple[int, int]) -> Mapping[str, Any] | str:
+    difference = first_difference(one, other, *where)
+    if difference is None and (past.folder / LOG_NAME).read_bytes() != (folder / LOG_NAME).read_bytes():
+        difference = Difference("log", where[0], None, "an entry that belongs to no component")
+    return "equal" if difference is None else difference.as_dict()

@@ -1,0 +1,103 @@
+"""Find a rollout of an earlier run by name, with everything that is needed to make it again."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, make_plan
+from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.types import Scenario
+from scenarios.suite import ScenarioRef
+
+DOING = "finding a logged rollout"
+
+
+@dataclass(frozen=True)
+class PastRollout:
+    """A finished rollout of an earlier run."""
+
+    root: Path  # of the run
+    cell: Cell
+    options: RunOptions
+    scenario: Scenario
+    manifest: Mapping[str, Any]
+
+    @property
+    def folder(self) -> Path:
+        """Give the folder with its log."""
+        return self.root / str(self.manifest["path"])
+
+    @property
+    def name(self) -> str:
+        """Give the name by which `find_rollout` finds it."""
+        return rollout_name(self.cell.renderer, self.cell.policy, self.cell.scene, self.cell.seed)
+
+
+def rollout_name(renderer: str, policy: str, scene: str, seed: int) -> str:
+    """Return ``RENDERER/POLICY/SCENE/SEED``."""
+    return f"{renderer}/{policy}/{scene}/{seed}"
+
+
+def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRollout:
+    """Find a finished rollout in a run folder and load what it was made of.
+
+    Args:
+        root: Run folder.
+        name: ``RENDERER/POLICY/SCENE/SEED`` as in the tables, or the rollout's folder below the run folder.
+        scenario: Where its scenario lies now; by default where ``run.json`` says that it lay.
+
+    Raises:
+        InputError: No such rollout, it did not finish, or its scenario or the parts that shape it are not what they were.
+    """
+    row = _row(root, name)
+    info = read_json(root / "run.json")
+    manifest = read_json(root / row["path"] / "manifest.json")
+    if manifest.get("fork"):
+        raise InputError(DOING, name, "it is itself the continuation of another rollout", f"name that one: {manifest['fork']['of']}")
+    stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
+    where = scenario or stated.get("path")
+    if where is None:
+        raise InputError(DOING, f"{root / 'run.json'}", "it does not say where the scenario lies", "name it with --scenario PATH")
+    ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())))
+    plan = plan_like(info, ref, row["renderer"], row["policy"], int(row["seed"]))
+    (cell,) = plan.cells
+    loaded = plan.scenarios.get(row["scene"])
+    if loaded is None or cell.rollout_key != manifest["rollout_key"]:
+        what = f"scenario {ref.path} now has the scene id {cell.scene!r}" if loaded is None else "content key differs"
+        raise InputError(
+            DOING,
+            name,
+            f"{what}: the scenario, a part or the version is not what it was when the log was made",
+            "run the rollout again, or name its scenario with --scenario PATH",
+        )
+    return PastRollout(root, cell, plan.options, loaded, manifest)
+
+
+def plan_like(info: Mapping[str, Any], ref: ScenarioRef, renderer: str, policy: str, seed: int) -> RunPlan:
+    """Return the plan of one rollout under the options of an earlier run."""
+    stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
+    return make_plan([ref], [renderer], [policy], [seed], RunOptions(**stated | {"baseline": None, "video": "none"}))
+
+
+def _row(root: Path, name: str) -> dict[str, Any]:
+    path = root / "rollouts.parquet"
+    if not path.is_file():
+        raise InputError(DOING, str(path), "no such file", "name a folder written by simrun run")
+    rows = pq.read_table(path, columns=["renderer", "policy", "scene", "seed", "status", "path", "failure"]).to_pylist()
+    by_name = {rollout_name(row["renderer"], row["policy"], row["scene"], row["seed"]): row for row in rows}
+    wanted = name.strip("/")
+    row = by_name.get(wanted) or next((r for r in rows if wanted in (r["path"], r["path"].removeprefix("rollouts/"))), None)
+    if row is None:
+        near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
+        do_this = f"did you mean {' or '.join(near)}?" if near else "give a run that holds rollouts"
+        raise InputError(DOING, f"--cell {name}", f"the run has no such rollout among its {len(rows)}", do_this)
+    if row["status"] != "ok":
+        raise InputError(DOING, f"--cell {name}", f"it did not finish: {row['failure']}", "name a rollout that ran to its end")
+    return dict(row)

@@ -1,0 +1,198 @@
+"""Ask one policy at the same poses behind several renderers: what a renderer alone changes in the plans, frame by frame.
+
+The logged rollout is made again by its own parts and compared with its log. At every camera frame each renderer under test renders the
+same request; at every question a policy of its own, with the history of its own frames, answers. Only the logged renderer's policy drives.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.geometry import quat_from_yaw
+from alpasim_plugin.log import read_facts
+from alpasim_plugin.log.trace import first_difference, trace_log
+from alpasim_plugin.runtime.cell import own_parts
+from alpasim_plugin.runtime.execute import thread_budget
+from alpasim_plugin.runtime.guards import checked_frames, checked_plan
+from alpasim_plugin.runtime.offers import chunk_of, lookahead_of, spent_by
+from alpasim_plugin.runtime.past import PastRollout
+from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
+from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.types import F64, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
+from evaluators.plan_gap import DIVERGED_M, HORIZON_US, plan_gap
+
+HORIZONS_S = (1.0, 3.0)
+DOING = "probing renderers along a logged rollout"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The plans of one question and the pictures they were made from, by renderer."""
+
+    t_us: int
+    plans: Mapping[str, Plan]
+    frames: Mapping[str, Frame]  # of the policy's first camera
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A renderer against the reference over all questions ``(Q,)``.
+
+    Attributes:
+        gap_m: Distance between the plans at `HORIZONS_S` ``(Q, 2)``; NaN where a plan ends earlier.
+        turn_rad: Heading of the renderer's plan less that of the reference's ``(Q, 2)``.
+        levels: Mean absolute difference of the two pictures, 8-bit levels ``(Q,)``.
+        first: Row of the first divergence as in `evaluators.plan_gap`, or None.
+        first_gap_m: The gap there, at the horizon or the end of the shorter plan.
+    """
+
+    reference: str
+    renderer: str
+    gap_m: F64
+    turn_rad: F64
+    levels: F64
+    first: int | None
+    first_gap_m: float | None
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a probe found."""
+
+    answers: tuple[Answer, ...]
+    pairs: tuple[Pair, ...]
+
+
+class _Eyes:
+    """Renders every request with all renderers and gives the loop the driving one's frames."""
+
+    def __init__(self, renderers: Mapping[str, Renderer], driver: str) -> None:
+        self.renderers, self.driver = renderers, driver
+        self.chunk = chunk_of(renderers[driver])
+        other = next((name for name, renderer in renderers.items() if chunk_of(renderer) != self.chunk), None)
+        if other is not None:
+            found = f"{other!r} renders in blocks of {chunk_of(renderers[other])}, {driver!r} in blocks of {self.chunk}"
+            raise InputError(DOING, f"--renderers {','.join(renderers)}", found, "choose the mode 'speculative' for both")
+        self.lookahead = max(lookahead_of(renderer) for renderer in renderers.values())
+        self.latest: dict[str, dict[str, Frame]] = {name: {} for name in renderers}
+        self.spent_ms: Mapping[str, float] = {}
+
+    def render(self, request: RenderRequest) -> Frame:
+        return self.render_batch([request])[0]
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
+        for name, renderer in self.renderers.items():
+            frames = checked_frames(renderer, requests)
+            self.latest[name] |= {frame.camera: frame for frame in frames}
+            if name == self.driver:
+                driven, self.spent_ms = frames, dict(spent_by(renderer))
+        return driven
+
+
+@dataclass
+class _Asked:
+    """Asks one policy per renderer and gives the loop the driving one's plan."""
+
+    policies: Mapping[str, Policy]
+    eyes: _Eyes
+    answers: list[Answer] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.sensors: Sequence[SensorSpec] = self.policies[self.eyes.driver].sensors
+        self.controller = getattr(self.policies[self.eyes.driver], "controller", "bicycle")
+
+    def reset(self, seed: int, route: Route) -> None:
+        for policy in self.policies.values():
+            policy.reset(seed, route)
+
+    def act(self, observation: Observation) -> Plan:
+        seen = {name: replace(observation, frames=dict(self.eyes.latest[name])) for name in self.policies}
+        plans = {name: checked_plan(policy, seen[name]) for name, policy in self.policies.items()}
+        camera = self.sensors[0].camera
+        self.answers.append(Answer(observation.t_us, plans, {name: self.eyes.latest[name][camera] for name in self.policies}))
+        return plans[self.eyes.driver]
+
+
+def probe_rollout(past: PastRollout, renderers: Sequence[str]) -> Probe:
+    """Ask the policy of a logged rollout at its own poses behind each of some renderers.
+
+    Args:
+        past: The logged rollout, which is driven again as it was.
+        renderers: Which to compare; the first is the reference. The logged renderer need not be among them.
+
+    Raises:
+        InputError: Fewer than two renderers, a policy without cameras, measured latency, or renderers of different blocks.
+        InfrastructureError: The replay is not equal to the log.
+        RendererError: A renderer failed.
+        PolicyError: The policy failed behind one of them.
+    """
+    if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
+        raise InputError(DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers")
+    if past.scenario.latency.kind == "measured":
+        found = "its latency is measured: when a plan took effect depended on the machine"
+        raise InputError(DOING, past.name, found, "run it with --set latency.kind=fixed")
+    own, threads = past.cell, thread_budget(1, 1).per_worker
+    names = list(dict.fromkeys([own.renderer, *renderers]))
+    parts = {name: own_parts(replace(own, renderer=name), past.options, past.scenario, threads) for name in names}
+    eyes = _Eyes({name: p.renderer for name, p in parts.items()}, own.renderer)
+    asked = _Asked({name: p.policy for name, p in parts.items()}, eyes)
+    if not asked.sensors:
+        raise InputError(DOING, past.name, f"the policy {own.policy!r} takes no camera", "probe a rollout of a policy that sees")
+    with tempfile.TemporaryDirectory(prefix="simrun-probe-") as folder:
+        with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
+            run_rollout(past.scenario, eyes, asked, own.seed, recorder)
+        one, other = (trace_log(f / LOG_NAME, read_facts(f / FRAMES_NAME)) for f in (past.folder, Path(folder)))
+    difference = first_difference(one, other, past.scenario.start_us, past.scenario.rates.control_us)
+    if difference is not None:
+        raise InfrastructureError(
+            DOING,
+            past.name,
+            f"its replay differs from the log: {difference}",
+            "probe it on the machine and with the versions that run.json names, or run the rollout again",
+        )
+    answers = tuple(asked.answers)
+    return Probe(answers, tuple(_pair(answers, renderers[0], name) for name in renderers[1:]))
+
+
+def _pair(answers: Sequence[Answer], reference: str, renderer: str) -> Pair:
+    n, first, first_gap = len(answers), None, None
+    gap, turn, levels = np.full((n, len(HORIZONS_S)), np.nan), np.full((n, len(HORIZONS_S)), np.nan), np.zeros(n)
+    for row, answer in enumerate(answers):
+        a, b = (_trajectory(answer.plans[name]) for name in (reference, renderer))
+        end_us = min(answer.t_us + HORIZON_US, int(a.t_us[-1]), int(b.t_us[-1]))
+        distances, turns = plan_gap(a, b, [*(answer.t_us + round(h * 1e6) for h in HORIZONS_S), end_us])
+        gap[row], turn[row] = distances[:-1], turns[:-1]
+        if first is None and distances[-1] > DIVERGED_M:
+            first, first_gap = row, float(distances[-1])
+        pictures = (answer.frames[name].rgb.astype(np.int16) for name in (reference, renderer))
+        levels[row] = float(np.mean(np.abs(np.subtract(*pictures))))
+    return Pair(reference, renderer, gap, turn, levels, first, first_gap)
+
+
+def _trajectory(plan: Plan) -> Trajectory:
+    """Return a plan as rig poses in the frame of the question, which all renderers share."""
+    return Trajectory(plan.times_us, np.column_stack([plan.xy, np.zeros(len(plan.times_us))]), quat_from_yaw(plan.yaw))
+
+
+def summarise(pair: Pair, answers: Sequence[Answer], start_us: int) -> dict[str, Any]:
+    """Return the numbers of a pair for JSON, without the pictures."""
+    out: dict[str, Any] = {"reference": pair.reference, "renderer": pair.renderer, "questions": len(answers)}
+    for j, horizon in enumerate(HORIZONS_S):
+        known = pair.gap_m[np.isfinite(pair.gap_m[:, j]), j]
+        turns = np.abs(pair.turn_rad[np.isfinite(pair.turn_rad[:, j]), j])
+        stats = {"median": 50, "p95": 95, "max": 100}
+        out[f"gap_{horizon:g}s_m"] = {k: round(float(np.percentile(known, q)), 4) for k, q in stats.items()} if len(known) else None
+        out[f"turn_{horizon:g}s_rad"] = {k: round(float(np.percentile(turns, q)), 5) for k, q in stats.items()} if len(turns) else None
+    out["levels_mean"] = round(float(np.mean(pair.levels)), 3) if len(pair.levels) else None
+    out["first_divergence"] = None
+    if pair.first is not None and pair.first_gap_m is not None:
+        t_us = answers[pair.first].t_us
+        out["first_divergence"] = {"t_us": t_us, "after_us": t_us - start_us, "gap_m": round(pair.first_gap_m, 4)}
+    return out

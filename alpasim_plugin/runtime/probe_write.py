@@ -1,0 +1,93 @@
+"""Write what a probe found: a table, a summary and a plot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from alpasim_plugin.log import encode_image
+from alpasim_plugin.runtime.past import PastRollout
+from alpasim_plugin.runtime.probe import HORIZONS_S, Probe, summarise
+from alpasim_plugin.runtime.probe_files import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
+from alpasim_plugin.runtime.store import write_bytes, write_json, write_table
+from evaluators.plan_gap import DIVERGED_M, HORIZON_US
+
+SCHEMA = pa.schema(
+    [("reference", pa.string()), ("renderer", pa.string()), ("t_us", pa.int64()), ("after_us", pa.int64())]
+    + [(f"{what}_{h:g}s_{unit}", pa.float64()) for h in HORIZONS_S for what, unit in (("gap", "m"), ("turn", "rad"))]
+    + [("levels", pa.float64())]
+)
+
+
+def write_probe(probe: Probe, past: PastRollout, renderers: tuple[str, ...], out: Path | None = None) -> Path:
+    """Write ``probe.parquet``, ``probe.json``, ``probe.png`` and the frames of each first divergence; return the folder.
+
+    Args:
+        probe: What was found.
+        past: Along which rollout.
+        renderers: Which were asked.
+        out: Folder; by default one below ``probes/`` in the rollout's run folder, where the report finds it.
+    """
+    cell = past.cell
+    folder = out or past.root / probe_folder(cell.renderer, cell.policy, cell.scene, cell.seed, renderers)
+    folder.mkdir(parents=True, exist_ok=True)
+    start_us = past.scenario.start_us
+    pairs, rows = [], []
+    for number, pair in enumerate(probe.pairs):
+        entry = summarise(pair, probe.answers, start_us)
+        if pair.first is not None:
+            frames = probe.answers[pair.first].frames
+            names = {name: f"first-{number}-{side}.jpg" for side, name in enumerate((pair.reference, pair.renderer))}
+            for name, file in names.items():
+                write_bytes(folder / file, encode_image(frames[name].rgb, "jpeg", 85))
+            entry["first_divergence"]["frames"] = names
+        pairs.append(entry)
+        for i, answer in enumerate(probe.answers):
+            row = {"reference": pair.reference, "renderer": pair.renderer, "t_us": answer.t_us, "after_us": answer.t_us - start_us}
+            for j, h in enumerate(HORIZONS_S):
+                row |= {f"gap_{h:g}s_m": _number(pair.gap_m[i, j]), f"turn_{h:g}s_rad": _number(pair.turn_rad[i, j])}
+            rows.append(row | {"levels": float(pair.levels[i])})
+    write_table(folder / PROBE_TABLE, rows, SCHEMA)
+    about = {"along": past.name, "renderers": list(renderers), "threshold_m": DIVERGED_M, "horizon_s": HORIZON_US * 1e-6, "pairs": pairs}
+    write_json(folder / PROBE_JSON, about)
+    _plot(folder / PROBE_PLOT, probe, past)
+    return folder
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _plot(path: Path, probe: Probe, past: PastRollout) -> None:
+    start_us, warmup_s = past.scenario.start_us, past.scenario.warmup_us * 1e-6
+    seconds = np.array([answer.t_us - start_us for answer in probe.answers]) * 1e-6
+    figure = Figure(figsize=(9.0, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, middle, below = figure.subplots(3, 1, sharex=True)
+    for k, pair in enumerate(probe.pairs):
+        for j, (horizon, style) in enumerate(zip(HORIZONS_S, ("--", "-"), strict=True)):
+            label = f"{pair.renderer}, {horizon:g} s ahead"
+            above.plot(seconds, pair.gap_m[:, j], style, color=f"C{k}", label=label)
+            middle.plot(seconds, np.rad2deg(pair.turn_rad[:, j]), style, color=f"C{k}", label=label)
+        below.plot(seconds, pair.levels, color=f"C{k}", label=pair.renderer)
+        if pair.first is not None:
+            above.axvline(seconds[pair.first], color=f"C{k}", linewidth=0.8, alpha=0.6)
+    above.axhline(DIVERGED_M, color="0.5", linestyle=":", linewidth=1.0, label=f"diverged: {DIVERGED_M} m")
+    above.set_ylabel("between the plans, m")
+    middle.set_ylabel("turn, degrees")
+    below.set_ylabel("pictures, levels of 255")
+    below.set_xlabel("s since the first frame")
+    above.set_ylim(bottom=0.0)
+    below.set_ylim(bottom=0.0)
+    for axes in (above, middle, below):
+        axes.axvspan(0.0, warmup_s, color="0.92", zorder=0)
+        axes.grid(color="0.9")
+        axes.spines[["top", "right"]].set_visible(False)
+    above.legend(fontsize=8, loc="upper left")
+    reference = probe.pairs[0].reference
+    above.set_title(f"{past.cell.policy} along {past.cell.scene}, seed {past.cell.seed}: against {reference} (grey: warm-up)", fontsize=10)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,154 @@
+"""Cells whose outcome changed between the baseline and another renderer: what one looks at first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from evaluators.report.frames import inline_jpeg
+from evaluators.report.numbers import Cell, fixed, missing, short
+from evaluators.report.run_folder import Rollout, Run, read_json
+
+FLIPS_NAME = "flips.json"
+OUTCOMES = {  # metric -> word, the gravest first
+    "collision_at_fault": "at-fault collision",
+    "collision_any": "collision",
+    "offroad": "off-road",
+}
+MAX_FLIP_ROWS = 400
+
+
+@dataclass(frozen=True)
+class Flip:
+    """One scene, policy and seed with two outcomes.
+
+    Attributes:
+        base, other: The rollouts behind the baseline and behind the other renderer.
+        was, now: Their outcomes in words.
+        tone: "worse" where an event came and none went, "better" where one went and none came, else "mixed".
+    """
+
+    base: Rollout
+    other: Rollout
+    was: str
+    now: str
+    tone: str
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        """Give renderer, policy, scene and seed of the other side."""
+        return self.other.cell
+
+
+def find_flips(run: Run) -> tuple[list[Flip], int]:
+    """Find every flip of a run.
+
+    Returns:
+        The flips, worse ones first and then as in ``rollouts.parquet``, and the number of pairs compared.
+    """
+    base = baseline_of(run)
+    partners = {r.cell[1:]: r for r in run.rollouts if r.renderer == base and r.ok}
+    flips: list[Flip] = []
+    compared = 0
+    for rollout in run.rollouts:
+        partner = partners.get(rollout.cell[1:])
+        if rollout.renderer == base or not rollout.ok or partner is None:
+            continue
+        compared += 1
+        was, now = events(partner), events(rollout)
+        if was != now:
+            tone = "worse" if was < now else "better" if now < was else "mixed"
+            flips.append(Flip(partner, rollout, in_words(was), in_words(now), tone))
+    order = {"worse": 0, "mixed": 1, "better": 2}
+    return sorted(flips, key=lambda flip: order[flip.tone]), compared
+
+
+def baseline_of(run: Run) -> str | None:
+    """Return the renderer that the others are compared with: as in the paired differences, else the first one."""
+    for pairs in (run.summary.get("paired") or {}).values():
+        for entry in pairs.values():
+            if entry.get("baseline") in run.renderers:
+                return str(entry["baseline"])
+    return next(iter(run.renderers), None)
+
+
+def events(rollout: Rollout) -> frozenset[str]:
+    """Return which of the `OUTCOMES` a rollout had."""
+    return frozenset(name for name in OUTCOMES if rollout.flag(name))
+
+
+def in_words(had: frozenset[str]) -> str:
+    """Name an outcome."""
+    said = [word for name, word in OUTCOMES.items() if name in had and not (name == "collision_any" and "collision_at_fault" in had)]
+    return " and ".join(said) or "no event"
+
+
+@dataclass(frozen=True)
+class FlipRow:
+    """One flip as the report shows it.
+
+    Attributes:
+        time: When the plans parted, since the first frame.
+        gap: How far apart they were then.
+        pictures: (renderer, arm, data address, width, height) at that time.
+        why_not: Why there are no pictures.
+        links: (renderer, arm, clip, folder).
+    """
+
+    flip: Flip
+    time: Cell
+    gap: Cell
+    source: str
+    pictures: tuple[tuple[str, int, str, int, int], ...]
+    why_not: str
+    links: tuple[tuple[str, int, str | None, str | None], ...]
+
+
+def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
+    """Lay out the flips with their pictures, as far as a budget goes.
+
+    Args:
+        run: The run; ``flips.json`` beside its tables tells when plans parted and where the frames of that time are.
+        budget_bytes: Most bytes of pictures to inline.
+
+    Returns:
+        The rows, how many more flips there are, and the number of pairs compared.
+    """
+    flips, compared = find_flips(run)
+    path = run.folder / FLIPS_NAME
+    told: dict[tuple[str, str, str, int], Mapping[str, Any]] = {}
+    if path.is_file():
+        told = {(c["renderer"], c["policy"], c["scene"], c["seed"]): c for c in read_json(path).get("cells") or []}
+    spent, rows = 0, []
+    for flip in flips[:MAX_FLIP_ROWS]:
+        entry = told.get(flip.key)
+        row = _row(run, flip, entry, spent < budget_bytes)
+        spent += sum(len(picture[2]) for picture in row.pictures)
+        rows.append(row)
+    return rows, len(flips) - len(rows), compared
+
+
+def _row(run: Run, flip: Flip, entry: Mapping[str, Any] | None, room: bool) -> FlipRow:
+    index = {name: i for i, name in enumerate(run.renderers)}
+    sides = (flip.base, flip.other)
+    links = tuple((r.renderer, index[r.renderer], run.href(r, "front.mp4"), run.href(r)) for r in sides)
+    if entry is None:
+        looked = (run.folder / FLIPS_NAME).is_file()
+        why = "not looked for: there are too many flips" if looked else "the run folder has no logs to look for it in"
+        return FlipRow(flip, missing(why), missing(why), "", (), why, links)
+    if entry.get("t_us") is None:
+        why = str(entry.get("reason") or "the plans never part by more than the threshold")
+        return FlipRow(flip, missing(why), missing(why), "", (), why, links)
+    seconds = float(entry["after_us"]) * 1e-6
+    time, gap = Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds), Cell(short(float(entry["gap_m"]), "m"), sort=float(entry["gap_m"]))
+    pictures = []
+    for rollout in sides if room else ():
+        name = (entry.get("frames") or {}).get(rollout.renderer)
+        file = run.folder / name if name else None
+        inside = file is not None and file.is_file() and file.resolve().is_relative_to(run.folder.resolve())
+        encoded = inline_jpeg(file) if file is not None and inside else None
+        if encoded is not None:
+            pictures.append((rollout.renderer, index[rollout.renderer], *encoded))
+    why = "" if pictures else str(entry.get("frames_reason") or "left out to keep this file small; they are in flips/")
+    return FlipRow(flip, time, gap, str(entry.get("source") or ""), tuple(pictures), why, links)
