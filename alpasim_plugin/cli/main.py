@@ -8,7 +8,7 @@ import traceback
 
 import typer
 
-from alpasim_plugin.cli import bench, doctor, fork, listing, refine, report, run
+from alpasim_plugin.cli import bench, doctor, fork, listing, refine, report, run, score, train
 from alpasim_plugin.errors import SimrunError
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ app = typer.Typer(
     "5 evaluator failure, 130 interrupted.",
 )
 app.command("run", epilog=run.EPILOG)(run.run)
+app.command("score", epilog=score.EPILOG)(score.score)
 app.command("report", epilog=report.EPILOG)(report.report)
 app.command("list", epilog=listing.EPILOG)(listing.list_parts)
 app.command("doctor", epilog=doctor.EPILOG)(doctor.doctor)
@@ -28,8 +29,9 @@ app.command("refine", epilog=refine.EPILOG)(refine.refine)
 app.command("fork", epilog=fork.FORK_EPILOG)(fork.fork)
 app.command("probe", epilog=fork.PROBE_EPILOG)(fork.probe)
 app.add_typer(bench.app, name="bench")
+app.add_typer(train.app, name="train")
 
-VERBS = ("run", "report", "list", "doctor", "refine", "fork", "probe", "bench")
+VERBS = ("run", "score", "report", "list", "doctor", "refine", "fork", "probe", "bench", "train")
 OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
 
 

@@ -1,0 +1,120 @@
+"""``simrun train``: make training data, and train the networks of a fixer."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.nets.latent_stats import LatentStats
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.training.clips import read_video, to_tensor
+from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.pairs import PairRecipe, make_sequence
+from alpasim_plugin.training.scenes import DEFAULT_COUNTS, SPLITS, write_scenes
+from alpasim_plugin.training.trainer import Schedule, Trainer
+from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
+from alpasim_plugin.training.vae_quality import quality, round_trip
+from scenarios.load import load_scenario
+
+app = typer.Typer(no_args_is_help=True, help="Make training data and train networks.")
+Out = Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")]
+WIDTH, HEIGHT = 256, 144
+
+
+@app.callback()
+def train() -> None:
+    """Make training data and train networks."""
+
+
+@app.command("scenes", epilog="Example: `simrun train scenes --out data/scenes --split train --count 120`")
+def scenes(
+    out: Out,
+    split: Annotated[Literal["train", "val", "test"], typer.Option("--split", help="Which split.")] = "train",
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Scenes; by default 120, 20 and 60.")] = None,
+    duration_s: Annotated[float, typer.Option("--duration-s", min=1.0, help="Length of every drive.")] = 9.9,
+) -> None:
+    """Draw scenarios; those of the test split come from other families of roads and traffic."""
+    console = Console(stderr=True)
+    for path in write_scenes(out, split, count or DEFAULT_COUNTS[split], duration_s):
+        console.print(str(path))
+
+
+@app.command("pairs", epilog="Example: `simrun train pairs data/scenes --out data/pairs`")
+def pairs(
+    scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml.")],
+    out: Out,
+    split: Annotated[str, typer.Option("--split", help="Splits, comma-separated.")] = ",".join(SPLITS),
+    wander_m: Annotated[float, typer.Option("--wander-m", min=0.0, help="Largest distance from the logged path.")] = 1.5,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the paths beside the log.")] = 0,
+) -> None:
+    """Render pairs of damaged and clean frames with opacity, semantic map and poses; finished sequences are kept."""
+    console = Console(stderr=True)
+    recipe = PairRecipe(wander_m=wander_m)
+    for name in (s.strip() for s in split.split(",")):
+        for path in sorted((scenes / name).glob("*.yaml")):
+            family = path.stem.rsplit("_", 1)[0]
+            made = make_sequence(load_scenario(path), out / name / path.stem, recipe, seed, split=name, family=family)
+            console.print(f"{name}/{path.stem}{'' if made else ' (was there)'}")
+
+
+@app.command("vae", epilog="Example: `simrun train vae data/pairs --video drive.mp4 --out runs/vae --steps 4000`")
+def vae(
+    data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
+    out: Out,
+    video: Annotated[list[Path] | None, typer.Option("--video", help="Driving video to learn from as well. Repeatable.")] = None,
+    video_share: Annotated[float, typer.Option("--video-share", min=0.1, max=1.0, help="Only the first share of every video.")] = 1.0,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 4000,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
+    init: Annotated[Path | None, typer.Option("--init", help="Weights to start from.")] = None,
+) -> None:
+    """Train the tiny video autoencoder; writes OUT/vae.safetensors with averaged weights and measured latent statistics."""
+    model = TinyVAE.load(init).requires_grad_(True) if init else TinyVAE.random(seed=seed)
+    dataset = PairDataset(data, "train")
+    videos = [read_video(path, WIDTH, HEIGHT, 0.0, video_share) for path in video or ()]
+    task = VaeTask(model, dataset.sequences, videos, VaeRecipe(seed=seed, video_clips=1 if videos else 0))
+    trainer = Trainer(model, out, Schedule(steps), task.batch, task.loss, task.facts)
+    console, began = Console(stderr=True), time.time()
+
+    def report(step: int, numbers: object) -> None:
+        if step % 50 == 0:
+            console.print(f"{step}/{steps} {time.time() - began:.0f} s {json.dumps(numbers)}")
+
+    trainer.run(report)
+    model.load_state_dict(trainer.averaged())
+    clips = [to_tensor(s.clip.rgb_gt[:97])[None] for s in dataset.sequences]
+    mean, std = measure_stats(model, clips)
+    model.stats = LatentStats((mean * model.stats.std + model.stats.mean).tolist(), (std * model.stats.std).tolist(), stored=True)
+    model.save(out / "vae.safetensors", {"made_by": "simrun train vae", "steps": str(steps), "seed": str(seed)})
+    console.print(f"wrote {out / 'vae.safetensors'}")
+
+
+@app.command("vae-quality", epilog="Example: `simrun train vae-quality runs/vae/vae.safetensors data/pairs --split val --video drive.mp4`")
+def vae_quality(
+    weights: Annotated[str, typer.Argument(help="Weights, or 'untrained'.")],
+    data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
+    split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "val",
+    video: Annotated[list[Path] | None, typer.Option("--video", help="Driving video to measure on as well. Repeatable.")] = None,
+    first_share: Annotated[float, typer.Option("--first-share", min=0.0, max=0.9, help="Skip this share of every video.")] = 0.0,
+) -> None:
+    """Measure a tiny autoencoder on held-out frames; prints one JSON document."""
+    model = TinyVAE.random() if weights == "untrained" else TinyVAE.load(weights)
+    rows: list[dict[str, object]] = []
+    for sequence in PairDataset(data, split).sequences:
+        clip = sequence.clip
+        gt, render = to_tensor(clip.rgb_gt)[None], to_tensor(clip.rgb_input)[None]
+        opacity = (to_tensor(clip.opacity[..., None])[None] + 1) / 2
+        rows.append({"clip": sequence.name, "from": "latent", **asdict(quality(round_trip(model, gt), gt))})
+        rows.append({"clip": sequence.name, "from": "latent and render", **asdict(quality(round_trip(model, gt, render, opacity), gt))})
+        rows.append({"clip": sequence.name, "from": "render alone", **asdict(quality(render, gt))})
+    for path in video or ():
+        gt = to_tensor(read_video(path, WIDTH, HEIGHT, first_share))[None]
+        rows.append({"clip": path.stem, "from": "latent", **asdict(quality(round_trip(model, gt), gt))})
+    print(json.dumps({"weights": weights, "split": split, "rows": rows}, indent=1))
+
+

@@ -1,0 +1,201 @@
+"""One training loop for every network here: accumulate, clip, step, average, log, checkpoint, resume, and stop at the first bad number.
+
+The batch of step i is a function of i alone, so a resumed run sees what an uninterrupted one would have seen and ends with equal weights.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+
+Batch = TypeVar("Batch")
+Loss = tuple[Tensor, Mapping[str, float]]  # what is minimised, and numbers for the log
+
+STATE_FILE, LOG_FILE, BAD_FILE = "state.safetensors", "log.jsonl", "bad_batch.pt"
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Optimisation.
+
+    Args:
+        steps: Updates in all.
+        peak_lr: Learning rate after the warm-up; it falls along a cosine to a hundredth.
+        warmup: Updates until the peak.
+        accumulate: Batches an update.
+        clip: Largest gradient norm.
+        weight_decay: Of AdamW, on matrices and kernels only.
+        ema: Decay of the averaged weights.
+        save_every: Updates between checkpoints.
+    """
+
+    steps: int
+    peak_lr: float = 1e-3
+    warmup: int = 100
+    accumulate: int = 1
+    clip: float = 1.0
+    weight_decay: float = 0.01
+    ema: float = 0.999
+    save_every: int = 200
+
+    def lr(self, step: int) -> float:
+        """Return the learning rate of an update, counted from 0."""
+        if step < self.warmup:
+            return self.peak_lr * (step + 1) / self.warmup
+        t = (step - self.warmup) / max(self.steps - self.warmup, 1)
+        return self.peak_lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(t, 1.0))))
+
+
+class Trainer(Generic[Batch]):
+    """Train one module in one folder; starting again in the same folder continues.
+
+    Args:
+        module: What is trained: its parameters that require a gradient.
+        folder: Receives state.safetensors (weights, average, moments), log.jsonl.
+        schedule: Optimisation.
+        batch: Makes the batch number i: the same for the same i, whatever was drawn before.
+        loss: Maps a batch and its number to what is minimised and numbers for the log.
+        facts: What identifies the run; a folder begun with other facts is refused.
+        autocast: Precision of the forward pass, or None.
+
+    Raises:
+        InputError: The folder holds another run.
+    """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        folder: Path,
+        schedule: Schedule,
+        batch: Callable[[int], Batch],
+        loss: Callable[[Batch, int], Loss],
+        facts: Mapping[str, Any],
+        autocast: torch.dtype | None = None,
+    ) -> None:
+        self.module, self.folder, self.schedule = module, folder, schedule
+        self._batch, self._loss, self._autocast = batch, loss, autocast
+        self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
+        decayed = [p for p in self.parameters.values() if p.ndim > 1]
+        plain = [p for p in self.parameters.values() if p.ndim <= 1]
+        groups = [{"params": decayed, "weight_decay": schedule.weight_decay}, {"params": plain, "weight_decay": 0.0}]
+        self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr, betas=(0.9, 0.99))
+        self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
+        self.step = 0
+        self._facts = json.dumps({**facts, "schedule": asdict(schedule)}, sort_keys=True, default=str)
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / STATE_FILE).exists():
+            self._resume()
+
+    def run(self, report: Callable[[int, Mapping[str, float]], None] | None = None, until: int | None = None) -> None:
+        """Train to the schedule's end, or to update ``until``.
+
+        Raises:
+            InfrastructureError: A loss or gradient is not finite; weights stay as after the last good update, the batch is saved.
+        """
+        last = min(until or self.schedule.steps, self.schedule.steps)
+        while self.step < last:
+            numbers = self._update()
+            self._write_log(numbers)
+            if report is not None:
+                report(self.step, numbers)
+            if self.step % self.schedule.save_every == 0 or self.step == last:
+                self.save()
+
+    def averaged(self) -> dict[str, Tensor]:
+        """Return the module's state dict with averaged parameters; what is not trained stays as it is."""
+        return {**self.module.state_dict(), **self.average}
+
+    def save(self) -> None:
+        """Write the checkpoint, whole or not at all."""
+        tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
+        tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
+        for name, p in self.parameters.items():
+            tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state[p].items()}
+        partial = self.folder / f"{STATE_FILE}.{os.getpid()}.part"
+        contiguous = {name: t.cpu().contiguous() for name, t in tensors.items()}
+        save_file(contiguous, str(partial), {"step": str(self.step), "facts": self._facts})
+        partial.replace(self.folder / STATE_FILE)
+
+    def _update(self) -> dict[str, float]:
+        began = time.perf_counter()
+        self.optimiser.zero_grad(set_to_none=True)
+        sums: dict[str, float] = {}
+        n = self.schedule.accumulate
+        for part in range(n):
+            index = self.step * n + part
+            batch = self._batch(index)
+            device = next(iter(self.parameters.values())).device.type
+            with torch.autocast(device, self._autocast or torch.bfloat16, enabled=self._autocast is not None):
+                loss, numbers = self._loss(batch, index)
+            if not torch.isfinite(loss):
+                self._stop(batch, f"loss {loss.item()} in batch {index}")
+            (loss / n).backward()  # type: ignore[no-untyped-call]
+            for name, value in {"loss": float(loss.detach()), **numbers}.items():
+                sums[name] = sums.get(name, 0.0) + value / n
+        norm = float(nn.utils.clip_grad_norm_(list(self.parameters.values()), self.schedule.clip))
+        if not math.isfinite(norm):
+            self._stop(batch, f"gradient norm {norm} at update {self.step}")
+        lr = self.schedule.lr(self.step)
+        for group in self.optimiser.param_groups:
+            group["lr"] = lr
+        self.optimiser.step()
+        self.step += 1
+        self._follow()
+        return {**sums, "grad_norm": norm, "lr": lr, "s": time.perf_counter() - began}
+
+    def _follow(self) -> None:
+        """Move the average; early on it follows faster, so that it does not remember the start."""
+        decay = min(self.schedule.ema, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for name, p in self.parameters.items():
+                self.average[name].lerp_(p, 1 - decay)
+
+    def _stop(self, batch: Batch, found: str) -> None:
+        path = self.folder / BAD_FILE
+        torch.save(batch, path)
+        self.save()
+        do = f"look at the batch in {path}; lower the learning rate or repair the data, then start again: training goes on from there"
+        raise InfrastructureError("training", str(self.folder), found, do)
+
+    def _write_log(self, numbers: Mapping[str, float]) -> None:
+        row = {"step": self.step, **{k: float(f"{v:.6g}") for k, v in numbers.items()}}
+        with (self.folder / LOG_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def _resume(self) -> None:
+        path = self.folder / STATE_FILE
+        with safe_open(str(path), "pt") as file:
+            meta = file.metadata()
+        if meta["facts"] != self._facts:
+            raise InputError(
+                "continuing a training run", str(path), f"it was begun as {meta['facts']}, this is {self._facts}", "choose another folder"
+            )
+        tensors = load_file(str(path))
+        self.step = int(meta["step"])
+        with torch.no_grad():
+            for name, p in self.parameters.items():
+                p.copy_(tensors[f"weight.{name}"])
+                self.average[name].copy_(tensors[f"average.{name}"])
+                moments = {k.split(".")[1]: t for k, t in tensors.items() if k.startswith("moment.") and k.split(".", 2)[2] == name}
+                self.optimiser.state[p] = {k: t if k == "step" else t.to(p.device) for k, t in moments.items()}
+        self._cut_log()
+
+    def _cut_log(self) -> None:
+        """Drop log rows of updates that were made after the checkpoint: they will be made again."""
+        path = self.folder / LOG_FILE
+        if path.exists():
+            rows = [line for line in path.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= self.step]
+            path.write_text("".join(row + "\n" for row in rows), encoding="utf-8")

@@ -1,0 +1,120 @@
+"""Train the tiny autoencoder on pairs and on driving video.
+
+It has to carry three kinds of pictures: clean frames, which it must also paint with the help of the damaged render; and damaged renders and
+semantic maps, which it only encodes for the generator. Latents get a little noise while it learns: a generator's are never exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.clips import Clip, ClipSize, draw_pair_clip, draw_video_clip
+from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.training.trainer import Loss
+from alpasim_plugin.types import U8
+
+
+@dataclass(frozen=True)
+class VaeRecipe:
+    """What a batch holds and what counts.
+
+    Args:
+        pair_clips: Clips from pairs in a batch.
+        video_clips: Clips from driving videos in a batch.
+        size: Frames (1 + 4k) and crop.
+        latent_noise: Standard deviation of the noise on latents, which have unit variance.
+        edge_weight: Weight of the difference of neighbouring pixels and frames: sharpness and flicker.
+        side_weight: Weight of damaged renders and semantic maps.
+        seed: Of draws and noise.
+    """
+
+    pair_clips: int = 2
+    video_clips: int = 1
+    size: ClipSize = ClipSize(9, 96, 160)
+    latent_noise: float = 0.05
+    edge_weight: float = 0.3
+    side_weight: float = 0.3
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class VaeBatch:
+    """``(B, C, T, H, W)`` clips of pairs, and of video alone (None: none)."""
+
+    pairs: Clip | None
+    video: Tensor | None
+    side: Tensor | None  # one damaged render or one semantic map
+
+
+class VaeTask:
+    """Batches and loss of the autoencoder, for `Trainer`."""
+
+    def __init__(self, vae: TinyVAE, sequences: Sequence[PairSequence], videos: Sequence[U8], recipe: VaeRecipe) -> None:
+        self.vae, self.sequences, self.videos, self.recipe = vae, sequences, videos, recipe
+        vae.latents_per_pass = None  # one pass a clip is faster; results differ by rounding only
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Identify the training data and recipe."""
+        return {"sequences": len(self.sequences), "videos": [list(v.shape) for v in self.videos], "recipe": asdict(self.recipe)}
+
+    def batch(self, index: int) -> VaeBatch:
+        """Make batch ``index``."""
+        r = self.recipe
+        pairs = None
+        side = None
+        if r.pair_clips:
+            clips = [draw_pair_clip(self.sequences, r.size, r.seed, index * r.pair_clips + i) for i in range(r.pair_clips)]
+            pairs = Clip(*(torch.stack([getattr(c, name) for c in clips]) for name in ("target", "render", "opacity", "sdmap")))
+            side = (pairs.render if index % 2 else pairs.sdmap)[:1]  # type: ignore[index]
+        video = None
+        if r.video_clips and self.videos:
+            clips = [draw_video_clip(self.videos, r.size, r.seed, index * r.video_clips + i) for i in range(r.video_clips)]
+            video = torch.stack([c.target for c in clips])
+        return VaeBatch(pairs, video, side)
+
+    def loss(self, batch: VaeBatch, index: int) -> Loss:
+        """Return the loss of a batch and its parts."""
+        r = self.recipe
+        parts: dict[str, Tensor] = {}
+        if batch.pairs is not None:
+            z, noisy = self._latents(batch.pairs.target, index, 0)
+            parts["latent"] = self._error(self.vae.decode(noisy, clamp=False), batch.pairs.target)
+            painted = self.vae.decode(noisy, render=batch.pairs.render, opacity=batch.pairs.opacity, clamp=False)
+            parts["render"] = self._error(painted, batch.pairs.target)
+            parts["spread"] = 1e-3 * (z.var(dim=(0, 2, 3, 4)).clamp_min(1e-6).log() ** 2).mean()
+        if batch.video is not None:
+            _, noisy = self._latents(batch.video, index, 1)
+            parts["video"] = self._error(self.vae.decode(noisy, clamp=False), batch.video)
+        if batch.side is not None:
+            _, noisy = self._latents(batch.side, index, 2)
+            parts["side"] = r.side_weight * self._error(self.vae.decode(noisy, clamp=False), batch.side)
+        total = torch.stack(list(parts.values())).sum()
+        return total, {name: float(value.detach()) for name, value in parts.items()}
+
+    def _latents(self, video: Tensor, index: int, which: int) -> tuple[Tensor, Tensor]:
+        z = self.vae.encode(video)
+        noise = stream("training", self.recipe.seed, f"vae.noise.{which}", index).standard_normal(z.shape, dtype="float32")
+        return z, z + self.recipe.latent_noise * torch.from_numpy(noise).to(z)
+
+    def _error(self, made: Tensor, wanted: Tensor) -> Tensor:
+        """Return a smooth absolute error of values and, weighted, of their differences along rows, columns and frames."""
+        d = made - wanted
+        value = torch.sqrt(d * d + 1e-4).mean()
+        edges = [F.smooth_l1_loss(x, torch.zeros_like(x), beta=0.02) for x in (d.diff(dim=-1), d.diff(dim=-2), d.diff(dim=-3))]
+        return value + self.recipe.edge_weight * torch.stack(edges).sum()
+
+
+def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation ``(16,)`` of the latents of clips ``(1, 3, T, H, W)``, one channel each."""
+    with torch.inference_mode():
+        z = torch.cat([vae.encode(c).flatten(2)[0] for c in clips], dim=1).double()
+    return z.mean(1).float(), z.std(1).float()

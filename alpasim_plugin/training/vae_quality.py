@@ -1,0 +1,45 @@
+"""Measure an autoencoder: how near its pictures come, and how much they flicker beside the original's own motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.nets.clips import crop_clip, pad_clip
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+
+
+@dataclass(frozen=True)
+class VaeQuality:
+    """Mean over a clip's frames.
+
+    Args:
+        psnr_db: Peak signal-to-noise ratio of 8-bit pictures, from the mean squared error of each frame, dB.
+        flicker: Root mean square of the change of the error from frame to frame, grey levels of 255; zero where the error stands still.
+        copy_flicker: The same of the original's own change from frame to frame: what motion alone gives.
+    """
+
+    psnr_db: float
+    flicker: float
+    copy_flicker: float
+
+
+def round_trip(vae: TinyVAE, video: Tensor, render: Tensor | None = None, opacity: Tensor | None = None) -> Tensor:
+    """Encode and decode a clip ``(1, 3, T, H, W)`` of any size; with a render, the decoder sees it."""
+    with torch.inference_mode():
+        padded, size = pad_clip(video)
+        seen = [None if x is None else pad_clip(x)[0] for x in (render, opacity)]
+        return crop_clip(vae.decode(vae.encode(padded), render=seen[0], opacity=seen[1]), size)
+
+
+def quality(made: Tensor, wanted: Tensor) -> VaeQuality:
+    """Compare clips ``(1, 3, T, H, W)`` in [-1, 1]."""
+    a, b = (np.rint((x.numpy().astype(np.float64) + 1) * 127.5).clip(0, 255) for x in (made, wanted))
+    error = a - b
+    mse = (error**2).mean(axis=(0, 1, 3, 4))
+    psnr = 10 * np.log10(255.0**2 / np.maximum(mse, 1e-10))
+    change = np.diff(error, axis=2)
+    return VaeQuality(float(psnr.mean()), float(np.sqrt((change**2).mean())), float(np.sqrt((np.diff(b, axis=2) ** 2).mean())))

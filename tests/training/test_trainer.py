@@ -1,0 +1,100 @@
+"""The training loop: resuming changes nothing, a bad number stops it and loses nothing."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.trainer import BAD_FILE, Schedule, Trainer
+
+
+class Line(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(3, 4))
+        self.bias = nn.Parameter(torch.zeros(3))
+        self.fixed = nn.Parameter(torch.ones(3), requires_grad=False)
+
+
+def batch(index: int) -> Tensor:
+    return torch.from_numpy(stream("t", 0, "x", index).standard_normal((8, 4))).float()
+
+
+TRUTH = torch.arange(12.0).reshape(3, 4) / 12
+
+
+def trainer(folder: Path, schedule: Schedule, facts: str = "a", bad_at: int = -1) -> Trainer[Tensor]:
+    model = Line()
+
+    def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
+        error = ((x @ model.weight.T + model.bias - x @ TRUTH.T) ** 2).mean()
+        return (error * float("nan") if index == bad_at else error), {"error": float(error.detach())}
+
+    return Trainer(model, folder, schedule, batch, loss, {"data": facts})
+
+
+def test_learns_and_averages(tmp_path: Path) -> None:
+    t = trainer(tmp_path, Schedule(steps=300, peak_lr=0.03, warmup=5, weight_decay=0.0, ema=0.9))
+    t.run()
+    torch.testing.assert_close(t.module.weight, TRUTH, atol=0.02, rtol=0)
+    torch.testing.assert_close(t.averaged()["weight"], TRUTH, atol=0.02, rtol=0)
+    assert set(t.averaged()) == {"weight", "bias", "fixed"}
+
+
+def test_resumed_run_ends_with_equal_weights_and_log(tmp_path: Path) -> None:
+    schedule = Schedule(steps=20, warmup=3, accumulate=2, save_every=7)
+    whole = trainer(tmp_path / "whole", schedule)
+    whole.run()
+    trainer(tmp_path / "cut", schedule).run(until=10)
+    again = trainer(tmp_path / "cut", schedule)
+    assert again.step == 10
+    again.run()
+    for name, p in whole.averaged().items():
+        assert torch.equal(p, again.averaged()[name])
+    steps = [line.split(",")[0] for line in (tmp_path / "cut" / "log.jsonl").read_text().splitlines()]
+    assert steps == [f'{{"step": {i}' for i in range(1, 21)]
+
+
+def test_kill_after_a_checkpoint_repeats_the_lost_updates_once(tmp_path: Path) -> None:
+    schedule = Schedule(steps=12, save_every=5)
+    t = trainer(tmp_path, schedule)
+    for _ in range(8):
+        t._write_log(t._update())
+        if t.step % 5 == 0:
+            t.save()
+    again = trainer(tmp_path, schedule)
+    assert again.step == 5
+    again.run()
+    assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 12
+
+
+def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) -> None:
+    schedule = Schedule(steps=9)
+    t = trainer(tmp_path, schedule, bad_at=4)
+    with pytest.raises(InfrastructureError, match="loss nan in batch 4"):
+        t.run()
+    assert torch.equal(torch.load(tmp_path / BAD_FILE, weights_only=True), batch(4))
+    again = trainer(tmp_path, schedule)
+    assert again.step == 4
+    assert torch.isfinite(again.module.weight).all()
+    again.run()
+    assert again.step == 9
+
+
+def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+    trainer(tmp_path, Schedule(steps=2)).run()
+    with pytest.raises(InputError, match="it was begun as"):
+        trainer(tmp_path, Schedule(steps=2), facts="b")
+    with pytest.raises(InputError, match="it was begun as"):
+        trainer(tmp_path, Schedule(steps=3))
+
+
+def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
+    s = Schedule(steps=110, peak_lr=1.0, warmup=10)
+    assert s.lr(0) == pytest.approx(0.1)
+    assert s.lr(10) == pytest.approx(1.0)
+    assert s.lr(60) == pytest.approx(0.505)
+    assert s.lr(110) == pytest.approx(0.01)
