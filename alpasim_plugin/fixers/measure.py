@@ -1,0 +1,180 @@
+"""Time a fixer stage by stage over a recorded clip, with the memory it takes.
+
+Two passes keep the numbers honest: one without any hook gives the all-in times, one with a clock at every stage gives the stages.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from alpasim_plugin.fixers.onefixer import OneFixer
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.types import F32, I64, U8, Frame
+
+STAGES = ("encode", "dit", "decode", "cache write")
+MB = 1e6
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of one camera with their semantic maps, as a fixer was given them in a rollout.
+
+    Attributes:
+        camera: Its name.
+        t_us: ``(T,)`` int64 microseconds.
+        rgb: ``(T, H, W, 3)`` uint8 sRGB.
+        alpha: ``(T, H, W)`` float32 opacity, 0 to 1.
+        maps: ``(T, H, W, 3)`` uint8 semantic maps.
+    """
+
+    camera: str
+    t_us: I64
+    rgb: U8
+    alpha: F32
+    maps: U8
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], maps: Sequence[U8]) -> Clip:
+        """Stack frames of one camera and their maps; a frame without opacity counts as opaque."""
+        alpha = [np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha for frame in frames]
+        times = np.array([frame.t_us for frame in frames], dtype=np.int64)
+        return cls(frames[0].camera, times, np.stack([frame.rgb for frame in frames]), np.stack(alpha), np.stack(maps))
+
+    def first(self, count: int) -> Clip:
+        """Return the first frames."""
+        return Clip(self.camera, self.t_us[:count], self.rgb[:count], self.alpha[:count], self.maps[:count])
+
+    def frames(self) -> list[Frame]:
+        """Return the frames."""
+        rows = zip(self.t_us, self.rgb, self.alpha, strict=True)
+        return [Frame(int(t_us), self.camera, rgb, alpha) for t_us, rgb, alpha in rows]
+
+    def blocks(self, rule: Callable[[int], int]) -> Iterator[tuple[list[Frame], list[U8]]]:
+        """Yield whole blocks of frames with their maps; what is left at the end and fills none is not given out."""
+        frames, start, index = self.frames(), 0, 0
+        while start + rule(index) <= len(frames):
+            end = start + rule(index)
+            yield frames[start:end], list(self.maps[start:end])
+            start, index = end, index + 1
+
+
+class StageClock:
+    """Add up the wall time of named stages; what `BlockPipeline` takes as its ``stage``.
+
+    Args:
+        device: On an accelerator, queued work is waited for at both ends of a stage.
+    """
+
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self._device = torch.device(device)
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Time one pass through a stage."""
+        begin = self.now()
+        yield
+        self.ms[name] = self.ms.get(name, 0.0) + (self.now() - begin) * 1e3
+
+    def now(self) -> float:
+        """Return seconds, with the device's queue empty."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return time.perf_counter()
+
+    def take(self) -> dict[str, float]:
+        """Return the milliseconds by stage since the last call."""
+        ms, self.ms = self.ms, {}
+        return ms
+
+
+@dataclass
+class Timing:
+    """What one setting cost; milliseconds per frame, one entry per block of steady state.
+
+    Attributes:
+        load_ms: Networks from nothing to ready.
+        first_ms: Very first block, all-in, whole: buffers are made and kernels chosen.
+        all_in: Blocks after the first, frames in to frames out.
+        stages: By stage, from a pass of its own.
+        peak_mb: Largest resident memory (device memory on an accelerator) beyond what the process held before the networks; None where
+            the system does not tell.
+        images: ``(T, H, W, 3)`` uint8 output of the first pass.
+    """
+
+    load_ms: float
+    first_ms: float
+    all_in: list[float] = field(default_factory=list)
+    stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
+    peak_mb: float | None = None
+    images: U8 = field(default_factory=lambda: np.zeros((0, 0, 0, 3), np.uint8))
+
+
+def measure(
+    settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None, passes: int = 2
+) -> Timing:
+    """Run a fixer over a clip and time it.
+
+    Args:
+        settings: The fixer.
+        clip: What it is given, block by block.
+        scene_id, seed: Key of the noise.
+        device, threads: Where, and with how many threads.
+        passes: Runs over the clip without and with clocks at the stages, each. The first block counts once, in the first pass.
+
+    Returns:
+        Times, memory and the first pass's images.
+    """
+    before_mb = resident_mb() if device == "cpu" else None
+    clock = StageClock(device)
+    begin = clock.now()
+    fixer = OneFixer(settings, scene_id, seed, device, threads)
+    timing = Timing((clock.now() - begin) * 1e3, 0.0)
+    images: list[U8] = []
+    for run in range(passes):
+        fixer.reset(seed)
+        for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
+            begin = clock.now()
+            fixed = fixer.step(frames, maps)
+            ms = (clock.now() - begin) * 1e3
+            if index:
+                timing.all_in.append(ms / len(frames))
+            elif not run:
+                timing.first_ms = ms
+            if not run:
+                images += [frame.rgb for frame in fixed]
+    timing.images = np.stack(images)
+    peak = peak_mb(device)
+    timing.peak_mb = None if peak is None or (before_mb is None and device == "cpu") else peak - (before_mb or 0.0)
+    fixer.pipeline.stage = clock
+    for _ in range(passes):
+        fixer.reset(seed)
+        for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
+            fixer.step(frames, maps)
+            for name, ms in clock.take().items():
+                if index and name in timing.stages:
+                    timing.stages[name].append(ms / len(frames))
+    return timing
+
+
+def resident_mb() -> float | None:
+    """Return this process's resident memory, None where the system does not tell."""
+    return _status_mb("VmRSS")
+
+
+def peak_mb(device: str) -> float | None:
+    """Return the most memory held so far: resident, or allocated on the device."""
+    return _status_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
+
+
+def _status_mb(key: str) -> float | None:
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((float(line.split()[1]) * 1024 / MB for line in lines if line.startswith(f"{key}:")), None)
