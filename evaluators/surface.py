@@ -40,6 +40,7 @@ class Surface:
         """
         self._areas, self._seam_m, self._level_m = areas, seam_m, level_m
         self._outlines = [np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in outlines]
+        self._bounds = np.array([(line.min(axis=0), line.max(axis=0)) for line in self._outlines]).reshape(-1, 2, 3)
         self._regions: dict[bytes, Region] = {}
 
     def margin_m(self, footprints: Geometries, xyz: F64) -> F64:
@@ -56,15 +57,17 @@ class Surface:
 
     def on_level(self, xyz: F64) -> Bool:
         """Return which areas ``(T, B)`` are on the level of points ``(T, 3)``: not on a bridge above nor on a road below."""
-        out = np.ones((len(xyz), len(self._areas)), dtype=np.bool_)
-        low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
-        points = shapely.points(xyz[:, :2])
-        for b, line in enumerate(self._outlines):
-            if max(high - line[:, 2].min(), line[:, 2].max() - low) <= self._level_m:
-                continue  # near enough everywhere
-            flat = shapely.linestrings(line[:, :2])
+        # Near enough even if the whole outline were at its extreme height and at the nearest corner of its bounds.
+        low, high = self._bounds[:, 0], self._bounds[:, 1]  # (B, 3)
+        outside = np.maximum(np.maximum(low[None, :, :2] - xyz[:, None, :2], xyz[:, None, :2] - high[None, :, :2]), 0.0)
+        at_least_m = np.hypot(outside[..., 0], outside[..., 1])  # (T, B)
+        rise_m = np.maximum(high[None, :, 2] - xyz[:, None, 2], xyz[:, None, 2] - low[None, :, 2])
+        out = np.asarray(rise_m <= self._level_m + SLOPE * at_least_m)
+        for b in np.flatnonzero(~out.all(axis=0)):
+            rows, line = np.flatnonzero(~out[:, b]), self._outlines[b]
+            flat, points = shapely.linestrings(line[:, :2]), shapely.points(xyz[rows, :2])
             z = np.interp(shapely.line_locate_point(flat, points), arc_lengths(line), line[:, 2])
-            out[:, b] = np.abs(z - xyz[:, 2]) <= self._level_m + SLOPE * shapely.distance(flat, points)
+            out[rows, b] = np.abs(z - xyz[rows, 2]) <= self._level_m + SLOPE * shapely.distance(flat, points)
         return out
 
     def region(self, chosen: Bool) -> Region:
@@ -95,6 +98,10 @@ class Region:
         out[inside] = self._nearest(footprints[inside])[1]
         out[~inside] = -self._depth_m(footprints[~inside])
         return out
+
+    def border_distance_m(self, xy: F64) -> F64:
+        """Return how far points ``(N, 2)`` are from the border, on either side of it."""
+        return self._nearest(shapely.points(xy))[1]
 
     def _nearest(self, shapes: Geometries) -> tuple[I64, F64]:
         """Return the nearest border segment and its distance per shape; among equally near ones any."""
@@ -153,12 +160,18 @@ def closed_union(areas: Geometries, seam_m: float) -> Any:
     added = added[shapely.area(added) > 0]
     if not len(added):
         return shape
-    outline = shapely.boundary(added)
-    thick = shapely.buffer(shapely.boundary(shape), 10 * _GRID_M, quad_segs=2)
-    shapely.prepare(thick)
-    mouths = shapely.length(shapely.difference(outline, thick)) / shapely.length(outline)
-    gaps = shapely.buffer(added[mouths < _MOUTH], 5 * _GRID_M, join_style="mitre")
+    gaps = shapely.buffer(added[_open_share(added, Region(shape)) < _MOUTH], 5 * _GRID_M, join_style="mitre")
     return shapely.union_all(np.concatenate([[shape], gaps]), grid_size=_GRID_M)
+
+
+def _open_share(added: Geometries, region: Region) -> F64:
+    """Return the share ``(M,)`` of the outline of each polygon that does not run along a region's border."""
+    ring, part = shapely.get_coordinates(shapely.get_exterior_ring(added), return_index=True)
+    side = np.flatnonzero(part[1:] == part[:-1])
+    length = np.linalg.norm(ring[side + 1] - ring[side], axis=1)
+    apart = region.border_distance_m((ring[side + 1] + ring[side]) / 2) > 10 * _GRID_M
+    whole = np.bincount(part[side], length, minlength=len(added))
+    return np.asarray(np.bincount(part[side], length * apart, minlength=len(added)) / whole)
 
 
 def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:

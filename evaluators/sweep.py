@@ -81,9 +81,7 @@ def slope(pairs: Motions) -> F64:
     """Return a bound ``(M,)`` on how fast any gap changes."""
     far = np.maximum(np.linalg.norm(pairs.start, axis=1), np.linalg.norm(pairs.start + pairs.shift, axis=1))
     turn = np.abs(pairs.turn)
-    return np.asarray(
-        np.linalg.norm(pairs.shift, axis=1) + turn.max(axis=1) * far + turn.sum(axis=1) * pairs.radius_m().max(axis=1)
-    )
+    return np.asarray(np.linalg.norm(pairs.shift, axis=1) + turn.max(axis=1) * far + turn.sum(axis=1) * pairs.radius_m().max(axis=1))
 
 
 def first_contact(pairs: Motions) -> F64:

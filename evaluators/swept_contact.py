@@ -4,9 +4,9 @@ Between two logged poses a body's centre moves straight and its heading turns at
 near is asked of an R-tree over x, y and t that holds stretches of their tracks; what is left is solved by `evaluators.sweep`, for all pairs
 of a rollout at once.
 
-An actor's contact has one side from its beginning to its end: the one first touched. Front: the actor touches the front side of the
-rectangle, its corners included; else rear: the rear side; else lateral. Contact that is there from the start, or from an actor's first
-logged time, has no first touch and is classified as overlap at that instant, by the same rule.
+An actor's contact has one side from its beginning to its end: the one that the contact's normal leaves the ego through, front, rear or
+lateral. At a corner that is the side nearer to the normal's direction; a tie is front before rear before lateral. Contact that is there
+from the start, or from an actor's first logged time, has no first touch; its normal is the shortest way out of the overlap.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from alpasim_plugin.geometry import wrap_angle
 from alpasim_plugin.types import F64, I64, Bool
 from evaluators.footprint import ActorTable, Footprints, corners
 from evaluators.step_contact import FRONT, LATERAL, REAR, Contacts
-from evaluators.sweep import Motions, first_contact
+from evaluators.sweep import Motions, first_contact, gaps
 
 PLACE_M = 1e-6  # where two bodies touch is read off their overlap when the ego is this much larger on every side
 _STRETCH = 16  # logged poses per box of the tree: few boxes, and little of the road in each
@@ -100,9 +100,7 @@ def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contact
     return SweptContacts(step[rank], actor[rank], begin[rank], beginnings)
 
 
-def _beginnings(
-    found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64
-) -> tuple[Beginnings, I64]:
+def _beginnings(found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Beginnings, I64]:
     """Join contacts found between steps with those that are there at once; also return how they were sorted (found ones first)."""
     step, actor = at_steps.step[fresh], at_steps.actor[fresh]
     boxes = actors.boxes(actor, t_us[step])
@@ -110,10 +108,10 @@ def _beginnings(
     here = ego.take(step)
     half = np.stack([here.size, boxes.size], axis=1) / 2
     pairs = Motions(boxes.xy - here.xy, still, np.stack([here.yaw, boxes.yaw], axis=1), still, half)
-    _, xy = _place(pairs, np.zeros(len(fresh)))
+    at_once, xy = _place(pairs, np.zeros(len(fresh)))
     who = np.concatenate([found.actor, actor])
     t_s = np.concatenate([found.t_s, (t_us[step] - t_us[0]) * 1e-6])
-    side = np.concatenate([found.side, at_steps.side[fresh]])
+    side = np.concatenate([found.side, at_once])
     order = np.lexsort((t_s, who))
     return Beginnings(who[order], t_s[order], side[order], np.concatenate([found.xy, xy])[order]), order
 
@@ -217,8 +215,19 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     own = shapely.polygons(corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))
     other = shapely.polygons(corners(seen, yaw[:, 1] - yaw[:, 0], 2 * pairs.half[:, 1]))
     shared = shapely.intersection(own, other)
-    bounds = shapely.bounds(shared)  # (M, 4)
-    front, rear = bounds[:, 2] >= half[:, 0] - PLACE_M, bounds[:, 0] <= PLACE_M - half[:, 0]
-    side = np.where(front, FRONT, np.where(rear, REAR, LATERAL)).astype(np.int64)
     middle = shapely.get_coordinates(shapely.centroid(shared)).reshape(-1, 2)
-    return side, np.clip(middle, -half, half)
+    return _sides(pairs, tau), np.clip(middle, -half, half)
+
+
+def _sides(pairs: Motions, tau: F64) -> I64:
+    """Return the side ``(M,)`` of the ego that the normal of touching pairs leaves through."""
+    gap = gaps(pairs, tau)  # (M, 8)
+    turned = pairs.yaw[:, 1] - pairs.yaw[:, 0] + tau * (pairs.turn[:, 1] - pairs.turn[:, 0])
+    c, s, one, zero = np.cos(turned), np.sin(turned), np.ones(len(tau)), np.zeros(len(tau))
+    # Forward and left part of the directions that `gaps` looks along, ego's first; odd columns look the other way.
+    forward = np.repeat(np.stack([one, zero, c, -s], axis=1), 2, axis=1) * np.tile([1.0, -1.0], 4)
+    left = np.repeat(np.stack([zero, one, s, c], axis=1), 2, axis=1)
+    normal = gap >= gap.max(axis=1, keepdims=True) - PLACE_M
+    along = np.abs(forward) >= np.abs(left)
+    front, rear = (np.any(normal & along & (forward * sign > 0), axis=1) for sign in (1, -1))
+    return np.where(front, FRONT, np.where(rear, REAR, LATERAL)).astype(np.int64)
