@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alpasim_plugin.renderers import make_renderer
+    from alpasim_plugin.runtime.compose import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from policies import make_policy
     from scenarios.load import load_scenario
@@ -19,7 +19,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_scenario": "scenarios.load",
     "make_policy": "policies",
-    "make_renderer": "alpasim_plugin.renderers",
+    "make_renderer": "alpasim_plugin.runtime.compose",
     "run_rollout": "alpasim_plugin.runtime.rollout",
 }
 

@@ -81,7 +81,8 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
     """Say in one line what runs where."""
     counts = (len(plan.renderers), len(plan.policies), len(plan.scenarios), len(plan.seeds))
     shape = "{} renderers x {} policies x {} scenes x {} seeds".format(*counts)
-    return f"{len(plan.cells)} rollouts ({shape}), {threads.workers} worker(s) x {threads.per_worker} thread(s) -> {root}"
+    line = f"{len(plan.cells)} rollouts ({shape}), {threads.workers} worker(s) x {threads.per_worker} thread(s) -> {root}"
+    return "\n".join([line, *(f"{name}: {card.label}, {card.settings.mode}" for name, card in plan.cards.items())])
 
 
 def describe(manifest: dict[str, Any], reused: bool) -> str:

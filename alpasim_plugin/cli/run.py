@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,22 +14,25 @@ from rich.console import Console
 
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.renderers import RENDERERS
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
+from alpasim_plugin.runtime.compose import parse_renderer
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from evaluators import PRESETS
-from evaluators.report import render_table
+from evaluators.report import fixer_lines, render_table
 from policies.base import find_policy
 from scenarios.suite import expand
 
 INTERRUPTED = 130
+FIXER_PREFIX = "fixer."
 
 EPILOG = """
 Examples:
 
 - `simrun --renderer clean,3dgs --policy lane-camera --seeds 3 real/us101`
+
+- `simrun --renderer 3dgs,onefixer --video all smoke/lead_car`
 
 - `simrun --renderer 3dgs --policy pure-pursuit suites/smoke --out runs/smoke --video all`
 
@@ -40,7 +44,7 @@ def run(
     scenarios: Annotated[
         list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")
     ],
-    renderer: Annotated[str, typer.Option("--renderer", help="Renderers, comma-separated.")] = "3dgs",
+    renderer: Annotated[str, typer.Option("--renderer", help="Renderers, comma-separated; `onefixer`, or `FIXER+RENDERER`.")] = "3dgs",
     policy: Annotated[str, typer.Option("--policy", help="Policies, comma-separated; `package.module:Class` works too.")] = "lane-camera",
     seeds: Annotated[str, typer.Option("--seeds", help="How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
@@ -49,7 +53,9 @@ def run(
     executor: Annotated[Literal["local", "ray", "slurm"], typer.Option("--executor", help="Where rollouts run.")] = "local",
     video: Annotated[Literal["none", "failures", "all"], typer.Option("--video", help="Write front.mp4.")] = "none",
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="Override a scenario key, or with `fixer.` a fixer's: key=value. Repeatable.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue in a folder that another command began.")] = False,
     baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
@@ -68,15 +74,16 @@ def run(
         raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is built", "use --executor local")
     names = [name.strip() for name in renderer.split(",") if name.strip()]
     drivers = [name.strip() for name in policy.split(",") if name.strip()]
-    for name in names:
-        RENDERERS.get(name)
     for name in drivers:
         find_policy(name)
     _check_preset(preset)
     if baseline is not None and baseline not in names:
         raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")
-    refs = [ref for item in scenarios for ref in expand(item, tuple(overrides or ()))]
-    plan = make_plan(refs, names, drivers, parse_seeds(seeds), RunOptions(preset, images, video, device, baseline))
+    for name in names:
+        parse_renderer(name)
+    of_scene, of_fixer = split_overrides(overrides or ())
+    refs = [ref for item in scenarios for ref in expand(item, of_scene)]
+    plan = make_plan(refs, names, drivers, parse_seeds(seeds), RunOptions(preset, images, video, device, baseline, of_fixer))
     root = out or default_folder(plan)
     if dry_run:
         _print_plan(plan, root, workers, as_json)
@@ -88,6 +95,17 @@ def run(
         raise typer.Exit(INTERRUPTED) from None
     _print_result(result, as_json)
     raise typer.Exit(result.exit_code)
+
+
+def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Part the overrides of scenarios from those of fixers, which begin with ``fixer.``.
+
+    Example:
+        >>> split_overrides(["timing.warmup_us=400000", "fixer.mode=chunk"])
+        (('timing.warmup_us=400000',), ('mode=chunk',))
+    """
+    of_scene = tuple(text for text in overrides if not text.startswith(FIXER_PREFIX))
+    return of_scene, tuple(text.removeprefix(FIXER_PREFIX) for text in overrides if text.startswith(FIXER_PREFIX))
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -126,6 +144,7 @@ def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -
         "rollouts": len(plan.cells),
         "scenes": list(plan.scenarios),
         "renderers": list(plan.renderers),
+        "fixers": [f"{name}: {card.label}, {card.settings.mode}" for name, card in plan.cards.items()],
         "policies": list(plan.policies),
         "seeds": list(plan.seeds),
         "camera_frames": int(frames * per_cell),
@@ -144,6 +163,8 @@ def _print_result(result: RunResult, as_json: bool) -> None:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
     Console().print(render_table(result.summary, headline_only=True))
+    for line in fixer_lines(result.summary):
+        print(line)
     for cell in result.summary["failures"]["cells"][:5]:
         print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
     if result.n_failed:

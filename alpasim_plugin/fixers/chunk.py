@@ -32,8 +32,9 @@ class ChunkRenderer:
         return self.workshop.spent_ms
 
     def facts(self) -> dict[str, Any]:
-        """Return what happened so far."""
-        return {"frames": self.frames, "blocks": self.blocks}
+        """Return what the fixer is and what happened so far."""
+        fixer = self.fixer
+        return {"label": fixer.label, "trained": fixer.trained, "mode": "chunk", "frames": self.frames, "blocks": self.blocks}
 
     def render(self, request: RenderRequest) -> Frame:
         """Refuse: one frame is no block, unless a block has one frame."""

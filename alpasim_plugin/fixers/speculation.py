@@ -21,8 +21,6 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.workshop import Shot, Workshop
 from alpasim_plugin.types import Frame, RenderRequest
 
-EXACT = Deviation(0.0, 0.0, 0.0)
-
 
 @dataclass
 class Tally:
@@ -64,7 +62,7 @@ class SpeculativeRenderer:
         self.workshop, self.settings = workshop, settings
         self._make = make_fixer
         self._spare: BlockFixer | None = make_fixer()
-        blocks = self._spare.blocks
+        self.label, self.trained, blocks = self._spare.label, self._spare.trained, self._spare.blocks
         self.lookahead = max(blocks.first, blocks.then) - 1
         self._rhythms: dict[tuple[int, ...], _Rhythm] = {}
         self._rhythm_of: dict[str, _Rhythm] = {}
@@ -76,8 +74,8 @@ class SpeculativeRenderer:
         return self.workshop.spent_ms
 
     def facts(self) -> dict[str, Any]:
-        """Return what happened so far."""
-        return self.tally.as_dict()
+        """Return what the fixer is and what happened so far."""
+        return {"label": self.label, "trained": self.trained, "mode": "speculative"} | self.tally.as_dict()
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; see `render_batch`."""
@@ -132,18 +130,19 @@ class _Rhythm:
         place = len(self.true)
         foretold = self.draft[place] if place < len(self.draft) else None
         self.true.append([self._shot(request, foretold, i) for i, request in enumerate(requests)])
-        off = [] if foretold is None else [deviation(shot.request, now) for (shot, _), now in zip(foretold, requests, strict=True)]
-        hit = bool(off) and all(d.within(self.settings.tolerance_m, self.settings.tolerance_deg) for d in off)
-        self._count(len(requests), off, hit, foretold)
+        exact = [Deviation(0.0, 0.0, 0.0)] * len(requests)
+        forecasts = [deviation(shot.request, now) for (shot, _), now in zip(foretold or (), requests, strict=foretold is not None)]
+        hit = bool(forecasts) and all(d.within(self.settings.tolerance_m, self.settings.tolerance_deg) for d in forecasts)
+        self._count(len(requests), forecasts, hit, foretold)
         if place + 1 == self.fixer.blocks.frames(self.done):
-            frames, off = self._complete(), []
+            frames, shown = self._complete(), exact
         elif hit and foretold is not None:
-            frames = [frame for _, frame in foretold]
+            frames, shown = [frame for _, frame in foretold], forecasts
         else:
-            frames, off = self._make_draft(requests), []
-        shown = off or [EXACT] * len(frames)
+            frames, shown = self._make_draft(requests), exact
         self.tally.shown += shown
-        return {frame.camera: _with_error(frame, error) for frame, error in zip(frames, shown, strict=True)}
+        missed = forecasts or [None] * len(frames)
+        return {frame.camera: _measured(frame, *errors) for frame, *errors in zip(frames, shown, missed, strict=True)}
 
     def _shot(self, request: RenderRequest, foretold: list[tuple[Shot, Frame]] | None, i: int) -> Shot:
         if foretold is not None and same_view(foretold[i][0].request, request):
@@ -199,16 +198,12 @@ class _Rhythm:
         self.last_us = now
 
 
-def _with_error(frame: Frame, error: Deviation) -> Frame:
-    return replace(
-        frame,
-        facts={
-            **frame.facts,
-            "pose_error_m": round(error.camera_m, 6),
-            "pose_error_deg": round(error.camera_deg, 6),
-            "actor_error_m": round(error.actor_m, 6),
-        },
-    )
+def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Frame:
+    """Note how far the pose of the frame handed out lies from the true one, and how far the forecast lay."""
+    facts = {"pose_error_m": shown.camera_m, "pose_error_deg": shown.camera_deg, "actor_error_m": shown.actor_m}
+    if forecast is not None:
+        facts |= {"forecast_error_m": forecast.camera_m, "forecast_error_deg": forecast.camera_deg}
+    return replace(frame, facts={**frame.facts, **{name: round(value, 6) for name, value in facts.items()}})
 
 
 def _spread(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | None]:

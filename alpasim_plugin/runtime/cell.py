@@ -14,7 +14,8 @@ import cv2
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import SimrunError
-from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.runtime.compose import card_of, make_renderer
+from alpasim_plugin.runtime.offers import facts_of
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
@@ -50,11 +51,12 @@ PartsOf = Callable[[Cell, RunOptions, Scenario, int], Parts]
 
 def own_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
     """Make the parts that a cell names."""
+    card = card_of(cell.renderer, options.fixer)
     return Parts(
-        make_renderer(cell.renderer, scenario, seed=cell.seed, device=options.device, threads=threads),
+        make_renderer(cell.renderer, scenario, cell.seed, options.device, threads, options.fixer),
         make_policy(cell.policy, scenario),
         cell.rollout_key,
-        {"sensorsim": cell.renderer, "egodriver": cell.policy},
+        {"sensorsim": cell.renderer if card is None else f"{cell.renderer} ({card.label})", "egodriver": cell.policy},
     )
 
 
@@ -83,7 +85,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of
         parts = parts_of(cell, options, scenario, threads)
         with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
             run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
-        manifest |= recorder.facts()
+        manifest |= recorder.facts() | {"fixer": facts_of(parts.renderer)}
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"

@@ -4,11 +4,13 @@
 - ``chunk: tuple[int, int] | None``: frames come in blocks of so many, first and later ones; the policy is asked at each block's end.
 - ``render_batch(requests) -> frames``: all requests of an instant (of all cameras; of a whole block with ``chunk``) in one call.
 - ``spent_ms: Mapping[str, float]``: parts of the last call's time that are stages of their own, such as ``{"fix": 12.0}``.
+- ``facts() -> dict``: what a fixer's session is and did, for the rollout's manifest: ``label``, ``trained``, ``mode``, counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from alpasim_plugin.types import Frame, Renderer, RenderRequest
 
@@ -34,3 +36,9 @@ def spent_by(renderer: Renderer) -> Mapping[str, float]:
     """Return the stages within the renderer's last call, milliseconds."""
     spent: Mapping[str, float] = getattr(renderer, "spent_ms", {})
     return spent
+
+
+def facts_of(renderer: Renderer) -> dict[str, Any]:
+    """Return what a fixer's session has to say when the rollout is over; empty for a renderer without a fixer."""
+    tell: Callable[[], dict[str, Any]] | None = getattr(renderer, "facts", None)
+    return {} if tell is None else tell()

@@ -5,15 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.compose import card_of, parse_renderer
 from alpasim_plugin.types import Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
+
+if TYPE_CHECKING:
+    from alpasim_plugin.fixers.card import Card
 
 SLUG_LENGTH = 80
 LOG_VERSION = 1  # raise when a rollout made by an older version must not be reused
@@ -28,6 +32,7 @@ class RunOptions:
     video: Literal["none", "failures", "all"] = "none"
     device: Literal["cpu", "cuda"] = "cpu"
     baseline: str | None = None
+    fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class RunPlan:
     policies: tuple[str, ...]
     seeds: tuple[int, ...]
     options: RunOptions
-    overrides: tuple[str, ...] = field(default=())
+    cards: Mapping[str, Card] = field(default_factory=dict)  # renderer -> the fixer in its name
 
     @property
     def key(self) -> str:
@@ -83,6 +88,13 @@ def make_plan(
             raise InputError(
                 "planning a run", f"{what}s {list(values)}", "none, or one of them twice", f"name every {what} once"
             )
+    same = [str(parse_renderer(name)) for name in renderers]
+    if len(set(same)) != len(same):
+        raise InputError("planning a run", f"renderers {list(renderers)}", f"they stand for {same}", "name every renderer once")
+    cards = {name: card for name in renderers if (card := card_of(name, options.fixer)) is not None}
+    if options.fixer and not cards:
+        found = f"no fixer among the renderers {list(renderers)}"
+        raise InputError("planning a run", f"--set fixer.{options.fixer[0]}", found, "leave it out, or name a fixer")
     scenarios: dict[str, Scenario] = {}
     origin: dict[str, ScenarioRef] = {}
     for ref in refs:
@@ -102,10 +114,10 @@ def make_plan(
             for policy in policies:
                 for seed in seeds:
                     shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
-                    rollout_key = digest(shaped_by)
+                    rollout_key = digest([*shaped_by, cards[renderer].as_dict()] if renderer in cards else shaped_by)
                     score_key = digest([rollout_key, options.preset])
                     cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], rollout_key, score_key))
-    return RunPlan(tuple(cells), scenarios, tuple(renderers), tuple(policies), tuple(seeds), options)
+    return RunPlan(tuple(cells), scenarios, tuple(renderers), tuple(policies), tuple(seeds), options, cards)
 
 
 def digest(value: object) -> str:

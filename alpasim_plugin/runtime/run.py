@@ -147,7 +147,8 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
                 }
                 for name, s in plan.scenarios.items()
             },
-            "weights": {},
+            "fixers": {name: card.as_dict() for name, card in plan.cards.items()},
+            "weights": {file: digest for card in plan.cards.values() for file, digest in card.weights.items()},
             "hardware": hardware(),
             "versions": versions(),
             "left_out": sorted({note for s in plan.scenarios.values() for note in s.notes}),

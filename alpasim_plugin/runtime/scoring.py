@@ -14,6 +14,9 @@ from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from evaluators import Reduction, reduce_rollout, score
 
+# Of a fixer that foretells: the camera's distance between the frame handed out and the truth, and between forecast and truth.
+FIXER_FACTS = ("pose_error_m", "forecast_error_m")
+
 
 @dataclass(frozen=True)
 class Scored:
@@ -36,10 +39,9 @@ def score_log(log: Path, frames: Path, scenario: Scenario, preset: str) -> Score
     reduction = reduce_rollout(series, preset)
     rows = [row for one in series for row in _rows(one)]
     rows += _state_rows(rollout)
-    rows += [
-        _row(int(fact["t_us"] or 0), "opacity_mean", fact["opacity_mean"], "the renderer gives no opacity")
-        for fact in read_facts(frames)
-    ]
+    facts = read_facts(frames)
+    rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in facts]
+    rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in facts if name in f]
     return Scored(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict())
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.runtime.execute import Threads
+from alpasim_plugin.runtime.fixer_table import fixers
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, rollouts_schema, write_bytes, write_json, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
@@ -52,6 +53,7 @@ def write_tables(
         "paired": _by_policy(rows, lambda some: _pairs(some, baseline)),
         "censoring": _by_policy(manifests, censoring),
         "failures": _failures(manifests),
+        "fixers": _by_policy([m for m in manifests if m["status"] == "ok"], fixers),
         "speed": _by_policy([m for m in manifests if m["status"] == "ok"], _speeds),
         "pool": _pool(root, manifests, threads, wall_s),
     }
@@ -112,6 +114,7 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "p50_ms": round(float(np.percentile(d, 50)), 3),
                 "p95_ms": round(float(np.percentile(d, 95)), 3),
                 "share": round(sum(d) / all_ms, 4),
+                "per_frame_ms": round(sum(d) / len(per_frame), 3),
             }
             for name, d in stages.items()
             if d

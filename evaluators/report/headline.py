@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from evaluators.report.fixers import fixer_cautions
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
 from evaluators.report.run_folder import Run
@@ -177,7 +178,7 @@ def _alone(run: Run, arm: str) -> str:
 
 
 def _cautions(run: Run) -> tuple[str, ...]:
-    said = []
+    said = fixer_cautions(run.summary)
     failed = [r for r in run.rollouts if not r.ok]
     if failed:
         classes: dict[str, int] = {}

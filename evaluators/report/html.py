@@ -18,6 +18,7 @@ from evaluators.report.charts import drift_charts
 from evaluators.report.events import events_of, read_series
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.files import write_whole
+from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
@@ -96,6 +97,8 @@ def context(run: Run) -> dict[str, Any]:
         "views_left_out": no_view,
         "strips": strips,
         "strips_left_out": no_strip,
+        "fixers": fixer_rows(run.summary),
+        "fixer_columns": COLUMNS,
         "speed": speed(run),
         "scene_rows": by_scene,
         "more_scene_rows": more_scene_rows,

@@ -45,7 +45,7 @@ def speed(run: Run) -> Speed:
     """Lay out milliseconds per frame, whole and by stage."""
     entries: Mapping[str, Mapping[str, Any]] = run.summary.get("speed") or {}
     names = list(dict.fromkeys(stage for e in entries.values() for stage in e.get("stages") or {}))
-    sums = {r: sum(finite(s.get("p50_ms")) or 0.0 for s in (e.get("stages") or {}).values()) for r, e in entries.items()}
+    sums = {r: sum(_per_frame(s) or 0.0 for s in (e.get("stages") or {}).values()) for r, e in entries.items()}
     longest = max(sums.values(), default=0.0)
     index = {name: i for i, name in enumerate(run.renderers)}
     rows = []
@@ -54,7 +54,7 @@ def speed(run: Run) -> Speed:
         bar = [
             Segment(i, name, short(ms, "ms"), round(100.0 * ms / longest, 2))
             for i, name in enumerate(names)
-            if longest and (ms := finite((stages.get(name) or {}).get("p50_ms")))
+            if longest and (ms := _per_frame(stages.get(name) or {}))
         ]
         rows.append(
             SpeedRow(
@@ -67,6 +67,12 @@ def speed(run: Run) -> Speed:
             )
         )
     return Speed(tuple(rows), tuple(names), _pool(run.summary.get("pool") or {}))
+
+
+def _per_frame(stage: Mapping[str, Any]) -> float | None:
+    """Return what a stage costs per frame: its mean where it is stated, since some stages run once for several frames."""
+    mean = finite(stage.get("per_frame_ms"))
+    return finite(stage.get("p50_ms")) if mean is None else mean
 
 
 def _ms(value: Any) -> Cell:

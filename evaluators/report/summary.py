@@ -8,6 +8,7 @@ from pathlib import Path
 from evaluators.report import tables
 from evaluators.report.failures import failure_rows
 from evaluators.report.files import write_whole
+from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell
 from evaluators.report.provenance import provenance
@@ -47,6 +48,10 @@ def summary_md(run: Run) -> str:
         head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
         body = [[p.arm, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs]
         parts.append(f"\n### Paired differences from {escape(pairs[0].baseline)}\n\n{table(head, body)}")
+    fixed = fixer_rows(run.summary)
+    if fixed:
+        head = ["renderer", *(name for name, _ in COLUMNS)]
+        parts.append(f"\n### Fixers\n\n{table(head, [[row.renderer, *(c.text for c in row.cells)] for row in fixed])}")
     times = speed(run)
     if times.rows:
         head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *times.stages]

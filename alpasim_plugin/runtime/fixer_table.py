@@ -1,0 +1,41 @@
+"""What a summary says of fixers: what they are, and how their blocks came about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+COUNTS = ("foretold", "hits", "exact", "drafts", "redrafts")
+
+
+def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return per renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts``, ``frames`` and ``blocks``.
+
+    In speculative mode also the counts of `alpasim_plugin.fixers.speculation.Tally` over rollouts, ``hit_rate`` (the share of foretold
+    frames that came within tolerance), and the largest ``forecast_error`` and ``shown_error``.
+
+    Args:
+        manifests: Of finished rollouts of one policy.
+    """
+    out: dict[str, Any] = {}
+    for name in dict.fromkeys(m["renderer"] for m in manifests):
+        told = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
+        if not told:
+            continue
+        entry = {key: told[0][key] for key in ("label", "trained", "mode")} | {"rollouts": len(told)}
+        entry |= {key: sum(one[key] for one in told) for key in ("frames", "blocks")}
+        if entry["mode"] == "speculative":
+            entry |= {key: sum(one[key] for one in told) for key in COUNTS}
+            entry["hit_rate"] = round(entry["hits"] / entry["foretold"], 4) if entry["foretold"] else None
+            entry |= {key: _largest(one[key] for one in told) for key in ("forecast_error", "shown_error")}
+        out[name] = entry
+    return out
+
+
+def _largest(spreads: Iterable[dict[str, dict[str, float] | None]]) -> dict[str, float | None]:
+    """Return the largest value of each kind of error over rollouts; None where there is no finite one."""
+    found: dict[str, list[float]] = {}
+    for spread in spreads:
+        for name, values in spread.items():
+            found.setdefault(name, []).extend([] if values is None else [values["max"]])
+    return {name: max(values, default=None) for name, values in found.items()}
