@@ -23,17 +23,21 @@ class MetricInfo:
     help: str
     is_flag: bool = False  # 0 or 1 per step; its mean over rollouts is a rate
     derived: bool = False  # exists per rollout only, computed in the reduction
+    is_headline: bool = False  # reports lead with it
+    is_share: bool = False  # a fraction that is printed in percent; flags are anyway
 
 
-def _flag(help_text: str, direction: Direction = "lower", derived: bool = False, aggregation: Aggregation = "max") -> MetricInfo:
-    return MetricInfo("", direction, aggregation, help_text, is_flag=True, derived=derived)
+def _flag(
+    help_text: str, direction: Direction = "lower", derived: bool = False, aggregation: Aggregation = "max", is_headline: bool = False
+) -> MetricInfo:
+    return MetricInfo("", direction, aggregation, help_text, is_flag=True, derived=derived, is_headline=is_headline)
 
 
 MIN_ADE = "min_ade@{:.1f}s({})"
 
-METRICS: dict[str, MetricInfo] = {
-    "collision_any": _flag("any contact with another actor"),
-    "collision_at_fault": _flag("front or lateral contact"),
+METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, after the headline ones
+    "collision_at_fault": _flag("front or lateral contact", is_headline=True),
+    "collision_any": _flag("any contact with another actor", is_headline=True),
     "collision_front": _flag("an actor touches the front bumper"),
     "collision_lateral": _flag("an actor touches the ego at neither bumper"),
     "collision_rear": _flag("an actor touches the rear bumper and not the front one"),
@@ -41,16 +45,18 @@ METRICS: dict[str, MetricInfo] = {
     "contact_time_s": MetricInfo("s", "none", "min", "when the first contact begins, counted from the first ego pose of the log"),
     "contact_x_m": MetricInfo("m", "none", "last", "where the ego is touched first: forward of its rear axle"),
     "contact_y_m": MetricInfo("m", "none", "last", "where the ego is touched first: to the left of its middle"),
-    "offroad": _flag("off the road: outside the lanes and touching a road edge (strict: off the drivable surface)"),
+    "offroad": _flag("off the road: outside the lanes and touching a road edge (strict: off the drivable surface)", is_headline=True),
     "offroad_margin_m": MetricInfo("m", "higher", "min", "gap to the drivable surface's border; below 0: how far the ego sticks out"),
     "wrong_lane": _flag("the lanes under the ego centre run against it (by more than 120 degrees)"),
     "min_distance_to_lane_boundary_m": MetricInfo("m", "higher", "min", "gap to the border of the joined nearby lanes; 0 when not inside"),
     "dist_to_gt_trajectory": MetricInfo("m", "lower", "max", "distance of the ego centre from the recorded path"),
-    "route_distance_m": MetricInfo("m", "lower", "mean", "mean over the rollout of the distance from the recorded path"),
+    "route_distance_m": MetricInfo(
+        "m", "lower", "mean", "mean over the rollout of the distance from the recorded path", is_headline=True
+    ),
     "dist_to_gt_location": MetricInfo("m", "lower", "max", "distance of the ego centre from where the recording is at that time"),
-    "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached"),
-    "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then"),
-    "progress_rel_to_total": MetricInfo("", "higher", "last", "same as progress, under AlpaSim's other name"),
+    "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached", is_headline=True, is_share=True),
+    "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then", is_share=True),
+    "progress_rel_to_total": MetricInfo("", "higher", "last", "same as progress, under AlpaSim's other name", is_share=True),
     "dist_traveled_m": MetricInfo("m", "none", "last", "metres driven"),
     "gt_dist_traveled_m": MetricInfo("m", "none", "last", "length of the recorded path"),
     "plan_deviation": MetricInfo("m", "lower", "mean", "how far consecutive plans differ at common times, near ones weigh more"),
@@ -67,7 +73,8 @@ METRICS: dict[str, MetricInfo] = {
     "offroad_or_collision": _flag("off-road or any contact", derived=True),
     "offroad_or_collision_at_fault": _flag("off-road or contact at fault", derived=True),
     "duration_frac_20s": MetricInfo("", "none", "last", "scored time over 20 s", derived=True),
-    "progress_clipped_rel": MetricInfo("", "higher", "last", "progress at the last scored step", derived=True),
+    "scene_score": MetricInfo("", "higher", "last", "AlpaSim's score: 0 after a fault, else saturated progress", derived=True),
+    "progress_clipped_rel": MetricInfo("", "higher", "last", "progress at the last scored step", derived=True, is_share=True),
 }
 
 _MIN_ADE_NAME = re.compile(r"min_ade@(\d+\.\d+)s\((gt|self)\)")

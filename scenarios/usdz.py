@@ -47,8 +47,13 @@ class RoadMap:
     notes: tuple[str, ...]
 
 
-def read_usdz(path: str | Path) -> RecordedLog:
-    """Read a scene as a recorded log to drive in.
+def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> RecordedLog:
+    """Read a scene as a recorded log, to drive in or to score logs against.
+
+    Args:
+        path: The scene.
+        rails: False drops the lanes' rails after the centres are made, so that scorers widen the centres by 1.85 m.
+        needs_map: False accepts a scene without a map: scorers say what they lack.
 
     Raises:
         InputError: A member is missing or damaged, or there is no map.
@@ -59,7 +64,7 @@ def read_usdz(path: str | Path) -> RecordedLog:
         scene_id = _scene_id(archive)
         rig = _Rig(archive)
         road = _road(archive, rig)
-        if not road.lane_map.lanes:
+        if needs_map and not road.lane_map.lanes:
             raise files.fail(path, "a scene without a map", "use a scene with map tables or map.xodr: its road is what gets dressed")
         actors, static = _actors(archive)
         cameras, camera_notes = front_wide(archive)
@@ -77,7 +82,7 @@ def read_usdz(path: str | Path) -> RecordedLog:
     return RecordedLog(
         scene_id=scene_id,
         source="usdz",
-        lane_map=road.lane_map,
+        lane_map=road.lane_map if rails else without_rails(road.lane_map),
         ground=ground,
         ego_log=rig.ego_log,
         vehicle=vehicle,
@@ -86,32 +91,14 @@ def read_usdz(path: str | Path) -> RecordedLog:
         world_origin=(0.0, 0.0, 0.0),
         content_hash=files.content_hash,
         notes=notes,
-        alpasim_map=road.alpasim,
+        alpasim_map=road.alpasim if rails or road.alpasim is None else without_rails(road.alpasim),
     )
 
 
-def read_usdz_scene(path: str | Path, rails: bool = True) -> tuple[Scene, tuple[str, ...], str]:
-    """Read what scorers need of a scene; a missing map gives one without lanes, and scorers say what they lack.
-
-    Args:
-        path: The scene.
-        rails: False drops the lanes' rails after the centres are made, so that lanes are centres widened by 1.85 m.
-
-    Returns:
-        The scene, notes, and the sha256 of the bytes read.
-
-    Raises:
-        InputError: A member is missing or damaged.
-    """
-    files = SourceFiles(DOING)
-    with Archive(files, Path(path)) as archive:
-        scene_id = _scene_id(archive)
-        rig = _Rig(archive)
-        road = _road(archive, rig)
-        vehicle, _ = rig.vehicle()
-    maps = [m if m is None or rails else without_rails(m) for m in (road.lane_map, road.alpasim)]
-    assert maps[0] is not None
-    return Scene(scene_id, maps[0], rig.ego_log, vehicle, maps[1]), road.notes, files.content_hash
+def read_usdz_scene(path: str | Path, rails: bool = True) -> Scene:
+    """Read what scorers see of a scene; see `read_usdz`."""
+    record = read_usdz(path, rails, needs_map=False)
+    return Scene(record.scene_id, record.lane_map, record.ego_log, record.vehicle, record.alpasim_map)
 
 
 def usdz_scene_id(path: str | Path) -> str:

@@ -2,14 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Scenario
+from alpasim_plugin.types import F64, Actor, LaneMap, Scenario, Scene, Trajectory, Vehicle
 
 
-def scene_as_json(scenario: Scenario) -> dict[str, Any]:
+@dataclass(frozen=True)
+class LoggedScene:
+    """A scene that logs are scored against: what evaluators see, and what a report says of it."""
+
+    scene: Scene
+    source: str
+    content_hash: str
+    notes: tuple[str, ...]
+    actors: Sequence[Actor]
+    world_origin: tuple[float, float, float]
+    start_us: int = 0
+    end_us: int = 0
+    warmup_us: int = 0
+
+    @property
+    def scene_id(self) -> str:
+        """Give the scene's id."""
+        return self.scene.scene_id
+
+    @property
+    def lane_map(self) -> LaneMap:
+        """Give the map."""
+        return self.scene.lane_map
+
+    @property
+    def ego_log(self) -> Trajectory:
+        """Give the recorded drive."""
+        return self.scene.ego_log
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """Give the ego's body."""
+        return self.scene.vehicle
+
+
+def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
     """Return lanes, edges, crosswalks and the logged path in world metres, rounded to a centimetre."""
     lanes = [
         {

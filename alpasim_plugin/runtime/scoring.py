@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ import numpy as np
 from alpasim_plugin.geometry import arc_lengths, inverse, offset_trajectory, project, yaw_from_quat
 from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
-from evaluators import Reduction, reduce_rollout, score
+from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
+from evaluators import preset as find_preset
 
 # Of a fixer that foretells: the camera's distance between the frame handed out and the truth, and between forecast and truth.
 FIXER_FACTS = ("pose_error_m", "forecast_error_m")
@@ -26,6 +27,7 @@ class Scored:
     metrics: dict[str, dict[str, Any]]  # metric -> value, valid, reason, unit, direction
     events: list[dict[str, Any]]  # first scored collision and off-road: metric, t_us, x_m, y_m
     censored: dict[str, Any]  # how many steps which rule removed
+    contacts: list[dict[str, Any]]  # where contact is searched between steps, each beginning: actor_id, t_s, side, x_m, y_m (rig frame)
 
 
 def score_log(log: Path, frames: Path, scenario: Scenario, preset: str) -> Scored:
@@ -36,13 +38,37 @@ def score_log(log: Path, frames: Path, scenario: Scenario, preset: str) -> Score
     """
     rollout = read_asl(log)
     series = score(rollout, scenario.scene, preset)
-    reduction = reduce_rollout(series, preset)
+    return tabulated(rollout, series, reduce_rollout(series, preset), read_facts(frames), contacts_of(rollout, preset))
+
+
+def tabulated(
+    rollout: RolloutLog,
+    series: Sequence[MetricSeries],
+    reduction: Reduction,
+    frames: Sequence[Mapping[str, Any]] = (),
+    contacts: Sequence[ContactEvent] = (),
+) -> Scored:
+    """Flatten a scored rollout for the tables.
+
+    Args:
+        rollout: The log.
+        series: What `evaluators.score` gave.
+        reduction: What it was reduced to.
+        frames: Facts per camera frame, where the renderer's are known.
+        contacts: What `contacts_of` gave.
+    """
     rows = [row for one in series for row in _rows(one)]
     rows += _state_rows(rollout)
-    facts = read_facts(frames)
-    rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in facts]
-    rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in facts if name in f]
-    return Scored(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict())
+    rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in frames]
+    rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in frames if name in f]
+    begun = [one.as_dict() for one in contacts]
+    return Scored(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict(), begun)
+
+
+def contacts_of(rollout: RolloutLog, preset: str | Preset) -> tuple[ContactEvent, ...]:
+    """Return who touched the ego when and where, if the preset searches contact between steps; else nothing."""
+    chosen = find_preset(preset)
+    return contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
 
 
 def _rows(series: MetricSeries) -> list[dict[str, Any]]:

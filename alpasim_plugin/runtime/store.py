@@ -87,13 +87,19 @@ STEPS_SCHEMA = pa.schema(
 )
 
 
-def rollouts_schema(metrics: Sequence[str]) -> pa.Schema:
-    """Return the schema of ``rollouts.parquet`` for a list of metric names."""
+def steps_schema(of_logs: bool) -> pa.Schema:
+    """Return the schema of ``steps.parquet``; tables of scored logs name the log's folder in ``rollout``."""
+    return pa.schema([*STEPS_SCHEMA, pa.field("rollout", pa.string())]) if of_logs else STEPS_SCHEMA
+
+
+def rollouts_schema(metrics: Sequence[str], of_logs: bool = False) -> pa.Schema:
+    """Return the schema of ``rollouts.parquet`` for a list of metric names; see `steps_schema` for ``of_logs``."""
     fields: list[tuple[str, pa.DataType]] = [
         ("renderer", pa.string()),
         ("policy", pa.string()),
         ("scene", pa.string()),
         ("seed", pa.int64()),
+        *([("rollout", pa.string())] if of_logs else []),
         ("status", pa.string()),
         ("failure_class", pa.string()),
         ("failure", pa.string()),

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
-from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, rollouts_schema, write_bytes, write_json, write_table
+from alpasim_plugin.runtime.store import read_json, rollouts_schema, steps_schema, write_bytes, write_json, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 
@@ -24,6 +24,7 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         error = manifest.get("error") or {}
         row: dict[str, Any] = {
             **{key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "status", "path", "wall_s")},
+            **{key: manifest[key] for key in ("rollout",) if key in manifest},
             "failure_class": error.get("failure_class"),
             "failure": error.get("found"),
             "frames": manifest.get("frames"),
@@ -42,10 +43,11 @@ def write_tables(
     """Write rollouts.parquet, steps.parquet and summary.json and return the summary."""
     rows = rollout_rows(manifests)
     metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
-    write_table(root / "rollouts.parquet", rows, rollouts_schema(metrics))
+    of_logs = any("rollout" in row for row in rows)
+    write_table(root / "rollouts.parquet", rows, rollouts_schema(metrics, of_logs))
     parts = [pq.read_table(root / m["path"] / "steps.parquet") for m in manifests if m["status"] == "ok"]
     sink = pa.BufferOutputStream()
-    pq.write_table(pa.concat_tables(parts) if parts else STEPS_SCHEMA.empty_table(), sink, compression="zstd")
+    pq.write_table(pa.concat_tables(parts) if parts else steps_schema(of_logs).empty_table(), sink, compression="zstd")
     write_bytes(root / "steps.parquet", sink.getvalue().to_pybytes())
     summary = {
         "preset": preset,
@@ -54,7 +56,7 @@ def write_tables(
         "censoring": _by_policy(manifests, censoring),
         "failures": _failures(manifests),
         "fixers": _by_policy([m for m in manifests if m["status"] == "ok"], fixers),
-        "speed": _by_policy([m for m in manifests if m["status"] == "ok"], _speeds),
+        "speed": _by_policy([m for m in manifests if m["status"] == "ok" and m.get("stage_ms")], _speeds),
         "pool": _pool(root, manifests, threads, wall_s),
     }
     write_json(root / "summary.json", summary)

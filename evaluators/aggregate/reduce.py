@@ -174,7 +174,8 @@ def _reduce(one: MetricSeries, first_us: int, last_us: int, preset: Preset, drop
     value, valid = one.value[rows], one.valid[rows]
     if not len(value):
         return _value(one.name, None, "no value among the scored steps")
-    if not preset.honour_valid:
+    # Combined events have no value where a part is unknown; such rows are empty in AlpaSim's tables and never read.
+    if not preset.honour_valid and not info(one.name).derived:
         return _value(one.name, _REDUCE[one.aggregation](value, one.t_us[rows]))
     if one.aggregation == "last":
         return _value(one.name, float(value[-1])) if valid[-1] else _value(one.name, None, one.reason)

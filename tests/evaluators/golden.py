@@ -18,7 +18,7 @@ from scenarios.usdz import read_usdz_scene
 
 
 def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, Scene]:
-    return read_asl(log), read_usdz_scene(scene, rails)[0]
+    return read_asl(log), read_usdz_scene(scene, rails)
 
 
 def expected(log: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -1,0 +1,95 @@
+"""``simrun score``: score rollout logs again without rendering."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.cli.progress import describe
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.known_scenes import KnownScenes
+from alpasim_plugin.runtime.score_logs import find_logs
+from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
+from evaluators import preset as find_preset
+from evaluators.alpasim import EvalSettings, load_settings
+from evaluators.report import render_table
+
+EPILOG = """
+Examples:
+
+- `simrun score rollouts/SCENE/ROLLOUT/rollout.asl --scene scenes/SCENE.usdz --preset alpasim`
+
+- `simrun score 'rollouts/*/*/rollout.asl' --scene scenes --preset alpasim --settings eval-config.yaml --out scored`
+
+- `simrun score runs/smoke/rollouts/3dgs --scene suites/smoke --preset strict`
+"""
+
+
+def score(
+    logs: Annotated[list[str], typer.Argument(help="Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes.")],
+    scene: Annotated[
+        list[str], typer.Option("--scene", help="The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable.")
+    ],
+    preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
+    settings: Annotated[Path | None, typer.Option("--settings", help="AlpaSim's eval-config.yaml, with --preset alpasim.")] = None,
+    rails: Annotated[bool, typer.Option("--rails/--no-rails", help="Lanes by their rails, or their centres widened by 1.85 m.")] = True,
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after logs and preset.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run.
+
+    Rows name the log by its folder in the column `rollout`. With `--preset alpasim` AlpaSim's own aggregation and scene score are written
+    to `aggregate/` as well. Nothing in a log is ever unpickled.
+    """
+    del debug  # read from the command line by cli.main, before any option is parsed
+    chosen = find_preset(preset)
+    own = _settings(preset, settings)
+    if own is not None:
+        chosen = own.preset()
+    found = find_logs(logs)
+    done = 0
+
+    def on_done(manifest: dict[str, Any]) -> None:
+        nonlocal done
+        done += 1
+        if not (quiet or as_json):
+            print(f"[{done}/{len(found)}] {manifest['rollout']}: {describe(manifest, reused=False)}", file=sys.stderr, flush=True)
+
+    result = execute_score(found, KnownScenes(scene, rails), chosen, own, out, ["simrun", *sys.argv[1:]], on_done)
+    _print(result, as_json)
+    raise typer.Exit(result.exit_code)
+
+
+def _settings(preset: str, path: Path | None) -> EvalSettings | None:
+    """Return AlpaSim's settings where its preset is meant; its defaults where no file is given."""
+    if preset == "alpasim":
+        return EvalSettings() if path is None else load_settings(path)
+    if path is not None:
+        raise InputError(
+            "reading evaluation settings", f"--settings {path}", f"--preset {preset}", "add --preset alpasim: the file is AlpaSim's"
+        )
+    return None
+
+
+def _print(result: ScoreResult, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
+        return
+    Console().print(render_table(result.summary, headline_only=True))
+    for cell in result.summary["failures"]["cells"][:5]:
+        print(f"failed: {cell['error']['with']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
+    aggregation = result.summary.get("alpasim") or {}
+    if aggregation.get("skipped"):
+        print(f"AlpaSim's aggregation was not written: {aggregation['skipped']}", file=sys.stderr)
+    if aggregation.get("error"):
+        error = aggregation["error"]
+        print(f"error: {error['doing']}\n   with: {error['with']}\n  found: {error['found']}\n     do: {error['do']}", file=sys.stderr)
+    print(f"report  {shlex.quote(str(result.root / 'report.html'))}")

@@ -1,0 +1,181 @@
+"""Score rollout logs without rendering, and write the files of a run folder."""
+
+from __future__ import annotations
+
+import glob
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.runtime.known_scenes import KnownScenes
+from alpasim_plugin.runtime.plan import slug
+from alpasim_plugin.runtime.scoring import contacts_of, tabulated
+from alpasim_plugin.runtime.store import steps_schema, write_json, write_table
+from alpasim_plugin.types import RolloutLog
+from evaluators import reduce_rollout, score
+from evaluators.alpasim import ScoredRollout
+from evaluators.presets import Preset
+
+DOING = "scoring logs"
+UNKNOWN = "unknown"  # renderer or policy that a log does not name
+SKIPPED = "<skip>"
+
+
+@dataclass(frozen=True)
+class LogScore:
+    """What became of one log."""
+
+    manifest: dict[str, Any]
+    scored: ScoredRollout | None  # None where the log could not be scored
+
+
+def find_logs(items: Sequence[str]) -> list[Path]:
+    """Return the logs meant by files, folders (searched to any depth for ``*.asl``) and glob patterns, each once, sorted per item.
+
+    Raises:
+        InputError: An item names no log.
+    """
+    found: dict[Path, Path] = {}
+    for item in items:
+        path = Path(item)
+        paths = [path] if path.is_file() else sorted(path.rglob("*.asl")) if path.is_dir() else []
+        if not paths and glob.has_magic(item):
+            hits = [Path(hit) for hit in sorted(glob.glob(item, recursive=True))]
+            paths = [log for hit in hits for log in ([hit] if hit.is_file() else sorted(hit.rglob("*.asl")))]
+        if not paths:
+            what = "a folder without .asl logs" if path.is_dir() else "no such file, folder or match"
+            raise InputError("finding logs", item, what, "give rollout.asl files, folders that hold them, or a pattern in quotes")
+        for log in paths:
+            found.setdefault(log.resolve(), log)
+    return list(found.values())
+
+
+def score_logs(
+    logs: Sequence[Path], scenes: KnownScenes, preset: Preset, root: Path, on_done: Callable[[dict[str, Any]], None]
+) -> list[LogScore]:
+    """Score every log against its scene and write its steps and manifest.
+
+    A log that cannot be read, ended before its time, or could not be scored becomes a failed row; the others are scored all the same.
+
+    Raises:
+        InputError: A log of a scene that is not among the given ones, or a scene that cannot be read.
+    """
+    out: list[LogScore] = []
+    taken: set[str] = set()
+    for log in logs:
+        began = time.perf_counter()
+        one = _score(log, scenes, preset, root, taken)
+        one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
+        write_json(root / one.manifest["path"] / "manifest.json", one.manifest)
+        out.append(one)
+        on_done(one.manifest)
+    return out
+
+
+def _score(log: Path, scenes: KnownScenes, preset: Preset, root: Path, taken: set[str]) -> LogScore:
+    name = log.resolve().parent.name
+    manifest: dict[str, Any] = {
+        "renderer": UNKNOWN, "policy": UNKNOWN, "scene": UNKNOWN, "seed": 0, "rollout": name, "log": str(log), "preset": preset.name,
+        "reused": True,  # nothing was rendered: no frame of this table belongs to the speed of anything
+    }  # fmt: skip
+    try:
+        rollout = read_asl(log)
+    except InputError as error:
+        return _failed(manifest, error, root, taken)
+    versions = rollout.info["versions"]
+    manifest |= {
+        "renderer": _named(versions.get("sensorsim"), versions.get("video_model")),
+        "policy": _named(versions.get("egodriver")),
+        "scene": rollout.scene_id,
+        "seed": int(rollout.seed) & (2**63 - 1),
+        "session_uuid": rollout.session_uuid,
+        "frames": len(rollout.images),
+        "steps": len(rollout.ego),
+        "warnings": list(rollout.warnings),
+    }
+    known = scenes.of(rollout.scene_id)  # a wrong --scene is the command's fault, not the log's
+    try:
+        check_whole(log, rollout)
+        series = tuple(score(rollout, known.scene, preset))
+        one = tabulated(rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset))
+    except SimrunError as error:
+        return _failed(manifest, error, root, taken)
+    manifest |= {"status": "ok", "metrics": one.metrics, "events": one.events, "censored": one.censored}
+    manifest |= {"contacts": one.contacts, "path": _folder(manifest, taken)}
+    keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
+    write_table(root / manifest["path"] / "steps.parquet", [keys | row for row in one.steps], steps_schema(of_logs=True))
+    run_uuid, run_name = run_names(log)
+    return LogScore(manifest, ScoredRollout(rollout.scene_id, name, series, run_uuid, run_name))
+
+
+def check_whole(log: Path, rollout: RolloutLog) -> None:
+    """Refuse the log of a rollout that did not come to its end.
+
+    The end is the announced number of control steps after the first policy time, or as far as the recording goes. A rollout that the
+    driver ended itself is whole.
+
+    Raises:
+        InfrastructureError: The log ends earlier.
+    """
+    if rollout.info["terminated"] or rollout.control_us <= 0 or len(rollout.ego) < 2:
+        return
+    first, last = int(rollout.ego.t_us[1]), int(rollout.ego.t_us[-1])
+    recorded = (int(rollout.ego_log.t_us[-1]) - first) // rollout.control_us
+    steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
+    done = (last - first) // rollout.control_us
+    if done < steps:
+        cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
+        raise InfrastructureError(
+            "scoring a log", str(log), f"the rollout ended after {done} of {steps} control steps{cut}",
+            "run this rollout again: what it would have done after that is unknown",
+        )  # fmt: skip
+
+
+def run_names(log: Path) -> tuple[str | None, str | None]:
+    """Return uuid and name of the run that a log belongs to, of the ``run_metadata.yaml`` in the nearest folder above it.
+
+    Raises:
+        InputError: The file is there, but broken.
+    """
+    from alpasim_plugin.config import load_yaml
+
+    for folder in list(log.resolve().parents)[:5]:
+        path = folder / "run_metadata.yaml"
+        if path.is_file():
+            data = load_yaml(path, "reading the names of a run").data
+            names = [data.get(key) if isinstance(data, dict) else None for key in ("run_uuid", "run_name")]
+            return tuple(None if name is None else str(name) for name in names)  # type: ignore[return-value]
+    return None, None
+
+
+def _failed(manifest: dict[str, Any], error: SimrunError, root: Path, taken: set[str]) -> LogScore:
+    manifest |= {"status": "failed", "error": error.as_dict(), "path": _folder(manifest, taken)}
+    return LogScore(manifest, None)
+
+
+def _folder(manifest: dict[str, Any], taken: set[str]) -> str:
+    """Return the folder of a log's results, relative to the run folder; logs with the same names get numbers."""
+    base = "/".join(["rollouts", *(slug(str(manifest[key])) for key in ("renderer", "policy", "scene", "rollout"))])
+    path, n = base, 2
+    while path in taken:
+        path, n = f"{base}-{n}", n + 1
+    taken.add(path)
+    return path
+
+
+def _named(*versions: str | None) -> str:
+    return next((text for text in versions if text and text != SKIPPED), UNKNOWN)
+
+
+def exit_code(scores: Sequence[LogScore], failures_allowed: bool, aggregate_error: EvaluatorError | None) -> int:
+    """Return the process exit code: 2 for a log that cannot be read, 5 for one that cannot be scored, 4 for a rollout cut short."""
+    classes = {one.manifest["error"]["failure_class"] for one in scores if one.manifest["status"] != "ok"}
+    if "input" in classes:
+        return 2
+    if "evaluator" in classes or aggregate_error is not None:
+        return 5
+    return 4 if classes and not failures_allowed else 0

@@ -1,0 +1,198 @@
+"""A scored set of logs as a run folder: tables, AlpaSim's aggregation, reports."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from alpasim_plugin.errors import EvaluatorError, InputError
+from alpasim_plugin.runtime.execute import Threads
+from alpasim_plugin.runtime.known_scenes import KnownScenes
+from alpasim_plugin.runtime.plan import digest, slug
+from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runtime.run import SCHEMA_VERSION
+from alpasim_plugin.runtime.scene_dump import scene_as_json
+from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
+from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
+from alpasim_plugin.runtime.tables import write_tables
+from evaluators.aggregate.reduce import RolloutValue
+from evaluators.alpasim import (
+    EvalSettings,
+    SceneScore,
+    metrics_results_table,
+    metrics_unprocessed_table,
+    over_sweeps,
+    reduce_run,
+    results_summary,
+    scene_score,
+)
+from evaluators.metrics import info
+from evaluators.presets import Preset
+from evaluators.report import write_junit, write_report, write_summary_md
+
+AGGREGATE = "aggregate"
+
+
+@dataclass(frozen=True)
+class ScoreResult:
+    """What scoring came to; the process exit code and what is printed come from here."""
+
+    root: Path
+    summary: dict[str, Any]
+    exit_code: int
+
+
+def execute_score(
+    logs: Sequence[Path],
+    scenes: KnownScenes,
+    preset: Preset,
+    settings: EvalSettings | None,
+    root: Path | None,
+    command: Sequence[str],
+    on_done: Callable[[dict[str, Any]], None],
+) -> ScoreResult:
+    """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its aggregation.
+
+    Args:
+        logs: The logs.
+        scenes: Where their scenes are.
+        preset: How to score.
+        settings: AlpaSim's settings; None where the preset is not AlpaSim's.
+        root: Run folder; None makes one below ``runs/`` named after content and preset.
+        command: The command line, for run.json.
+        on_done: Called with each log's manifest.
+
+    Raises:
+        InputError: The folder holds other results, or a log's scene is not among ``scenes``.
+    """
+    began = time.perf_counter()
+    key = digest({"logs": sorted(_hash(log) for log in logs), "scenes": scenes.places, "preset": preset.as_dict()})[:12]
+    root = root or Path("runs", f"score-{slug(logs[0].resolve().parent.parent.name)}-{key}")
+    held = read_json(root / "run.json").get("key") if (root / "run.json").exists() else None
+    if held not in (None, key):
+        raise InputError("scoring logs", f"folder {root}", f"it holds other results (key {held})", "choose another --out")
+    scores = score_logs(logs, scenes, preset, root, on_done)
+    aggregation: dict[str, Any] | None = None
+    error: EvaluatorError | None = None
+    if settings is not None:
+        aggregation, error = _aggregate(scores, preset, settings, root)
+    manifests = [one.manifest for one in scores]
+    _write_info(root, key, scores, scenes, preset, settings, command)
+    summary = write_tables(root, manifests, preset.name, None, Threads(1, 1), time.perf_counter() - began)
+    code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
+    summary |= {"exit_code": code} | ({} if aggregation is None else {"alpasim": aggregation})
+    write_json(root / "summary.json", summary)
+    write_summary_md(root)
+    write_junit(root)
+    write_report(root)
+    return ScoreResult(root, summary, code)
+
+
+def _aggregate(
+    scores: Sequence[LogScore], preset: Preset, settings: EvalSettings, root: Path
+) -> tuple[dict[str, Any], EvaluatorError | None]:
+    """Aggregate as AlpaSim does, put its rollout values into the manifests, and write its files."""
+    good = [one for one in scores if one.scored is not None]
+    failed = [one.manifest for one in scores if one.scored is None]
+    written: list[str] = []
+    error: EvaluatorError | None = None
+    skipped = ""
+    if failed and not settings.allow_aggregation_with_failed_rollouts:
+        skipped = f"{len(failed)} of {len(scores)} rollouts failed, and allow_aggregation_with_failed_rollouts is false"
+    if good:
+        try:
+            reduced = reduce_run([one.scored for one in good if one.scored is not None], preset)
+            marks = _scores(reduced, settings) if settings.scene_score.enabled else {}
+        except EvaluatorError as failure:
+            error, marks = failure, {}
+            reduced = reduce_run([one.scored for one in good if one.scored is not None], preset) if "scene score" in failure.doing else []
+        for i, one in enumerate(reduced):
+            values = dict(one.reduction.values)
+            if i in marks:
+                facts = info("scene_score")
+                values["scene_score"] = RolloutValue(marks[i].score, True, "", facts.unit, facts.direction)
+            good[i].manifest["metrics"] = {name: dict(value.__dict__) for name, value in values.items()}
+            good[i].manifest["scene_score"] = None if i not in marks else {"failure_reason": marks[i].failure_reason}
+        if reduced and not skipped:
+            own = [one.of for one in reduced]
+            sweeps = over_sweeps(reduced)
+            _write_parquet(root / AGGREGATE / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
+            _write_parquet(root / AGGREGATE / "metrics_results.parquet", metrics_results_table(sweeps, own))
+            written += ["metrics_unprocessed.parquet", "metrics_results.parquet"]
+            if error is None:
+                rows = [_failure(m, own[0].run_name) for m in failed]
+                write_json(root / AGGREGATE / "results-summary.json", results_summary(reduced, marks, rows, sweeps, settings.scene_score))
+                written.append("results-summary.json")
+    return {"folder": AGGREGATE, "files": written, "skipped": skipped, "error": error.as_dict() if error else None}, error
+
+
+def _scores(reduced: Sequence[Any], settings: EvalSettings) -> dict[int, SceneScore]:
+    return {i: scene_score(one.values, settings.scene_score) for i, one in enumerate(reduced) if not one.dropped}
+
+
+def _failure(manifest: dict[str, Any], run_name: str | None) -> dict[str, Any]:
+    ids = {"clipgt_id": manifest["scene"], "rollout_id": manifest["rollout"], "run_uuid": None, "run_name": run_name}
+    return ids | {"error": manifest["error"]["found"]}
+
+
+def _write_info(
+    root: Path,
+    key: str,
+    scores: Sequence[LogScore],
+    scenes: KnownScenes,
+    preset: Preset,
+    settings: EvalSettings | None,
+    command: Sequence[str],
+) -> None:
+    used = {one.manifest["scene"]: scenes.of(one.manifest["scene"]) for one in scores if one.scored is not None}
+    for scene_id, scene in used.items():
+        write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scene))
+
+    def names(column: str) -> list[Any]:
+        return list(dict.fromkeys(one.manifest[column] for one in scores))
+
+    write_json(
+        root / "run.json",
+        {
+            "schema_version": SCHEMA_VERSION,
+            "kind": "score",
+            "key": key,
+            "command": list(command),
+            "version": versions()["alpasim-onefixer"],
+            "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "config": {"preset": preset.as_dict(), "settings": None if settings is None else settings.model_dump(mode="json")},
+            "preset": preset.name,
+            "renderers": names("renderer"),
+            "policies": names("policy"),
+            "seeds": names("seed"),
+            "logs": names("log"),
+            "scenes": {
+                name: {"source": one.source, "content_hash": one.content_hash, "notes": list(one.notes)} for name, one in used.items()
+            },
+            "weights": {},
+            "hardware": hardware(),
+            "versions": versions(),
+            "left_out": sorted({note for one in used.values() for note in one.notes}),
+        },
+    )
+
+
+def _hash(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError("scoring logs", str(path), f"cannot open: {error.strerror}", "check the path") from error
+
+
+def _write_parquet(path: Path, table: pa.Table) -> None:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd")
+    write_bytes(path, sink.getvalue().to_pybytes())

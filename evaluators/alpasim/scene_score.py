@@ -1,0 +1,54 @@
+"""AlpaSim's score of a rollout: 0 after a fault, else how much of the recorded path was driven."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from alpasim_plugin.errors import EvaluatorError
+from evaluators.alpasim.settings import SceneScoreSettings
+
+NEEDED = ("progress_clipped_rel", "gt_dist_traveled_m", "collision_at_fault", "offroad")
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """Score of one rollout."""
+
+    score: float  # 0..1
+    progress_score: float  # 0..1, what the score would be without a fault
+    failure_reason: str | None  # collision_at_fault | offroad
+
+    @property
+    def passed(self) -> bool:
+        """Tell whether no fault happened, whatever the progress."""
+        return self.failure_reason is None
+
+
+def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings) -> SceneScore:
+    """Score a rollout: ``min(clip(progress, 0, 1) / saturation, 1)``, 1 on recordings shorter than the least distance, 0 after a fault.
+
+    Args:
+        values: Rollout values by metric.
+        settings: Saturation and least distance.
+
+    Raises:
+        EvaluatorError: A metric that is needed is missing or not finite; AlpaSim stops there too.
+    """
+    found: dict[str, float] = {}
+    for name in NEEDED:
+        value = values.get(name)
+        if name not in values or value is None or not np.isfinite(value):
+            what = f"missing metric {name!r}" if name not in values else f"metric {name!r} is {value}"
+            raise EvaluatorError(
+                "computing the scene score", f"metrics {', '.join(NEEDED)}", what,
+                "give the scene a map with road edges, or set scene_score.enabled: false in --settings",
+            )  # fmt: skip
+        found[name] = float(value)
+    progress = min(min(max(found["progress_clipped_rel"], 0.0), 1.0) / settings.progress_saturation_threshold, 1.0)
+    if found["gt_dist_traveled_m"] < settings.min_gt_distance_for_full_score_m:
+        progress = 1.0
+    reason = next((name for name in ("collision_at_fault", "offroad") if found[name] != 0.0), None)
+    return SceneScore(0.0 if reason else progress, progress, reason)
