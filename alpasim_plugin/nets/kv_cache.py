@@ -68,13 +68,11 @@ class BlockCache(ABC):
         """
         self.open_latents = latents
         at, table = self._tables.get(latents, (-1, None))
-        if table is None or at != self.position:
-            fresh = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
-            if table is None or self.keeps_graph:  # gradients of earlier blocks still need their own rotation
-                table = fresh
-            else:
-                for kept, new in zip(table, fresh, strict=True):
-                    kept.copy_(new)
+        with torch.inference_mode(False):  # what is made in inference mode could not be written to outside of it
+            if table is None or (at != self.position and self.keeps_graph):  # gradients of earlier blocks still need their own rotation
+                table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
+            elif at != self.position:
+                self.rope.move(table, self.position, latents)
         self._tables[latents] = (self.position, table)
         return table
 
@@ -123,16 +121,23 @@ class RollingCache(BlockCache):
         self.size = window
         self.layout = (layers, heads, dtype)
         shape = (layers, batch, window * self.tokens, heads, rope.head_width)
-        self.keys = torch.zeros(shape, device=device, dtype=dtype)
-        self.values = torch.zeros(shape, device=device, dtype=dtype)
-        self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows that the open block's tokens go to
+        with torch.inference_mode(False):
+            self.keys = torch.zeros(shape, device=device, dtype=dtype)
+            self.values = torch.zeros(shape, device=device, dtype=dtype)
+            self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows that the open block's tokens go to
         self._source: Tensor | None = None  # which of the block's tokens those are; None for all
+        self._chosen = (0, 0)  # latents kept and length of the block that the rows were chosen for
         self._fits = True
 
     @property
     def nbytes(self) -> int:
         """Bytes of the buffers."""
         return 2 * self.keys.numel() * self.keys.element_size()
+
+    @property
+    def in_sight(self) -> int:
+        """Latents that the open block attends to; it grows until the window is full, then stays."""
+        return min(self.size, self.filled + self.open_latents)
 
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
@@ -146,6 +151,9 @@ class RollingCache(BlockCache):
             do = "repeat a block with its first length (its forwards share slots), or write it, or reset the cache"
             raise InputError("opening a block of a rolling cache", f"window {self.window}, sink {self.sink}", found, do)
         table = super().begin(latents)
+        if self._chosen == (self.filled, latents):  # opened again: nothing goes to the device
+            return table
+        self._chosen = (self.filled, latents)
         ring = self.size - self.sink
         own = range(self.filled, self.filled + latents)
         rolling = [i for i in own if i >= self.sink]
@@ -154,11 +162,12 @@ class RollingCache(BlockCache):
         kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
         self._source = None if self._fits else self._token_rows([i - self.filled for i in kept]).to(self.device)
-        rows = self._token_rows(slots)
-        if self._rows.shape == rows.shape:
-            self._rows.copy_(rows)
-        else:
-            self._rows = rows.to(self.device)
+        with torch.inference_mode(False):
+            rows = self._token_rows(slots)
+            if self._rows.shape == rows.shape:
+                self._rows.copy_(rows)
+            else:
+                self._rows = rows.to(self.device)
         return table
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
@@ -168,7 +177,7 @@ class RollingCache(BlockCache):
         for buffer, own in ((keys, own_k), (values, own_v)):
             buffer.index_copy_(1, self._rows, own if self._source is None else own[:, self._source])
         if self._fits:
-            end = min(self.size, self.filled + self.open_latents) * self.tokens
+            end = self.in_sight * self.tokens
             return attend(q, keys[:, :end], values[:, :end])
         past = min(self.sink, self.filled) * self.tokens
         return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
@@ -217,6 +226,20 @@ class GraphCache(BlockCache):
             self._kept.setdefault(layer, []).extend(pairs)
         self._open = {}
         super().commit()
+
+    def fork(self) -> GraphCache:
+        """Return a cache with the same past, cut from its gradients; the two never meet again.
+
+        Raises:
+            InputError: In the middle of a block.
+        """
+        if self.open_latents:
+            do = "keep the block first, or reset the cache"
+            raise InputError("forking a cache", f"latent {self.position}", "a block with forwards that were not kept", do)
+        copy = GraphCache(self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device)
+        copy.position, copy.filled = self.position, self.filled
+        copy._kept = {layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()}
+        return copy
 
     def detach(self) -> None:
         """Cut the gradients of everything kept so far: blocks that follow send none beyond this point."""

@@ -145,3 +145,35 @@ def test_every_wrong_input_is_named():
     for args, message in bad:
         with pytest.raises(InputError, match=message):
             net(*args)
+
+
+@pytest.mark.parametrize("made_inside", [True, False])
+def test_inference_mode_may_begin_and_end_anywhere(made_inside):
+    net, (x, t, text, hdmap) = network(), clip(8)
+    expected = stream(net, net.new_cache(1, 4, 6, 4), x, t, text, hdmap, (2, 2, 2, 2))
+    with torch.inference_mode(made_inside):
+        cache = net.new_cache(1, 4, 6, 4)
+    out = []
+    for start in range(0, 8, 2):
+        cut = slice(start, start + 2)
+        with torch.inference_mode((start // 2 % 2 == 0) == made_inside):
+            out.append(net.step(x[:, :, cut], t[:, cut], text, hdmap[:, :, cut], cache))
+    assert torch.equal(torch.cat(out, 2), expected)
+
+
+def test_reopened_block_sends_nothing_to_the_device_and_a_moved_rotation_is_a_new_one():
+    net = network()
+    cache = net.new_cache(1, 4, 6, 4)
+    cache.begin(2)
+    for position in (0, 2, 126, 10_000):
+        cache.reset(position)
+        table = cache.begin(2)
+        for moved, new in zip(table, net.rope.table(position, 2, 2, 3), strict=True):
+            assert torch.equal(moved, new)
+    made = []
+    cache._token_rows, kept = (lambda latents: made.append(latents)), cache._token_rows
+    cache.begin(2)
+    assert not made
+    cache._token_rows = kept
+    cache.commit()
+    assert (cache.in_sight, cache.begin(2) is table, cache.in_sight) == (2, True, 4)
