@@ -1,0 +1,59 @@
+"""The perceptual term of the shared rollout: decode one position causally, compare its frames with equally decoded clean ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.nets.carry import State
+from alpasim_plugin.nets.clips import GROUP
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+
+Distance = Callable[[Tensor, Tensor], Tensor]  # frames (F, 3, H, W) in [-1, 1], twice -> (F,)
+
+
+@dataclass(frozen=True)
+class DecodedDistance:
+    """Decode position w of the predictions and of the clean latents, and average a distance over its frames.
+
+    The decoder's memory of what came before w is made without gradients: truncation distance 1 (paper, App. A.3).
+
+    Args:
+        decoder: Frozen.
+        distance: Frozen, differentiable in its first argument.
+        z_0: ``(B, C, N, H, W)`` clean latents.
+        render: ``(B, 3, 1 + 4 (N - 1), 8H, 8W)`` render's frames for a decoder that sees them, or None.
+        opacity: ``(B, 1, ...)`` their opacity, or None.
+    """
+
+    decoder: TinyVAE
+    distance: Distance
+    z_0: Tensor
+    render: Tensor | None = None
+    opacity: Tensor | None = None
+
+    def __call__(self, predicted: Tensor, w: int) -> Tensor:
+        """Return the mean distance of position ``w``'s frames; ``predicted`` reaches at least to w."""
+        with torch.no_grad():
+            wanted = self._decode(self.z_0, w)
+        made = self._decode(predicted, w)
+        return self.distance(_frames(made), _frames(wanted)).mean()
+
+    def _decode(self, z: Tensor, w: int) -> Tensor:
+        state, end = None, 0
+        if w > 0:
+            end = 1 + GROUP * (w - 1)
+            with torch.no_grad():
+                state = self._part(z[:, :, :w].detach(), None, slice(0, end))[1]
+        return self._part(z[:, :, w : w + 1], state, slice(end, 1 + GROUP * w))[0]
+
+    def _part(self, z: Tensor, state: State | None, frames: slice) -> tuple[Tensor, State]:
+        render, opacity = (None if x is None else x[:, :, frames] for x in (self.render, self.opacity))
+        return self.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
+
+
+def _frames(video: Tensor) -> Tensor:
+    return video.transpose(1, 2).flatten(0, 1)

@@ -1,0 +1,236 @@
+"""OneFixer's training objectives on one shared rollout (paper, Sec. 3.2 and 3.3).
+
+    rollout         z^i_0 = G(z^i_1 | sg(z^<i_0), c^i)                   the deployed generator, block by block
+    flow matching   | v(z^i_t, t | sg(z^<i_0), c^i) - (z^i_1 - z^i_0) |^2   at every position, with the rollout as its history
+    perceptual      d( D(z^w_0), D(clean^w) )                            at one sampled position w, through the last k predictions
+
+Names as in the paper: ``z_r`` render, ``z_0`` clean, ``z_1`` source, ``m`` mask, ``eps`` noise, ``sg`` stop-gradient. Latents are
+``(B, C, N, H, W)``, normalised. Every random number is an argument. What the history holds of a block are the keys and values of its
+clean latents, slightly noised (`sampling.finalise`), as at deployment; their gradient reaches the weights, not the latents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.dit import CosmosCausalDiT, TextContext
+from alpasim_plugin.nets.kv_cache import GraphCache
+from alpasim_plugin.nets.sampling import finalise, flow_step, interpolant, mixed_source
+
+FlowHistory = Literal["own", "clean", "redenoised"]
+Perceptual = Callable[[Tensor, int], Tensor]  # predictions (B, C, N, H, W), position w -> scalar
+T_SOURCE = 1000.0  # what the network is told at t = 1
+
+
+@dataclass(frozen=True)
+class Objectives:
+    """What is minimised, and on which history: the axes of the paper's ablation.
+
+    Args:
+        flow: History of flow matching: the model's ``own`` predictions, the ``clean`` latents (diffusion forcing), clean latents that
+            the model noised and denoised again (``redenoised``), or None for no flow matching.
+        horizon: k, how many latent positions ending at w the perceptual gradient passes through; 0 for no perceptual term.
+        weight: lambda, of the perceptual term.
+        use_map: Whether the network sees the semantic map.
+        mixed: Whether the source is Eq. 1; otherwise it is noise, and the render's latents are joined to the map's as further channels.
+    """
+
+    flow: FlowHistory | None = "own"
+    horizon: int = 4
+    weight: float = 10.0
+    use_map: bool = True
+    mixed: bool = True
+
+    def __post_init__(self) -> None:
+        if self.flow is None and not self.horizon:
+            raise InputError("choosing objectives", "flow None, horizon 0", "nothing to minimise", "switch one of them on")
+        if self.horizon < 0 or self.weight < 0:
+            found = f"horizon {self.horizon}, weight {self.weight}"
+            raise InputError("choosing objectives", "the perceptual term", found, "give values of at least 0")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A batch of clips as latents, and all the noise that its training takes.
+
+    Args:
+        z_r, z_0: Render and clean frames ``(B, C, N, H, W)``.
+        z_map: Semantic map, like ``z_0``.
+        m: ``(B, 1, N, H, W)`` mask of Eq. 1.
+        eps: Noise of the source, like ``z_0``.
+        eps_context: Noise of the cache write, like ``z_0``.
+        t: ``(B, N)`` uniform in 0..1, flow matching's times.
+        t_again: ``(B, N)`` uniform in 0..1, the noise levels of re-denoised history.
+        w: Position of the perceptual term.
+    """
+
+    z_r: Tensor
+    z_0: Tensor
+    z_map: Tensor
+    m: Tensor
+    eps: Tensor
+    eps_context: Tensor
+    t: Tensor
+    t_again: Tensor
+    w: int
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Terms of one sample.
+
+    Args:
+        total: What is minimised.
+        flow: Mean over everything; None if off.
+        perceptual: Without its weight; None if off.
+        rollout: ``(B, C, N, H, W)`` the model's own predictions, cut from gradients; None if no objective needed them.
+        seen: The predictions up to w as the perceptual term met them, block by block, before the horizon cuts them.
+    """
+
+    total: Tensor
+    flow: Tensor | None
+    perceptual: Tensor | None
+    rollout: Tensor | None
+    seen: tuple[Tensor, ...] = ()
+
+
+def losses(
+    net: CosmosCausalDiT,
+    sample: Sample,
+    text: Tensor | TextContext,
+    objectives: Objectives,
+    perceptual: Perceptual | None = None,
+    *,
+    block_latents: int = 2,
+    window: int | None = 12,
+) -> Losses:
+    """Return the objectives of one batch of clips, all on the same rollout.
+
+    Args:
+        net: The generator.
+        sample: Latents and noise.
+        text: Prompt.
+        objectives: Which terms.
+        perceptual: Decodes the predictions causally and compares position w with the clean frames; needed if ``objectives.horizon``.
+        block_latents, window: As at deployment, in latents.
+
+    Raises:
+        InputError: A perceptual term without its function, or w outside the clip.
+    """
+    n = sample.z_0.shape[2]
+    if objectives.horizon and perceptual is None:
+        raise InputError("training on a shared rollout", "the perceptual term", "no function that measures it", "give one, or horizon=0")
+    if not 0 <= sample.w < n:
+        raise InputError("training on a shared rollout", f"w = {sample.w}", f"{n} latents", "sample w within the clip")
+    rollout = _Rollout(net, sample, text, objectives, block_latents, window)
+    history = rollout.history()
+    flow = None if objectives.flow is None else rollout.flow_matching(history)
+    seen: tuple[Tensor, ...] = ()
+    perc = None
+    if objectives.horizon:
+        assert perceptual is not None
+        seen = rollout.predictions_with_gradient()
+        perc = perceptual(torch.cat([rollout.cut(z, b) for z, b in zip(seen, rollout.blocks, strict=False)], dim=2), sample.w)
+    terms = [term for term in (flow, None if perc is None else objectives.weight * perc) if term is not None]
+    return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, seen)
+
+
+class _Rollout:
+    """One batch on its way through the generator; the methods are the equations, the attributes what they share."""
+
+    def __init__(
+        self, net: CosmosCausalDiT, s: Sample, text: Tensor | TextContext, objectives: Objectives, block_latents: int, window: int | None
+    ) -> None:
+        self.net, self.s, self.text, self.objectives = net, s, text, objectives
+        n = s.z_0.shape[2]
+        self.blocks = [slice(i, min(i + block_latents, n)) for i in range(0, n, block_latents)]
+        self.window = window
+        self.z_1 = mixed_source(s.z_r, s.m, s.eps) if objectives.mixed else s.eps
+        z_map = s.z_map if objectives.use_map else torch.zeros_like(s.z_map)
+        self.condition = z_map if objectives.mixed else torch.cat([z_map, s.z_r], dim=1)
+        self.first = max(s.w - objectives.horizon + 1, 0)  # first position whose prediction keeps its gradient
+        self.predicted: Tensor | None = None
+        self._before: GraphCache | None = None  # the rollout's cache before the block that holds ``first``
+
+    def history(self) -> Tensor | None:
+        """Return the history of flow matching ``(B, C, N, H, W)`` without gradients, and roll out where anything needs it."""
+        with torch.no_grad():
+            if self.objectives.flow == "own" or self.objectives.horizon:
+                self.predicted = self._roll(self.generate, fork_at=self.first)
+            if self.objectives.flow == "redenoised":
+                return self._roll(self._denoise_again)
+        return self.s.z_0 if self.objectives.flow == "clean" else self.predicted
+
+    def generate(self, b: slice, cache: GraphCache) -> Tensor:
+        """Predict a block in one step from its source (Eq. 2); leaves the block open."""
+        v = self.net.step(self.z_1[:, :, b], T_SOURCE, self.text, self.condition[:, :, b], cache, write=False)
+        return flow_step(self.z_1[:, :, b], v)
+
+    def flow_matching(self, history: Tensor | None) -> Tensor:
+        """Return the mean error of the velocity over all positions, each at its random time, given the history."""
+        assert history is not None
+        s, cache, errors = self.s, self._new_cache(), []
+        t = s.t[:, None, :, None, None]
+        z_t = interpolant(s.z_0, self.z_1, t)
+        for b in self.blocks:
+            v = self.net.step(z_t[:, :, b], T_SOURCE * s.t[:, b], self.text, self.condition[:, :, b], cache, write=False)
+            errors.append((v - (self.z_1 - s.z_0)[:, :, b]).square().mean(dim=(0, 1, 3, 4)))
+            self._write(history[:, :, b], b, cache)
+        return torch.cat(errors).mean()
+
+    def predictions_with_gradient(self) -> tuple[Tensor, ...]:
+        """Return the predictions of the blocks up to w's, with gradients from the block of the horizon's first position on.
+
+        The values are those of the rollout: the same network on the same sources and history. What lies before the horizon is cut before it
+        enters the history.
+        """
+        assert self.predicted is not None
+        assert self._before is not None
+        cache = self._before
+        out: list[Tensor] = []
+        for b in self.blocks:
+            if b.start > self.s.w:
+                break
+            if b.stop <= self.first:
+                out.append(self.predicted[:, :, b])
+                continue
+            out.append(self.generate(b, cache))
+            self._write(self.cut(out[-1], b), b, cache)
+        return tuple(out)
+
+    def cut(self, z: Tensor, b: slice) -> Tensor:
+        """Return a block's predictions with those before the horizon cut from their gradients."""
+        outside = min(max(self.first - b.start, 0), z.shape[2])
+        return torch.cat([z[:, :, :outside].detach(), z[:, :, outside:]], dim=2)
+
+    def _roll(self, make: Callable[[slice, GraphCache], Tensor], fork_at: int | None = None) -> Tensor:
+        """Make block after block, each with those before as its history; remember the cache before the block that holds ``fork_at``."""
+        cache, parts = self._new_cache(), []
+        for b in self.blocks:
+            if fork_at is not None and b.start <= fork_at < b.stop:
+                self._before = cache.fork()
+            parts.append(make(b, cache))
+            self._write(parts[-1], b, cache)
+        return torch.cat(parts, dim=2)
+
+    def _denoise_again(self, b: slice, cache: GraphCache) -> Tensor:
+        """Noise the clean latents to a random level and let the model denoise them, given what it has so denoised before."""
+        t = self.s.t_again[:, b]
+        z_t = interpolant(self.s.z_0[:, :, b], self.z_1[:, :, b], t[:, None, :, None, None])
+        v = self.net.step(z_t, T_SOURCE * t, self.text, self.condition[:, :, b], cache, write=False)
+        return flow_step(z_t, v, t[:, None, :, None, None])
+
+    def _write(self, z: Tensor, b: slice, cache: GraphCache) -> None:
+        finalise(self.net, z, self.s.eps_context[:, :, b], self.text, self.condition[:, :, b], cache)
+
+    def _new_cache(self) -> GraphCache:
+        b, _, _, h, w = self.s.z_0.shape
+        cache = self.net.new_cache(b, h, w, self.window, keeps_graph=True)
+        assert isinstance(cache, GraphCache)
+        return cache
