@@ -16,6 +16,7 @@ from evaluators.aggregate.paired import paired
 from evaluators.aggregate.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
 from evaluators.aggregate.summary import aggregate
 from evaluators.base import EVALUATORS, score
+from evaluators.collision import ContactEvent, contact_events
 from evaluators.metrics import METRICS, MetricInfo
 from evaluators.presets import PRESETS, Preset, preset
 
@@ -26,12 +27,14 @@ __all__ = [
     "EVALUATORS",
     "METRICS",
     "PRESETS",
+    "ContactEvent",
     "MetricInfo",
     "Preset",
     "Reduction",
     "RolloutValue",
     "aggregate",
     "censoring",
+    "contact_events",
     "paired",
     "preset",
     "reduce_rollout",

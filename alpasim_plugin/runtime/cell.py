@@ -127,7 +127,7 @@ def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) ->
     scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset)
     keys = {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed}
     write_table(folder / "steps.parquet", [keys | row for row in scored.steps], STEPS_SCHEMA)
-    return {"metrics": scored.metrics, "events": scored.events, "censored": scored.censored}
+    return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
 
 
 @lru_cache(maxsize=4)
