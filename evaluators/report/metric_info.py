@@ -1,4 +1,4 @@
-"""What a reader needs to know about a metric: its place in the tables, one line of meaning, and whether it is a rate.
+"""How a metric is shown. What it means stands in `evaluators.metrics` alone.
 
 Unit and direction come with the numbers in ``summary.json``; a metric of a third party that this process has not loaded is shown all
 the same, without a line of meaning.
@@ -11,31 +11,12 @@ from collections.abc import Iterable
 from evaluators.metrics import METRICS
 
 # What the report leads with; the other metrics are one click away.
-HEADLINE = ("collision_at_fault", "collision_any", "offroad", "route_distance_m", "progress")
-
-ORDER = (
-    *HEADLINE,
-    "collision_front",
-    "collision_lateral",
-    "collision_rear",
-    "offroad_or_collision",
-    "offroad_or_collision_at_fault",
-    "wrong_lane",
-    "offroad_margin_m",
-    "min_distance_to_obstacle_m",
-    "min_distance_to_lane_boundary_m",
-    "dist_to_gt_trajectory",
-    "dist_to_gt_location",
-    "plan_deviation",
-    "progress_rel",
-)
-
-SHARES = ("progress", "progress_rel", "progress_rel_to_total", "progress_clipped_rel")  # fractions, not counts of rollouts
+HEADLINE = tuple(name for name, facts in METRICS.items() if facts.is_headline)
 
 
 def ordered(names: Iterable[str]) -> list[str]:
-    """Sort metric names: the known ones as in `ORDER`, then the others by name."""
-    rank = {name: index for index, name in enumerate(ORDER)}
+    """Sort metric names: headline ones, then the known ones in the order of `METRICS`, then the others by name."""
+    rank = {name: index for index, name in enumerate((*HEADLINE, *(name for name in METRICS if name not in HEADLINE)))}
     return sorted(set(names), key=lambda name: (rank.get(name, len(rank)), name))
 
 
@@ -51,4 +32,4 @@ def is_rate(name: str, unit: str) -> bool:
 
 def in_percent(name: str, unit: str) -> bool:
     """Tell whether a metric is printed in percent: rates, and shares without a unit."""
-    return is_rate(name, unit) or (not unit and name in SHARES)
+    return is_rate(name, unit) or (not unit and name in METRICS and METRICS[name].is_share)
