@@ -167,10 +167,10 @@ def depth_by_points(corners: F64, rings: Sequence[Ring], n: int = 24) -> tuple[f
     for start in sorted(grid, reverse=True)[:3]:
         value, u, v = start
         step = 0.5 / n
-        while step > 1e-9:
+        while step > 2e-8:
             around = [(min(max(u + i * step, 0.0), 1.0), min(max(v + j * step, 0.0), 1.0)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
             value, u, v = max((at(p, q), p, q) for p, q in around)
-            step /= 1.5
+            step /= 2
         best = max(best, value)
     return best, upper
 

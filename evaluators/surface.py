@@ -151,7 +151,7 @@ def closed_union(areas: Geometries, seam_m: float) -> Any:
     border by hairs; those are told from gaps by being open to the outside along much of their outline, and are left out, so that the
     outer border is the map's own.
     """
-    shape = shapely.union_all(areas, grid_size=_GRID_M)
+    shape = shapely.union_all(areas[~shapely.is_empty(areas)], grid_size=_GRID_M)
     if seam_m <= 0 or shapely.is_empty(shape):
         return shape
     radius_m = 0.505 * seam_m  # arcs are drawn as polygons inside the circle; a gap of seam_m must close all the same
