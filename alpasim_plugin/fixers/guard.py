@@ -26,12 +26,13 @@ def failures(video: Tensor) -> list[str]:
         T events, "" where a frame is fine.
     """
     low, high = (x.float() for x in (video.amin((0, 2, 3)), video.amax((0, 2, 3))))  # NaN anywhere in a frame is the result
-    events = np.where((low.isfinite() & high.isfinite()).cpu().numpy(), "", NAN)
-    beyond = ((low < -LIMIT) | (high > LIMIT)).cpu().numpy() & (events == "")
-    for t in np.flatnonzero(beyond):
-        if float((video[:, t].abs() > LIMIT).float().mean()) > SHARE:
+    finite = (low.isfinite() & high.isfinite()).tolist()
+    beyond = ((low < -LIMIT) | (high > LIMIT)).tolist()
+    events = ["" if fine else NAN for fine in finite]
+    for t, far in enumerate(beyond):
+        if finite[t] and far and float((video[:, t].abs() > LIMIT).float().mean()) > SHARE:
             events[t] = RANGE
-    return [str(event) for event in events]
+    return events
 
 
 def black(fixed: U8, raw: U8) -> bool:
