@@ -94,8 +94,12 @@ def _kernel() -> Tensor:
 
 
 def _cosines(n: int) -> Tensor:
-    """Return the orthonormal DCT-II matrix ``(n, n)``, one frequency a row, float64."""
-    k, i = torch.arange(n, dtype=torch.float64)[:, None], torch.arange(n, dtype=torch.float64)[None]
+    """Return the orthonormal DCT-II matrix ``(n, n)``, one frequency a row, float64.
+
+    On the CPU also under another default device: arithmetic on ``meta`` would load torch's compiler, which takes seconds.
+    """
+    index = torch.arange(n, dtype=torch.float64, device="cpu")
+    k, i = index[:, None], index[None]
     matrix = torch.cos(math.pi * (i + 0.5) * k / n) * math.sqrt(2 / n)
     matrix[0] /= math.sqrt(2)
     return matrix
