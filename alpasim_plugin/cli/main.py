@@ -8,7 +8,7 @@ import traceback
 
 import typer
 
-from alpasim_plugin.cli import bench, doctor, fork, listing, refine, report, run, score, train
+from alpasim_plugin.cli import bench, compare, doctor, fork, gate, listing, refine, report, run, score, train
 from alpasim_plugin.errors import SimrunError
 
 app = typer.Typer(
@@ -22,6 +22,8 @@ app = typer.Typer(
 )
 app.command("run", epilog=run.EPILOG)(run.run)
 app.command("score", epilog=score.EPILOG)(score.score)
+app.command("compare", epilog=compare.EPILOG)(compare.compare)
+app.command("gate", epilog=gate.EPILOG)(gate.gate)
 app.command("report", epilog=report.EPILOG)(report.report)
 app.command("list", epilog=listing.EPILOG)(listing.list_parts)
 app.command("doctor", epilog=doctor.EPILOG)(doctor.doctor)
@@ -31,7 +33,7 @@ app.command("probe", epilog=fork.PROBE_EPILOG)(fork.probe)
 app.add_typer(bench.app, name="bench")
 app.add_typer(train.app, name="train")
 
-VERBS = ("run", "score", "report", "list", "doctor", "refine", "fork", "probe", "bench", "train")
+VERBS = ("run", "score", "compare", "gate", "report", "list", "doctor", "refine", "fork", "probe", "bench", "train")
 OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, Bool
+from alpasim_plugin.types import F64, I64, Bool
 from evaluators.aggregate.intervals import Interval, cluster_means, rate_interval, t_interval
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
 from evaluators.aggregate.rows import Cell, Row, Side, failure_of, metric_names, reason_of, sides
@@ -116,7 +116,7 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
     return entry
 
 
-def flag_interval(delta: F64, scenes: Sequence[str]) -> Interval:
+def flag_interval(delta: F64, scenes: Sequence[str] | I64) -> Interval:
     """Return the interval of a difference of rates.
 
     A t interval on the scenes' mean differences, once enough scenes changed for it to hold. Where fewer than six changed, the rates of

@@ -1,0 +1,106 @@
+"""``simrun gate``: hold a run against margins and limits; the exit code says what it came to."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from alpasim_plugin.cli.progress import make_progress
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.self_test import run_self_test
+from evaluators.gate import GateVerdict, check_matches, judge, load_gate, read_baseline, rows_of_run, write_baseline
+from evaluators.report.gate import write_gate_files
+from evaluators.report.run_folder import read_run
+
+EPILOG = """
+Examples:
+
+- `simrun gate runs/nightly --gate default`
+
+- `simrun gate runs/main --write-baseline baseline.json`, then `simrun gate runs/change --gate gate.yaml --baseline-file baseline.json`
+
+- `simrun gate --self-test`
+
+Exit codes: 0 pass, 1 regression, 2 bad input or another baseline, 3 undecided, 4 rollouts could not be run, 5 could not be scored.
+"""
+
+
+def gate(
+    run: Annotated[Path | None, typer.Argument(help="A run folder.")] = None,
+    gate_file: Annotated[str, typer.Option("--gate", help="A gate file, or the name of a shipped gate.")] = "default",
+    baseline_file: Annotated[Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline.")] = None,
+    approve: Annotated[Path | None, typer.Option("--write-baseline", help="Store the run as a baseline and stop.")] = None,
+    self_test: Annotated[bool, typer.Option("--self-test", help="Drive broken renderers; fail unless the gate catches each.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Where gate.md and gate.junit.xml go; by default the run folder.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Self-test: worker processes.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Judge a run by a gate, or test the gate itself on deliberately broken renderers."""
+    del debug
+    if self_test:
+        if run is not None or baseline_file is not None or approve is not None:
+            raise InputError("testing a gate", "--self-test", "a run or baseline is named as well", "give --gate and --out only")
+        raise typer.Exit(_self_test(gate_file, out, workers, as_json))
+    if run is None:
+        raise InputError("judging a run", "simrun gate", "no run folder is named", "name one, or use --self-test")
+    found = read_run(run)
+    if approve is not None:
+        write_baseline(found, approve)
+        print(json.dumps({"baseline": str(approve)}) if as_json else f"baseline  {approve}")
+        return
+    spec, source = load_gate(gate_file)
+    preset = str(found.summary.get("preset"))
+    if spec.preset is not None and spec.preset != preset:
+        wanted = f"preset {preset!r}, the gate {source} is for {spec.preset!r}"
+        raise InputError("judging a run", str(run), wanted, "score it with that preset")
+    stored = None
+    if baseline_file is not None:
+        stored = read_baseline(baseline_file)
+        check_matches(stored, found, baseline_file)
+    verdict = judge(rows_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""))
+    files = write_gate_files(verdict, source, found, out or run)
+    if as_json:
+        print(json.dumps({**verdict.as_dict(), "files": [str(path) for path in files]}))
+    else:
+        print_verdict(verdict)
+    raise typer.Exit(verdict.exit_code)
+
+
+def print_verdict(verdict: GateVerdict) -> None:
+    """Print every check, what else led to the verdict, and last the verdict, once."""
+    for check in verdict.checks:
+        note = "" if check.binding else " (not binding)"
+        print(f"{check.cause:>10}  {check.policy}, {check.text}{note}")
+    shown = {check.text for check in verdict.checks}
+    for reason in verdict.outcome.reasons:
+        if reason not in shown:
+            print(f"{verdict.outcome.cause:>10}  {reason}")
+    print(f"{verdict.outcome.title} (exit code {verdict.exit_code}), compared with {verdict.baseline}")
+
+
+def _self_test(gate_file: str, out: Path | None, workers: int | None, as_json: bool) -> int:
+    spec, source = load_gate(gate_file)
+    root = out or Path("runs", f"gate-self-test-{spec.preset or 'paper'}")
+    began = time.perf_counter()
+    result = run_self_test(spec, root, workers, ["simrun", *sys.argv[1:]], make_progress(as_json))
+    took_s = time.perf_counter() - began
+    if as_json:
+        trials = [trial.as_dict() for trial in result.trials]
+        print(json.dumps({"gate": source, "outcome": result.outcome.as_dict(), "wall_s": round(took_s, 1), "trials": trials}))
+        return result.outcome.exit_code
+    for trial in result.trials:
+        found = f"caught by {', '.join(trial.caught_by)}" if trial.caught_by else "not called worse"
+        print(f"{'ok' if trial.is_right else 'WRONG':>5}  {trial.renderer}: {found}")
+        if not trial.is_right:
+            for check in trial.verdict.checks:
+                print(f"       {check.text}")
+    for reason in result.outcome.reasons:
+        print(f"self-test: {reason}", file=sys.stderr)
+    print(f"self-test of {source}: {result.outcome.title} (exit code {result.outcome.exit_code}) in {took_s:.0f} s; rollouts in {root}")
+    return result.outcome.exit_code

@@ -1,0 +1,102 @@
+"""The gate's self-test: drive deliberately broken renderers in closed loop, and see whether the gate catches each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.renderers import RENDERERS
+from alpasim_plugin.runtime.plan import RunOptions, make_plan
+from alpasim_plugin.runtime.run import Progress, execute_run
+from evaluators.aggregate.outcome import Outcome, outcome_of_failures
+from evaluators.aggregate.rows import Row
+from evaluators.gate import GateSpec, GateVerdict, judge, rows_of_run
+from evaluators.report.run_folder import read_run
+from scenarios.suite import load_suite
+
+SUITE = "suites/gate_self_test"
+POLICY = "lane-camera"  # the only shipped policy that drives by what it sees
+REFERENCE = "clean"
+CONTROL = "clean, other noise"
+SEEDS = (0, 1)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What the gate said about one renderer, and what it should have said."""
+
+    renderer: str
+    is_broken: bool
+    verdict: GateVerdict
+
+    @property
+    def is_right(self) -> bool:
+        """Tell whether a broken renderer is caught, or the healthy control is not called worse."""
+        return (self.verdict.outcome.cause == "regression") == self.is_broken
+
+    @property
+    def caught_by(self) -> list[str]:
+        """Name the metrics whose rule was broken."""
+        return [check.metric for check in self.verdict.checks if check.cause == "regression"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the trial for JSON."""
+        facts = {"renderer": self.renderer, "is_broken": self.is_broken, "is_right": self.is_right, "caught_by": self.caught_by}
+        return facts | {"verdict": self.verdict.as_dict()}
+
+
+@dataclass(frozen=True)
+class SelfTest:
+    """All trials and the outcome that follows."""
+
+    trials: tuple[Trial, ...]
+    outcome: Outcome
+    root: Path
+
+
+def broken_renderers() -> list[str]:
+    """Return the registered renderers with a deliberate fault."""
+    return [name for name in RENDERERS if name.startswith("broken-")]
+
+
+def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequence[str], progress: Progress) -> SelfTest:
+    """Drive the suite behind the reference and every broken renderer and judge each pair by the gate.
+
+    The gate's rules are taken as they are, except what ties it to one run: the reference is `REFERENCE`, and no more scenes are asked for
+    than the suite has. As a control the reference meets itself under other seeds: a gate that fails everything fails its test.
+
+    Args:
+        spec: The gate under test.
+        root: Run folder; finished rollouts in it are reused.
+        workers: As for a run.
+        command: Written to run.json.
+        progress: Shows the drives.
+    """
+    broken = broken_renderers()
+    options = RunOptions(preset=spec.preset or "paper", baseline=REFERENCE)
+    plan = make_plan(load_suite(SUITE), [REFERENCE, *broken], [POLICY], SEEDS, options)
+    result = execute_run(plan, root, workers, command, progress, certificate="none")
+    failed = outcome_of_failures(result.summary["failures"])
+    rows = rows_of_run(read_run(root))
+    trials = [Trial(name, True, _judge(spec, rows, name, len(plan.scenarios))) for name in broken]
+    trials.append(Trial(CONTROL, False, _judge(spec, control_rows(rows), CONTROL, len(plan.scenarios))))
+    if failed.cause != "pass":
+        return SelfTest(tuple(trials), failed, root)
+    wrong = [trial for trial in trials if not trial.is_right]
+    reasons = tuple(f"{t.renderer} is {'not caught' if t.is_broken else 'called worse, and it is not'}" for t in wrong)
+    return SelfTest(tuple(trials), Outcome("regression" if wrong else "pass", reasons), root)
+
+
+def control_rows(rows: Sequence[Row]) -> list[Row]:
+    """Return the reference under its first seed, and again under its second as if that were another renderer's first."""
+    mine = [row for row in rows if row["renderer"] == REFERENCE]
+    first = [row for row in mine if row["seed"] == SEEDS[0]]
+    return first + [{**row, "renderer": CONTROL, "seed": SEEDS[0]} for row in mine if row["seed"] == SEEDS[1]]
+
+
+def _judge(spec: GateSpec, rows: Sequence[Row], name: str, n_scenes: int) -> GateVerdict:
+    fields = {"renderers": (name,), "baseline": REFERENCE, "min_scenes": min(spec.min_scenes, n_scenes), "max_failed": 0.0}
+    only = [row for row in rows if row["renderer"] in (REFERENCE, name)]
+    return judge(only, spec.model_copy(update=fields))

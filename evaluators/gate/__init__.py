@@ -1,0 +1,21 @@
+"""The gate: what a run must reach, against what, and what it came to."""
+
+from evaluators.gate.baseline import Baseline, baseline_of, check_matches, read_baseline, write_baseline
+from evaluators.gate.judge import Check, GateVerdict, judge
+from evaluators.gate.rows import rows_of_run
+from evaluators.gate.spec import GateSpec, MetricRule, load_gate
+
+__all__ = [
+    "Baseline",
+    "Check",
+    "GateSpec",
+    "GateVerdict",
+    "MetricRule",
+    "baseline_of",
+    "check_matches",
+    "judge",
+    "load_gate",
+    "read_baseline",
+    "rows_of_run",
+    "write_baseline",
+]

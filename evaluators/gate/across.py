@@ -1,0 +1,111 @@
+"""Paired differences within a run, or between two runs on the cells that both have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from alpasim_plugin.errors import InputError
+from evaluators.aggregate.paired import LISTED, compare
+from evaluators.aggregate.rows import Row, metric_names, sides
+from evaluators.aggregate.verdict import default_margin
+from evaluators.gate.baseline import check_scenes, scene_hashes
+from evaluators.gate.rows import of_policy, policies_of, rows_of_run
+from evaluators.report.run_folder import Run
+
+DOING = "comparing runs"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Paired differences.
+
+    Attributes:
+        paired: ARM -> METRIC -> what `evaluators.aggregate.paired.compare` gives; an arm is RENDERER, or RENDERER/POLICY with several
+            policies.
+        notes: What a reader must know, such as policies that were paired although their names differ.
+    """
+
+    paired: Mapping[str, Mapping[str, Mapping[str, Any]]]
+    notes: tuple[str, ...] = field(default=())
+
+
+def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED) -> Comparison:
+    """Compare the renderers of one run with one of them, by default the run's own baseline or its first.
+
+    Raises:
+        InputError: Only one renderer, or an unknown baseline.
+    """
+    rows = rows_of_run(run)
+    known = list(sides(rows))
+    name = baseline or (run.info.get("config") or {}).get("baseline") or (known[0] if known else "")
+    if name not in known:
+        raise InputError(DOING, f"baseline {name!r}", f"{run.folder} does not have it", f"choose one of {', '.join(known) or 'none'}")
+    if len(known) < 2:
+        raise InputError(DOING, str(run.folder), f"only one renderer, {name}", "name a second run, or run two renderers")
+    return Comparison(_pairs(rows, rows, {other: name for other in known if other != name}, "", margins, listed))
+
+
+def compare_runs(
+    first: Run, second: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED
+) -> Comparison:
+    """Compare the second run with the first: each renderer with the same name, or all with ``baseline`` of the first run.
+
+    A policy is paired with the policy of the same name; where the runs share none and have one each, with the other's.
+
+    Raises:
+        InputError: The runs differ in preset or in a scene's content, share no scene, or a renderer or policy has no partner.
+    """
+    both = f"{first.folder} and {second.folder}"
+    presets = [str(run.summary.get("preset")) for run in (first, second)]
+    if presets[0] != presets[1]:
+        raise InputError(DOING, both, f"presets {presets[0]!r} and {presets[1]!r}", "give the command of one run again with --preset")
+    check_scenes(scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files")
+    rows = rows_of_run(second)
+    base_rows, notes = _align_policies(rows_of_run(first), rows)
+    there, here = list(sides(base_rows)), list(sides(rows))
+    if baseline is not None and baseline not in there:
+        raise InputError(DOING, f"baseline {baseline!r}", f"{first.folder} does not have it", f"choose one of {', '.join(there)}")
+    alone = there[0] if len(there) == 1 else None
+    partner = {name: baseline or (name if name in there else alone) for name in here}
+    lone = [name for name, other in partner.items() if other is None]
+    if lone:
+        raise InputError(DOING, f"renderers {lone} of {second.folder}", f"{first.folder} has {', '.join(there)}", "name one by --baseline")
+    chosen = {name: other for name, other in partner.items() if other is not None}
+    return Comparison(_pairs(rows, base_rows, chosen, f"{first.folder}: ", margins, listed), notes)
+
+
+def _pairs(
+    rows: Sequence[Row],
+    base_rows: Sequence[Row],
+    partner: Mapping[str, str],
+    prefix: str,
+    margins: Mapping[str, float] | None,
+    listed: int,
+) -> dict[str, dict[str, Any]]:
+    names = metric_names([*rows, *base_rows])
+    out: dict[str, dict[str, Any]] = {}
+    policies = policies_of(rows)
+    for policy in policies:
+        here, there = sides(of_policy(rows, policy)), sides(of_policy(base_rows, policy))
+        for renderer, other in partner.items():
+            if renderer in here and other in there:
+                arm = renderer if len(policies) == 1 else f"{renderer}/{policy}"
+                out[arm] = {
+                    name: compare(
+                        here[renderer], there[other], name, prefix + other, (margins or {}).get(name, default_margin(name)), listed
+                    )
+                    for name in names
+                }
+    return out
+
+
+def _align_policies(base_rows: Sequence[Row], rows: Sequence[Row]) -> tuple[Sequence[Row], tuple[str, ...]]:
+    """Give the first run's only policy the name of the second's only one, where they share none."""
+    there, here = policies_of(base_rows), policies_of(rows)
+    if set(there) & set(here):
+        return base_rows, ()
+    if len(there) == len(here) == 1:
+        return [{**row, "policy": here[0]} for row in base_rows], (f"policy {here[0]} is compared with policy {there[0]}",)
+    raise InputError(DOING, f"policies {there} and {here}", "none in common", "compare runs of one policy each, or of the same policies")

@@ -1,0 +1,119 @@
+"""Stored baselines: the rows of an approved run, with what they were made with; refused where that differs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.errors import InputError
+from evaluators.aggregate.rows import Row
+from evaluators.gate.rows import rows_of_run
+from evaluators.report.files import write_whole
+from evaluators.report.run_folder import Run
+
+SCHEMA_VERSION = 1
+DOING = "comparing with a stored baseline"
+APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What a baseline file holds."""
+
+    preset: str
+    scenes: Mapping[str, str]  # scene id -> content hash
+    weights: Mapping[str, Any]  # as in run.json
+    rows: Sequence[Row]
+    made_with: Mapping[str, Any]  # command, versions, hardware, start: for people, not compared
+    schema_version: int = SCHEMA_VERSION
+
+
+def baseline_of(run: Run) -> Baseline:
+    """Return a run's results as a baseline."""
+    kept = ("key", "command", "version", "started_at", "versions", "hardware", "renderers", "policies", "seeds")
+    made_with = {key: run.info[key] for key in kept if key in run.info}
+    return Baseline(_preset(run), scene_hashes(run), dict(run.info.get("weights") or {}), rows_of_run(run), made_with)
+
+
+def write_baseline(run: Run, path: Path) -> None:
+    """Store a run's results as a baseline file.
+
+    Raises:
+        InputError: A rollout of the run failed: a baseline with holes would hide regressions.
+        InfrastructureError: The disk refused.
+    """
+    failed = [r for r in run.rollouts if not r.ok]
+    if failed or not run.rollouts:
+        found = f"{len(failed)} of {len(run.rollouts)} rollouts failed" if failed else "it holds no rollouts"
+        raise InputError("storing a baseline", str(run.folder), found, "store a run in which every rollout ran to its end")
+    write_whole(path, json.dumps(asdict(baseline_of(run)), indent=1, allow_nan=False) + "\n")
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read a baseline file.
+
+    Raises:
+        InputError: Missing, not JSON, or not a baseline of this version.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(DOING, str(path), "no such file", "write one with simrun gate RUN --write-baseline FILE") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(DOING, str(path), f"not JSON: {error}", "restore the file or write it again") from error
+    names = set(Baseline.__dataclass_fields__)
+    if not isinstance(content, dict) or set(content) != names or content["schema_version"] != SCHEMA_VERSION:
+        raise InputError(DOING, str(path), f"not a baseline of version {SCHEMA_VERSION}", "write it again with this version")
+    return Baseline(**content)
+
+
+def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
+    """Refuse a baseline that was made with something else than the run.
+
+    Scenes that only one side has are missing cells, not a mismatch.
+
+    Raises:
+        InputError: Other preset, other weights, a scene with another content, or no scene in common.
+    """
+    preset, hashes, weights = _preset(run), scene_hashes(run), dict(run.info.get("weights") or {})
+    if baseline.preset != preset:
+        raise InputError(DOING, str(path), f"preset {baseline.preset!r}, the run has {preset!r}", APPROVE)
+    if dict(baseline.weights) != weights:
+        names = sorted(name for name in {*baseline.weights, *weights} if baseline.weights.get(name) != weights.get(name))
+        raise InputError(DOING, str(path), f"other weights: {', '.join(names)}", APPROVE)
+    check_scenes(baseline.scenes, hashes, str(path), DOING, APPROVE)
+
+
+def check_scenes(here: Mapping[str, str], there: Mapping[str, str], with_what: str, doing: str, do_this: str) -> None:
+    """Refuse two sets of scenes that share none, or share a name with another content.
+
+    Raises:
+        InputError: They do.
+    """
+    changed = sorted(name for name in here.keys() & there.keys() if here[name] != there[name])
+    if changed:
+        raise InputError(doing, with_what, f"scenes with another content: {', '.join(changed)}", do_this)
+    if not here.keys() & there.keys():
+        raise InputError(doing, with_what, "no scene in common", do_this)
+
+
+def scene_hashes(run: Run) -> dict[str, str]:
+    """Return scene id -> content hash of a run.
+
+    Raises:
+        InputError: run.json has no hash of a scene.
+    """
+    scenes = run.info.get("scenes") or {}
+    hashes = {name: str(facts.get("content_hash") or "") for name, facts in scenes.items()}
+    bare = sorted(name for name in {r.scene for r in run.rollouts} | set(hashes) if not hashes.get(name))
+    if bare:
+        found = f"no content hash for {', '.join(bare)}"
+        raise InputError("reading the scenes of a run", str(run.folder / "run.json"), found, "make the run again with this version")
+    return hashes
+
+
+def _preset(run: Run) -> str:
+    return str(run.summary.get("preset") or run.info.get("preset") or "")

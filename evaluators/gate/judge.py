@@ -1,0 +1,171 @@
+"""Judge a run by a gate: every check, and the one outcome that follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
+from evaluators.aggregate.paired import compare
+from evaluators.aggregate.rows import Row, Side, failure_of, is_ok, sides
+from evaluators.gate.rows import of_policy, policies_of
+from evaluators.gate.spec import GateSpec, MetricRule
+from evaluators.metrics import info
+
+Kind = Literal["margin", "limit"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One metric of one renderer and policy against one rule."""
+
+    renderer: str
+    policy: str
+    metric: str
+    kind: Kind
+    cause: Cause
+    text: str  # one sentence with the numbers
+    entry: Mapping[str, Any]  # the paired comparison, or mean and bounds
+    binding: bool = True  # an undecided check that does not bind leaves the gate open
+
+
+@dataclass(frozen=True)
+class GateVerdict:
+    """Everything a gate found; `outcome` gives the exit code and the heading."""
+
+    outcome: Outcome
+    checks: tuple[Check, ...]
+    failures: Mapping[str, Any]
+    baseline: str  # what was compared with, in words
+
+    @property
+    def exit_code(self) -> int:
+        """Give the process exit code."""
+        return self.outcome.exit_code
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        checks = [asdict(check) for check in self.checks]
+        return {"outcome": self.outcome.as_dict(), "baseline": self.baseline, "failures": dict(self.failures), "checks": checks}
+
+
+def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "") -> GateVerdict:
+    """Judge rollout rows.
+
+    Args:
+        rows: Every planned rollout of the run (`rows_of_run`).
+        spec: The gate.
+        stored: Rows of a stored baseline; without it the baseline is a renderer of the run itself.
+        stored_name: How to call the stored baseline.
+
+    Raises:
+        InputError: A renderer that the gate names is not there, or nothing is left to judge.
+    """
+    checks: list[Check] = []
+    for policy in policies_of(rows):
+        here = sides(of_policy(rows, policy))
+        there = here if stored is None else sides(of_policy(stored, policy))
+        for renderer in _judged(here, spec, stored is not None):
+            base = _baseline_name(renderer, here, there, spec, stored is not None)
+            for metric, rule in spec.metrics.items():
+                side = here[renderer]
+                if rule.margin is not None:
+                    checks.append(_margin(side, there[base], (renderer, policy), base, metric, rule, spec))
+                if rule.max is not None or rule.min is not None:
+                    checks.append(_limit(side, (renderer, policy), metric, rule))
+    failures = failures_of(rows)
+    found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
+    outcome = worst([outcome_of_failures(failures, spec.max_failed), *found])
+    name = stored_name if stored is not None else f"renderer {spec.baseline or next(iter(sides(rows)))} of the same run"
+    return GateVerdict(outcome, tuple(checks), failures, name)
+
+
+def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """Count rollouts that did not run to their end, as summary.json does."""
+    by_class: dict[str, int] = {}
+    for row in rows:
+        if not is_ok(row):
+            by_class[failure_of(row)] = by_class.get(failure_of(row), 0) + 1
+    return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
+
+
+def _judged(here: Mapping[str, Side], spec: GateSpec, has_stored: bool) -> list[str]:
+    absent = [name for name in spec.renderers if name not in here]
+    if absent:
+        raise InputError("judging a run", f"renderers {absent}", "the run has none of these", f"it has {', '.join(here)}")
+    if spec.renderers:
+        return list(spec.renderers)
+    if has_stored and spec.baseline is None:
+        return list(here)
+    base = spec.baseline or next(iter(here))
+    judged = [name for name in here if name != base]
+    # A gate of limits alone needs no second renderer.
+    return judged or ([base] if all(rule.margin is None for rule in spec.metrics.values()) else _nothing(base))
+
+
+def _nothing(base: str) -> list[str]:
+    raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", "run two renderers, or give --baseline-file")
+
+
+def _baseline_name(renderer: str, here: Mapping[str, Side], there: Mapping[str, Side], spec: GateSpec, has_stored: bool) -> str:
+    name = spec.baseline or (renderer if has_stored else next(iter(here)))
+    needs = any(rule.margin is not None for rule in spec.metrics.values())
+    if needs and name not in there:
+        where = "the stored baseline" if has_stored else "the run"
+        known = ", ".join(there) or "no rollout of this policy"
+        raise InputError("judging a run", f"baseline {name!r}", f"{where} does not have it", f"choose one of: {known}")
+    return name
+
+
+def _margin(side: Side, base: Side, arm: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec) -> Check:
+    entry = compare(side, base, metric, name, rule.margin or 0.0)
+    planned = entry["n_cells"] + entry["n_missing"]
+    cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
+    said = _paired_text(entry, metric, arm[0])
+    if entry["n_scenes"] < spec.min_scenes:
+        cause = "undecided"
+        said += f"; {entry['n_scenes']} scenes, the gate asks for {spec.min_scenes}"
+    elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
+        cause = "undecided"
+        said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
+    return Check(*arm, metric, "margin", cause, said, entry, rule.must_decide)
+
+
+def _limit(side: Side, arm: tuple[str, str], metric: str, rule: MetricRule) -> Check:
+    values = side.values(metric)
+    known = values[np.isfinite(values)]
+    unit = info(metric).unit
+    bounds = {"max": rule.max, "min": rule.min}
+    limits = " and ".join(f"{kind} {value:g}" for kind, value in bounds.items() if value is not None)
+    if not len(known):
+        text = f"{arm[0]}: {metric} has no valid value, its limit is {limits}"
+        return Check(*arm, metric, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
+    mean = float(known.mean())
+    broken = (rule.max is not None and mean > rule.max) or (rule.min is not None and mean < rule.min)
+    text = f"{arm[0]}: {metric} {_number(mean, unit)}, limit {limits}"
+    return Check(*arm, metric, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)})
+
+
+def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str) -> str:
+    unit = entry["unit"]
+    head = f"{renderer}: {metric}"
+    if entry["diff"] is None:
+        return f"{head} cannot be compared with {entry['baseline']}: {entry['reason']}"
+    text = f"{head} {_number(entry['diff'], unit, sign=True)} against {entry['baseline']}"
+    if entry["ci95"] is None:
+        return f"{text}: {entry['reason']}"
+    low, high = (_number(b, unit, sign=True) for b in entry["ci95"])
+    text += f" (95 % {low} to {high}, margin {_number(entry['margin'], unit)}): {entry['verdict']}"
+    if entry["verdict"] == "undecided":
+        more = entry["more_scenes"]
+        text += f", about {more} more scenes would decide it" if more else ", more scenes of this kind would not decide it"
+    return text
+
+
+def _number(value: float, unit: str, sign: bool = False) -> str:
+    text = f"{value:+.4g}" if sign else f"{value:.4g}"
+    return f"{text} {unit}".rstrip()
