@@ -12,11 +12,13 @@ from typing import Any, Protocol
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.execute import Threads, execute, thread_budget
+from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.plan import RunPlan, slug
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.store import read_json, write_json
 from alpasim_plugin.runtime.tables import write_tables
+from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.report import write_junit, write_report, write_summary_md
 
 SCHEMA_VERSION = 1
@@ -44,12 +46,14 @@ class RunResult:
     n_failed: int
 
     @property
+    def outcome(self) -> Outcome:
+        """Say what the run came to: rollouts that could not be run or scored; gates add criteria to this."""
+        return outcome_of_failures(self.summary["failures"])
+
+    @property
     def exit_code(self) -> int:
-        """Give the process exit code that docs/cli.md lists: 4 where rollouts could not be run, 5 where they could not be scored."""
-        classes = self.summary["failures"]["by_class"]
-        if set(classes) == {"evaluator"}:
-            return 5
-        return 4 if self.n_failed else 0
+        """Give the process exit code that docs/cli.md lists."""
+        return self.outcome.exit_code
 
 
 def default_folder(plan: RunPlan) -> Path:
@@ -92,6 +96,7 @@ def execute_run(
     summary["determinism"] = determinism
     write_json(tables, summary)
     write_json(root / "run.json", read_json(root / "run.json") | {"determinism": determinism})
+    write_flips(root)
     write_summary_md(root)
     write_junit(root)
     write_report(root)

@@ -56,6 +56,8 @@ LEDGER_COLUMNS = (  # key, head, what it means
     ("steps_after_event", "after event", "steps after the first collision or off-road event"),
     ("steps_after_drift", "after drift", "steps after leaving the logged path too far"),
     ("steps_scored", "scored", "steps that enter the metrics"),
+    ("frames", "frames", "camera frames of rollouts that ran to their end"),
+    ("frame_events", "of them bad", "frames in which a guard saw something: black, or a fixer's frame that was replaced by the raw one"),
 )
 
 
@@ -76,10 +78,30 @@ def ledger(run: Run, rates: tuple[str, ...]) -> list[LedgerRow]:
     return rows
 
 
+@dataclass(frozen=True)
+class InvalidRow:
+    """A metric without a valid value in some rollouts of a renderer, and why."""
+
+    renderer: str
+    metric: str
+    rollouts: int
+    reasons: str
+
+
+def invalid_rows(run: Run) -> list[InvalidRow]:
+    """List every metric that is invalid somewhere."""
+    rows = []
+    for renderer, entry in (run.summary.get("censoring") or {}).items():
+        for metric, found in ((entry or {}).get("invalid") or {}).items():
+            reasons = "; ".join(f"{reason} ({n})" for reason, n in (found.get("reasons") or {}).items())
+            rows.append(InvalidRow(renderer, metric, int(found.get("rollouts") or 0), reasons or "not given"))
+    return rows
+
+
 def _tally(value: Any) -> Cell:
     if isinstance(value, Mapping):
         total = sum(int(n) for n in value.values())
-        return Cell(str(total), "; ".join(f"{cause}: {n}" for cause, n in value.items()), sort=total)
+        return Cell(str(total), "", ", ".join(f"{cause} {n}" for cause, n in value.items()), sort=total)
     number = finite(value)
     return missing("not counted") if number is None else Cell(fixed(number, 0), sort=number)
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from evaluators.report.certificate import certificate_caution
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
@@ -36,6 +37,7 @@ class Point:
     text: str
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
+    hinted: tuple[str, ...] = ()  # a difference for the worse is shown, but not that it exceeds the margin
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,9 @@ def _clause(point: Point, baseline: str) -> str:
     if point.tone == "mixed":
         return f"{point.name} is worse than {baseline} in {_listing(point.worse)} and better in {_listing(point.better)}"
     if point.tone == "neutral":
-        return f"{point.name} drives no worse than {baseline}"
+        return f"{point.name} drives no worse than {baseline} by more than the margins"
+    if point.hinted:
+        return f"{point.name} drives worse than {baseline} in {_listing(point.hinted)}, undecided whether by more than the margin"
     return f"no difference shown between {point.name} and {baseline}"
 
 
@@ -137,7 +141,8 @@ def _paired_point(run: Run, arm: str, pairs: Mapping[str, Any]) -> Point:
     parts += [f"no difference at all in {_listing(same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better)
+    hinted = tuple(m for m in lead if tones[m] == "unclear" and pairs[m].get("difference") == "worse")
+    return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better, hinted)
 
 
 def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
@@ -155,7 +160,13 @@ def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any], brief
     text = f"{WORDS.get(metric, metric)}: {here} against {there} ({fixed(difference, places, sign=True)}{tail}"
     if ends:
         text += f", 95\u00a0% interval {fixed(ends[0], places, sign=True)} to {fixed(ends[1], places, sign=True)}"
-    return f"{text})"
+    return f"{text}{_needed(entry)})"
+
+
+def _needed(entry: Mapping[str, Any]) -> str:
+    """Say how much more would decide an undecided difference, where that is known."""
+    more = entry.get("more_scenes")
+    return f"; about {plural(int(more), 'more scene')} would decide" if isinstance(more, int) and more > 0 else ""
 
 
 def _level(run: Run, arm: str, metric: str) -> str:
@@ -189,6 +200,7 @@ def _cautions(run: Run) -> tuple[str, ...]:
         said.append(
             f"{len(failed)} of {plural(len(run.rollouts), 'rollout')} could not be run ({causes}); they are in no average. See Failures."
         )
+    said += certificate_caution(run)
     scenes = {r.scene for r in run.rollouts if r.ok}
     if len(scenes) == 1:
         said.append("One scene only: the result says nothing about other scenes, and no interval over scenes exists.")

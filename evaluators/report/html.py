@@ -14,11 +14,14 @@ from markupsafe import Markup
 
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
+from evaluators.report.certificate import certificate
 from evaluators.report.charts import drift_charts
 from evaluators.report.events import events_of, read_series
-from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
+from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
+from evaluators.report.figures import forest, speed_against_error, strata_chart
 from evaluators.report.files import write_whole
 from evaluators.report.fixers import COLUMNS, fixer_rows
+from evaluators.report.flips import baseline_of, flip_rows
 from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
@@ -26,6 +29,7 @@ from evaluators.report.provenance import provenance
 from evaluators.report.run_folder import Run, Series, read_run
 from evaluators.report.scene_table import SCENE_METRICS, scene_rows
 from evaluators.report.speed import speed
+from evaluators.report.strata import heads, strata, stratum_rows
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
@@ -33,6 +37,7 @@ MAX_STRIP_SCENES = 8
 LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
+FLIP_BUDGET_BYTES = 2_000_000
 
 
 def write_report(run_dir: Path | str) -> Path:
@@ -77,6 +82,9 @@ def context(run: Run) -> dict[str, Any]:
     by_scene, more_scene_rows = scene_rows(run)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
+    colours = _arm_colours(run)
+    flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
+    split = strata(run)
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
@@ -84,7 +92,17 @@ def context(run: Run) -> dict[str, Any]:
         "finding": find(run),
         "facts": _facts(run),
         "columns": tables.columns(run),
-        "arm_colour": _arm_colours(run),
+        "arm_colour": colours,
+        "forest": forest(run, colours),
+        "flips": flips,
+        "more_flips": more_flips,
+        "flip_pairs": flip_pairs,
+        "baseline": baseline_of(run),
+        "strata": [(one, stratum_rows(one), strata_chart(one)) for one in split],
+        "strata_heads": heads(),
+        "speed_charts": speed_against_error(run, colours),
+        "certificate": certificate(run),
+        "invalid": invalid_rows(run),
         "headline_rows": headline,
         "other_rows": [row for row in rows if row not in headline],
         "headline_pairs": [p for p in pairs if p.metric in {row.name for row in headline}] or pairs,

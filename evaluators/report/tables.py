@@ -19,6 +19,7 @@ from evaluators.report.numbers import (
     interval,
     missing,
     plural,
+    short,
 )
 from evaluators.report.run_folder import Run
 
@@ -64,6 +65,7 @@ class PairRow:
     verdict: str
     tone: str
     span: Span | None
+    hint: str = ""  # the margin, and how many more scenes would decide
 
 
 def metric_rows(summary: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None) -> list[MetricRow]:
@@ -210,7 +212,18 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
     p_cell = missing(reason or "no test was made") if p is None else Cell(_p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
-    return PairRow(arm, str(entry.get("baseline") or "\u2014"), name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span)
+    if verdict != "worse" and entry.get("difference") in ("better", "worse"):
+        verdict += f", {entry['difference']}"
+    base, hint = str(entry.get("baseline") or "\u2014"), _hint(entry, scale, unit)
+    return PairRow(arm, base, name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
+
+
+def _hint(entry: Mapping[str, Any], scale: float, unit: str) -> str:
+    margin, more = finite(entry.get("margin")), entry.get("more_scenes")
+    said = [f"margin {short(margin * scale, unit)}"] if margin is not None and entry.get("direction") != "none" else []
+    if isinstance(more, int) and more > 0:
+        said.append(f"about {plural(more, 'more scene')} would decide")
+    return "; ".join(said)
 
 
 def _pair_note(entry: Mapping[str, Any]) -> str:

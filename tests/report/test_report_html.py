@@ -86,8 +86,9 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path) -> N
 
 def test_verdict_comes_first(usual_run: Path) -> None:
     page = page_of(usual_run)
-    heads = ["Results", "Paired differences", "Over time", "What the camera saw", "From above", "Scene by scene", "Speed", "Failures"]
-    assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == [*heads, "Not in the numbers", "Provenance"]
+    heads = ["Results", "Paired differences", "Changed outcomes", "Over time", "What the camera saw", "From above", "Scene by scene"]
+    heads += ["By distance and by opacity", "Speed", "Failures", "Not in the numbers", "Repeatability", "Provenance"]
+    assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == heads
     assert page.text.index("3dgs drives worse than clean") < page.text.index("One value per rollout")
     assert page.tags.index("h1") < page.tags.index("table")
 

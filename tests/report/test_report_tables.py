@@ -156,7 +156,7 @@ def test_ledger_bounds_cover_what_failed(usual_run: Path) -> None:
     rows = {row.renderer: row for row in ledger(read_run(usual_run), ("offroad",))}
     assert rows["clean"].bounds[0].text == "0.0\u00a0%"
     assert rows["onefixer"].bounds[0].text == "0.0 to 8.3\u00a0%"
-    assert rows["3dgs"].counts[1].note == "renderer: 2"
+    assert rows["3dgs"].counts[1].detail == "renderer 2"
 
 
 def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> None:

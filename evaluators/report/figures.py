@@ -1,0 +1,169 @@
+"""The charts that compare renderers: the forest of paired differences, speed against error, and plans by stratum."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from evaluators.report.charts import ARM, GRID, INK, MUTED, N_COLOURS, RC, Chart, themed_svg
+from evaluators.report.headline import WORDS
+from evaluators.report.metric_info import HEADLINE, in_percent, ordered
+from evaluators.report.numbers import finite, interval, short
+from evaluators.report.run_folder import Run
+from evaluators.report.strata import VALUES, Strata
+
+WIDTH_IN = 4.6
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
+ERRORS = ("collision_at_fault", "offroad", "route_distance_m")
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One difference turned so that positive is worse, in printed units."""
+
+    metric: str
+    arm: int
+    centre: float
+    low: float
+    high: float
+    margin: float
+
+
+def forest(run: Run, arms: Mapping[str, int]) -> list[Chart]:
+    """Draw the paired differences with their intervals, one chart a unit; metrics without a better side are left out.
+
+    Args:
+        run: The run.
+        arms: Key of ``summary.json`` -> colour.
+    """
+    lines: dict[str, list[_Line]] = {}
+    for arm, pairs in (run.summary.get("paired") or {}).items():
+        for metric in ordered(pairs):
+            found = _line(metric, arms.get(arm, 0), pairs[metric] or {})
+            if found is not None and metric in HEADLINE:
+                lines.setdefault(found[0], []).append(found[1])
+    return [_forest_chart(unit, some) for unit, some in lines.items()]
+
+
+def _line(metric: str, arm: int, entry: Mapping[str, Any]) -> tuple[str, _Line] | None:
+    centre, direction = finite(entry.get("diff")), entry.get("direction")
+    bounds = interval(entry.get("ci95"), centre)
+    if centre is None or bounds is None or direction not in ("lower", "higher"):
+        return None
+    unit = str(entry.get("unit") or "")
+    scale = 100.0 if in_percent(metric, unit) else 1.0
+    turned = [v * scale if direction == "lower" else -v * scale for v in (centre, *bounds)]
+    margin = (finite(entry.get("margin")) or 0.0) * scale
+    return ("points" if scale == 100.0 else unit), _Line(metric, arm, turned[0], min(turned[1:]), max(turned[1:]), margin)
+
+
+def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
+    metrics = list(dict.fromkeys(line.metric for line in lines))
+    arms = sorted({line.arm for line in lines})
+    gap = 1.0 / (len(arms) + 1)
+    with mpl.rc_context(RC | {"axes.grid.axis": "x"}):
+        figure = Figure(figsize=(WIDTH_IN, 0.75 + 0.42 * len(metrics) * max(1.0, 0.6 * len(arms))), layout="constrained")
+        axes = figure.add_subplot()
+        axes.axvline(0.0, color=INK, linewidth=1.0)
+        for line in lines:
+            y = metrics.index(line.metric) + (arms.index(line.arm) + 1) * gap - 0.5
+            colour = ARM[line.arm % N_COLOURS]
+            axes.plot([line.low, line.high], [y, y], color=colour, linewidth=1.8, solid_capstyle="butt")
+            axes.plot([line.centre], [y], MARKERS[line.arm % len(MARKERS)], color=colour, markersize=5.5)
+        for row, metric in enumerate(metrics):
+            margin = max(line.margin for line in lines if line.metric == metric)
+            if margin > 0.0:
+                axes.plot([margin, margin], [row - 0.42, row + 0.42], color=MUTED, linewidth=1.0, linestyle=(0, (2.0, 2.0)))
+        axes.set_yticks(range(len(metrics)), [WORDS.get(metric, metric) for metric in metrics])
+        axes.set_ylim(len(metrics) - 0.5, -0.5)
+        axes.tick_params(length=0)
+        axes.spines["left"].set_visible(False)
+        axes.set_xlabel(f"{'percentage points' if unit == 'points' else unit or 'no unit'} worse than the baseline \u2192")
+        svg = themed_svg(figure)
+    title = "Rates and shares" if unit == "points" else f"In {unit or 'numbers without unit'}"
+    return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
+
+
+def speed_against_error(run: Run, arms: Mapping[str, int]) -> list[Chart]:
+    """Draw milliseconds per frame against what the renderer does to the driving, for each of a few metrics."""
+    speed = run.summary.get("speed") or {}
+    times = {arm: ms for arm, entry in speed.items() if (ms := finite(entry.get("ms_per_frame_p50"))) is not None and ms > 0}
+    paired = run.summary.get("paired") or {}
+    charts = []
+    for metric in ERRORS:
+        points = []
+        for arm, ms in times.items():
+            entry = (paired.get(arm) or {}).get(metric)
+            if entry is None and arm not in paired:
+                points.append((arm, ms, _Line(metric, arms.get(arm, 0), 0.0, 0.0, 0.0, 0.0)))
+            elif entry is not None and (found := _line(metric, arms.get(arm, 0), entry)) is not None:
+                points.append((arm, ms, found[1]))
+        if len(points) >= 2 and any(line.low < line.high or line.centre for _, _, line in points):
+            unit = "points" if in_percent(metric, "") else "m"
+            charts.append(_speed_chart(metric, unit, points))
+    return charts
+
+
+def _speed_chart(metric: str, unit: str, points: Sequence[tuple[str, float, _Line]]) -> Chart:
+    with mpl.rc_context(RC):
+        figure = Figure(figsize=(WIDTH_IN, 2.7), layout="constrained")
+        axes = figure.add_subplot()
+        axes.axhline(0.0, color=INK, linewidth=0.9, alpha=0.7)
+        for arm, ms, line in points:
+            colour = ARM[line.arm % N_COLOURS]
+            axes.plot([ms, ms], [line.low, line.high], color=colour, linewidth=1.8)
+            axes.plot([ms], [line.centre], MARKERS[line.arm % len(MARKERS)], color=colour, markersize=7, label=arm)
+            axes.annotate(arm, (ms, line.centre), (7, 5), textcoords="offset points", fontsize=9, color=colour)
+        _log_time(axes, [ms for _, ms, _ in points])
+        axes.set_xlabel("ms per camera frame, median")
+        axes.set_ylabel("points worse" if unit == "points" else f"{unit} worse")
+        axes.tick_params(length=0)
+        return Chart(WORDS.get(metric, metric), "Paired with the baseline, which lies on the line; 95 % over scenes.", themed_svg(figure))
+
+
+def _log_time(axes: Axes, ms: Sequence[float]) -> None:
+    axes.set_xscale("log")
+    low, high = min(ms), max(ms)
+    axes.set_xlim(low / 1.6, high * 2.2)
+    ticks = [t for t in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000) if low / 1.6 <= t <= high * 2.2]
+    axes.set_xticks(ticks or [low])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def strata_chart(one: Strata) -> Chart | None:
+    """Draw the steadiness of plans by stratum; None where it is known in fewer than two."""
+    name = VALUES[0]
+    known = [s for s in one.strata if any(name in b.means for b in s.bins)]
+    if len(known) < 2:
+        return None
+    arms = sorted({b.arm for s in known for b in s.bins})
+    with mpl.rc_context(RC | {"axes.grid.axis": "y"}):
+        figure = Figure(figsize=(WIDTH_IN, 2.7), layout="constrained")
+        axes = figure.add_subplot()
+        for k, stratum in enumerate(known):
+            for b in stratum.bins:
+                if name not in b.means:
+                    continue
+                x = k + (arms.index(b.arm) + 1) / (len(arms) + 1) - 0.5
+                mean, low, high = b.means[name]
+                colour = ARM[b.arm % N_COLOURS]
+                if low is not None and high is not None:
+                    axes.plot([x, x], [max(low, 0.0), high], color=colour, linewidth=1.8)
+                axes.plot([x], [mean], MARKERS[b.arm % len(MARKERS)], color=colour, markersize=6)
+        for k in range(1, len(known)):
+            axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
+        axes.set_xticks(range(len(known)), [s.label.replace(" and more", "+").replace("below ", "< ") for s in known], fontsize=8)
+        axes.set_xlim(-0.5, len(known) - 0.5)
+        axes.set_ylim(bottom=0.0)
+        axes.set_ylabel("m between plans in a row")
+        axes.set_xlabel(one.axis)
+        axes.tick_params(length=0)
+        svg = themed_svg(figure)
+    return Chart(f"Steadiness of plans by {one.axis}", "Mean over steps of plan_deviation; bars: 95 % over scenes.", svg)

@@ -1,0 +1,210 @@
+"""Results by how far the ego was from the logged path, and by how much of the picture the renderer covered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from evaluators.aggregate.intervals import clustered
+from evaluators.report.events import COLLISION
+from evaluators.report.metric_info import meaning
+from evaluators.report.numbers import Cell, fixed, missing, plural, short
+from evaluators.report.run_folder import Own, Rollout, Run, series_by_cell
+
+DISTANCE, OPACITY = "lateral_offset_m", "opacity_mean"
+DISTANCE_EDGES_M = (0.25, 0.5, 1.0, 2.0)
+OPACITY_SHARES = (25, 50, 75)  # percentiles of the run's own frames: what is much covered depends on how much sky there is
+EVENTS = (("collision_at_fault", "at-fault collisions"), ("offroad", "off-road"))
+VALUES = ("plan_deviation", "min_ade@1.0s(gt)")
+SERIES = (DISTANCE, OPACITY, *VALUES, *COLLISION, "offroad", "eval_relevant")
+LEAST_STEPS = 10  # fewer steps in a stratum give no mean
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Bin:
+    """One renderer within one stratum.
+
+    Attributes:
+        seconds: Time driven there, of the scored part of all rollouts.
+        events: Rollouts whose first event of the kind began there, by metric.
+        means: Mean over steps by metric with its interval over scenes (low, high None where there is none); absent where unknown.
+    """
+
+    arm: int
+    renderer: str
+    seconds: float
+    rollouts: int
+    events: dict[str, int]
+    means: dict[str, tuple[float, float | None, float | None]]
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """A range of the variable with the renderers in it."""
+
+    label: str
+    bins: tuple[Bin, ...]
+
+
+@dataclass(frozen=True)
+class Strata:
+    """All ranges of one variable."""
+
+    title: str
+    note: str
+    axis: str
+    strata: tuple[Stratum, ...]
+
+
+@dataclass(frozen=True)
+class StratumRow:
+    """One line of the table."""
+
+    label: str
+    order: int
+    renderer: str
+    arm: int
+    cells: tuple[Cell, ...]  # time, events, values
+
+
+def strata(run: Run) -> list[Strata]:
+    """Split the scored steps of a run by distance and by opacity; a variable that the run does not hold is left out."""
+    series = series_by_cell(run.steps(SERIES))
+    steps = [_Steps(r, series[r.cell]) for r in run.rollouts if r.ok and DISTANCE in series.get(r.cell, {})]
+    steps = [one for one in steps if len(one.t_us)]
+    found = []
+    if steps:
+        labels = [*_labels(DISTANCE_EDGES_M, "m"), "not beside the path"]
+        note = "Time, events and plans by how far the ego's rear axle was from the logged path at that moment."
+        groups = [one.distance_bin() for one in steps]
+        found.append(_split("By distance from the logged path", note, "distance from the path", labels, steps, groups, run))
+    covered = [one for one in steps if one.opacity is not None]
+    if covered:
+        every = np.concatenate([one.opacity[np.isfinite(one.opacity)] for one in covered if one.opacity is not None])
+        edges = tuple(dict.fromkeys(round(float(v), 3) for v in np.percentile(every, OPACITY_SHARES))) if every.size else ()
+        note = "Opacity: mean over the picture of what the Gaussians cover; little means sky, or holes. Limits are quartiles of this run."
+        groups = [one.opacity_bin(edges) for one in covered]
+        found.append(_split("By rendered opacity", note, "rendered opacity", _labels(edges, ""), covered, groups, run))
+    return found
+
+
+def stratum_rows(one: Strata) -> list[StratumRow]:
+    """Lay out a table: ranges x renderers."""
+    rows = []
+    for order, stratum in enumerate(one.strata):
+        for b in stratum.bins:
+            counts = [Cell(str(b.events[name]), _rate(b.events[name], b.seconds), sort=b.events[name]) for name, _ in EVENTS]
+            values = [_mean(b, name) for name in VALUES]
+            time = Cell(f"{fixed(b.seconds, 1)}\u00a0s", plural(b.rollouts, "rollout"), sort=b.seconds)
+            rows.append(StratumRow(stratum.label, order, b.renderer, b.arm, (time, *counts, *values)))
+    return rows
+
+
+def heads() -> list[tuple[str, str]]:
+    """Give the heads of the columns with their meaning."""
+    events = [(word, f"rollouts whose first {word.removesuffix('s')} event began there") for _, word in EVENTS]
+    return [("time driven", "scored steps of all rollouts"), *events, *((f"{name} (m)", meaning(name)) for name in VALUES)]
+
+
+class _Steps:
+    """The scored steps of one rollout: after the warm-up, up to its first counted event."""
+
+    def __init__(self, rollout: Rollout, own: Own) -> None:
+        self.rollout, self.own = rollout, own
+        t_us = own["eval_relevant"][0] if "eval_relevant" in own else own[DISTANCE][0]
+        counted = own["eval_relevant"][1] >= 0.5 if "eval_relevant" in own else np.ones(len(t_us), dtype=bool)
+        self.first: dict[str, int] = {}
+        for name, _ in EVENTS:
+            if name in own and rollout.flag(name):
+                times, values = own[name]
+                hit = times[(values >= 0.5) & np.isin(times, t_us[counted])]
+                if len(hit):
+                    self.first[name] = int(hit[0])
+        end = min(self.first.values(), default=None)
+        self.t_us: I64 = t_us[counted & (t_us <= end)] if end is not None else t_us[counted]
+        self.step_s = float(np.median(np.diff(t_us))) * 1e-6 if len(t_us) > 1 else 0.0
+        self.opacity = self._at(OPACITY)
+
+    def _at(self, name: str) -> F64 | None:
+        """Return a series at the scored steps: the newest value, NaN before the first; several cameras are averaged."""
+        if name not in self.own:
+            return None
+        times, where = np.unique(self.own[name][0], return_inverse=True)
+        values = np.bincount(where, self.own[name][1]) / np.bincount(where)
+        at = np.searchsorted(times, self.t_us, side="right") - 1
+        return np.where(at >= 0, values[np.maximum(at, 0)], np.nan)
+
+    def distance_bin(self) -> I64:
+        times, values = self.own[DISTANCE]
+        at = np.searchsorted(times, self.t_us)
+        beside = (at < len(times)) & (times[np.minimum(at, len(times) - 1)] == self.t_us)
+        found = np.digitize(np.abs(values[np.minimum(at, len(times) - 1)]), DISTANCE_EDGES_M)
+        return np.where(beside, found, len(DISTANCE_EDGES_M) + 1)
+
+    def opacity_bin(self, edges: Sequence[float]) -> I64:
+        assert self.opacity is not None
+        return np.where(np.isfinite(self.opacity), np.digitize(self.opacity, edges), -1)
+
+    def values(self, name: str, group: I64, k: int) -> F64:
+        """Return the values of a metric at the steps of one group; times without a value have none."""
+        if name not in self.own:
+            return np.zeros(0)
+        times, values = self.own[name]
+        return np.asarray(values[np.isin(times, self.t_us[group == k])])
+
+
+def _split(title: str, note: str, axis: str, labels: Sequence[str], steps: list[_Steps], groups: list[I64], run: Run) -> Strata:
+    strata_found = []
+    for k, label in enumerate(labels):
+        bins = []
+        for arm, renderer in enumerate(run.renderers):
+            mine = [(s, g) for s, g in zip(steps, groups, strict=True) if s.rollout.renderer == renderer and bool((g == k).any())]
+            if mine:
+                bins.append(_bin(arm, renderer, mine, k))
+        if bins:
+            strata_found.append(Stratum(label, tuple(bins)))
+    return Strata(title, note, axis, tuple(strata_found))
+
+
+def _bin(arm: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) -> Bin:
+    seconds = sum(float(np.count_nonzero(g == k)) * s.step_s for s, g in mine)
+    events = {}
+    for name, _ in EVENTS:
+        began = [(s.first[name], s, g) for s, g in mine if name in s.first]
+        events[name] = sum(bool((g[s.t_us == t_us] == k).any()) for t_us, s, g in began)
+    means = {}
+    for name in VALUES:
+        parts = [(s.values(name, g, k), s.rollout.scene) for s, g in mine]
+        values = np.concatenate([v for v, _ in parts])
+        scenes = [scene for v, scene in parts for _ in v]
+        if len(values) >= LEAST_STEPS:
+            interval = clustered(values, scenes)
+            means[name] = (float(np.mean(values)), interval.low, interval.high)
+    return Bin(arm, renderer, seconds, len(mine), events, means)
+
+
+def _mean(b: Bin, name: str) -> Cell:
+    if name not in b.means:
+        return missing(f"fewer than {LEAST_STEPS} steps here have it")
+    mean, low, high = b.means[name]
+    detail = "" if low is None or high is None else f"{short(low)} to {short(high)}"
+    return Cell(short(mean), "" if detail else "no interval: it needs two scenes", detail, sort=mean)
+
+
+def _rate(n: int, seconds: float) -> str:
+    return f"{short(100 * n / seconds)} per 100 s driven" if seconds > 0 else ""
+
+
+def _labels(edges: Sequence[float], unit: str) -> list[str]:
+    tail = f"\u00a0{unit}" if unit else ""
+    if not edges:
+        return ["all"]
+    inner = [f"{a:g} to {b:g}{tail}" for a, b in pairwise(edges)]
+    return [f"below {edges[0]:g}{tail}", *inner, f"{edges[-1]:g}{tail} and more"]
