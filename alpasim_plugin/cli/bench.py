@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from alpasim_plugin.cli import bench_evaluators
 from alpasim_plugin.gaussians.bench import bench_raster
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts.")
@@ -18,6 +19,9 @@ app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts."
 @app.callback()
 def bench() -> None:
     """Measure speed and error of parts."""
+
+
+app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evaluators)
 
 
 @app.command("raster", epilog="Example: `simrun bench raster --repeats 20`")
