@@ -7,18 +7,34 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import RolloutLog, Scene
+from alpasim_plugin.types import MetricSeries, RolloutLog, Scene
+from evaluators.presets import Preset
 from scenarios.usdz import read_usdz_scene
 
 
 def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, Scene]:
     return read_asl(log), read_usdz_scene(scene, rails)
+
+
+@lru_cache(maxsize=128)
+def scored(log: Path, archive: Path, preset: Preset, rails: bool = True) -> tuple[MetricSeries, ...]:
+    """Score a log against its scene; several tests look at the same series."""
+    from evaluators import score
+
+    return tuple(score(*read_case(log, archive, rails), preset))
+
+
+def close(got: float, want: float) -> bool:
+    """Compare as the goldens do: 1e-4 absolute or 1e-5 relative, since poses are float32 there."""
+    same = got == want or (np.isnan(got) and np.isnan(want))
+    return same or abs(got - want) <= max(1e-4, 1e-5 * abs(want))
 
 
 def expected(log: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alpasim_plugin.types import MetricSeries
-from evaluators import PRESETS, reduce_rollout, score
+from evaluators import PRESETS, reduce_rollout
 from evaluators.presets import Preset
-from tests.evaluators.golden import expected, read_case
+from tests.evaluators.golden import close, expected, scored
 
 ALPASIM = PRESETS["alpasim"]
 OTHER = replace(
@@ -35,17 +33,6 @@ SCENES = (
     *("intersection-a", "lane-change-a", "odd-rings-a", "opendrive-a", "plans-a", "rear-hit-a", "replay-a", "seam-a", "seam-c"),
     *("stacked-a", "standstill-a", "standstill-c", "two-contacts-a", "two-contacts-c", "vru-offset-a"),
 )
-
-
-def close(got: float, want: float) -> bool:
-    same = got == want or (np.isnan(got) and np.isnan(want))
-    return same or abs(got - want) <= max(1e-4, 1e-5 * abs(want))
-
-
-@lru_cache(maxsize=2)
-def scored(log: Path, archive: Path, preset: Preset, rails: bool = True) -> tuple[MetricSeries, ...]:
-    rollout, scene = read_case(log, archive, rails)
-    return tuple(score(rollout, scene, preset))
 
 
 def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True) -> None:

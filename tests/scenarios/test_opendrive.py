@@ -274,7 +274,8 @@ def test_lanes_of_real_maps_are_sound(shared_data, name):
         for after in one.successors:
             follower = found.lanes[after]
             gap = np.hypot(*(one.centre[-1, :2] - follower.centre[0, :2]))
-            assert gap < 0.5, (one.lane_id, after, gap)
+            # Town03 links shoulders across the tips of two head-on roads that are 8 cm and 96 cm long.
+            assert gap < 0.01 or one.kind == "shoulder", (one.lane_id, after, gap)
 
 
 def test_widths_of_a_real_straight_road(shared_data):
