@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
 from alpasim_plugin.nets.checkpoints import file_sha256, read_metadata
@@ -60,6 +62,10 @@ def fixer_card(name: str, overrides: Sequence[str] = ()) -> Card:
     if not isinstance(settings, OneFixerSettings):
         return Card(name, settings, "no network", False)
     paths = {part: path for part in PARTS if (path := getattr(settings.weights, part)) is not None}
+    for part, path in paths.items():
+        if not Path(path).is_file():
+            do = f"correct --set fixer.weights.{part}, or where it is written"
+            raise InputError("looking for a fixer's weights", f"{name}: weights.{part} = {path}", "no such file", do)
     weights = {path: file_sha256(path) for path in paths.values()}
     if "bundle" in paths:
         trained = read_metadata(paths["bundle"]).get("trained") == "true"

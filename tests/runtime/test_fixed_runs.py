@@ -1,0 +1,117 @@
+"""Whole runs with fixers: any number of workers, resume, and what every table says of an untrained fixer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.runtime.cell import MANIFEST
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runtime.run import execute_run
+from scenarios.suite import expand
+from tests.runtime.test_runs import comparable, run
+
+SMALL_NET = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random")
+SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height: 64}]")
+
+
+def plan_of(seeds: tuple[int, ...] = (0, 1), fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
+    refs = expand("smoke/straight", SCENE)
+    return make_plan(refs, ("clean", "onefixer+clean"), ("lane-camera",), seeds, RunOptions(fixer=fixer))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a finished run of one worker."""
+    root = tmp_path_factory.mktemp("run")
+    run(plan_of(), root)
+    return root
+
+
+def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp_path: Path) -> None:
+    run(plan_of(), tmp_path, workers=2)
+    assert comparable(tmp_path) == comparable(finished)
+    for path in finished.rglob("frames.jsonl"):
+        assert (tmp_path / path.relative_to(finished)).read_bytes() == path.read_bytes()
+
+
+def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path) -> None:
+    plan = plan_of()
+    before = comparable(finished)
+    fixed = next(cell for cell in plan.cells if cell.renderer == "onefixer+clean")
+    (finished / fixed.folder / MANIFEST).unlink()
+    _, heard = run(plan, finished)
+    assert heard.fates.count(("ok", False)) == 1
+    assert comparable(finished) == before
+    _, heard = run(plan_of(fixer=(*SMALL_NET, "tolerance_m=0")), finished, resume=True)
+    assert heard.fates.count(("ok", True)) == 2  # the plain renderer's
+    run(plan, finished, resume=True)
+
+
+def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
+    said = "untrained (random)"
+    info = json.loads((finished / "run.json").read_text())
+    assert said in info["fixers"]["onefixer+clean"]["label"]
+    assert info["fixers"]["onefixer+clean"]["settings"]["dit"]["width"] == 32
+    assert info["config"]["fixer"] == list(SMALL_NET)
+    assert info["weights"] == {}
+    summary = json.loads((finished / "summary.json").read_text())
+    entry = summary["fixers"]["onefixer+clean"]
+    assert said in entry["label"]
+    assert entry["trained"] is False
+    assert list(summary["fixers"]) == ["onefixer+clean"]
+    manifest = json.loads(next(finished.glob("rollouts/onefixer+clean/**/manifest.json")).read_text())
+    assert said in manifest["fixer"]["label"]
+    assert said in (finished / "summary.md").read_text().replace("\\", "")
+    page = (finished / "report.html").read_text()
+    assert '<div class="caution">onefixer+clean is' in page
+    assert 'id="table-fixers"' in page
+    log = read_asl(next(finished.glob("rollouts/onefixer+clean/**/rollout.asl")), images=False)
+    assert said in log.info["versions"]["sensorsim"]
+
+
+def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
+    summary = json.loads((finished / "summary.json").read_text())
+    entry = summary["fixers"]["onefixer+clean"]
+    assert entry["frames"] == 30  # 15 of each seed
+    assert entry["foretold"] == 30 - 2 * 3
+    assert 0 < entry["hits"] <= entry["foretold"]
+    assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["foretold"], abs=1e-4)
+    assert {"render", "map", "fix"} <= set(summary["speed"]["onefixer+clean"]["stages"])
+    steps = pq.read_table(finished / "steps.parquet").to_pylist()
+    shown = [row["value"] for row in steps if row["metric"] == "pose_error_m"]
+    assert len(shown) == entry["frames"]
+    assert max(shown) <= 0.02
+    assert max(shown) == pytest.approx(entry["shown_error"]["camera_m"])
+
+
+def test_a_plain_run_knows_nothing_of_fixers(tmp_path: Path) -> None:
+    plan = make_plan(expand("smoke/straight", SCENE), ("clean",), ("constant-velocity",), (0,), RunOptions())
+    result = execute_run(plan, tmp_path, 1, ["simrun"], type("P", (), {"started": print, "rollout_done": print})(), certificate="none")
+    assert result.summary["fixers"] == {}
+    assert 'id="fixers"' not in (tmp_path / "report.html").read_text()
+
+
+def test_the_terminal_names_the_fixer_before_and_after(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["--renderer", "identity+clean", "--policy", "lane-camera", "--workers", "1", "--certify", "none", "--out", str(tmp_path)]
+    for text in (*SCENE, "fixer.mode=chunk"):
+        command += ["--set", text]
+    assert run_command([*command, "smoke/straight"]) == 0
+    out = capsys.readouterr()
+    assert "identity+clean: identity, no network, chunk" in out.err
+    assert "identity+clean: identity, no network, chunk" in out.out
+    assert run_command([*command[:2], "--dry-run", "smoke/straight"]) == 0
+    assert "identity+clean: identity, no network, speculative" in capsys.readouterr().out
+
+
+def test_list_fixers_says_whose_weights_they_have(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["list", "fixers", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert "[no network]" in listed["identity"]
+    assert "[weights missing]" in listed["onefixer-2b"]
+    assert set(listed) >= {"onefixer", "onefixer-tiny", "onefixer-s"}
