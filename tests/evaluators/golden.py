@@ -37,9 +37,9 @@ def close(got: float, want: float) -> bool:
     return same or abs(got - want) <= max(1e-4, 1e-5 * abs(want))
 
 
-def expected(log: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return AlpaSim's table of a log: metric -> times, values, valid; the placeholder row of an empty metric is left out."""
-    table = pq.read_table(log.parent / "expected_metrics.parquet").to_pydict()
+def expected(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return AlpaSim's table in a log's folder: metric -> times, values, valid; the placeholder row of an empty metric is left out."""
+    table = pq.read_table(folder / "expected_metrics.parquet").to_pydict()
     out: dict[str, list] = {}
     for name, t, value, valid in zip(table["name"], table["timestamps_us"], table["values"], table["valid"], strict=True):
         rows = out.setdefault(name, [])
@@ -58,7 +58,7 @@ def parity_table(folder: Path) -> str:
         name = log.parent.parent.name
         rollout, scene = read_case(log, folder / "scenes" / f"{name}.usdz")
         found = {one.name: one for one in score(rollout, scene, "alpasim")}
-        for metric, (_, value, _) in expected(log).items():
+        for metric, (_, value, _) in expected(log.parent).items():
             got = found[metric].value
             both_missing = np.isnan(got) & np.isnan(value)
             off = np.where((got == value) | both_missing, 0.0, np.abs(got - value))

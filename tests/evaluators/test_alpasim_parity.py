@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evaluators import PRESETS, reduce_rollout
+from evaluators.alpasim import load_settings
 from evaluators.presets import Preset
 from tests.evaluators.golden import close, expected, scored
 
 ALPASIM = PRESETS["alpasim"]
-OTHER = replace(
-    ALPASIM,
-    name="other-settings",
-    shrink=0.15,
-    roundness=0.9,
-    stop_beyond_gt_m=2.0,
-    open_loop_horizon_us=1_300_000,
-    plan_decay=0.5,
-    plan_with_z=True,
-    min_ade_with_z=True,
-    min_ade_target="self",
-    min_ade_horizons_s=(0.4, 2.0, 3.1),
-)
 IDS = {"clipgt_id", "rollout_id", "run_name", "run_uuid"}
 SCENES = (
     *("black-frame-a", "curve-offroad-a", "curve-offroad-c", "cut-in-a", "cut-in-c", "drift-a", "front-brake-a", "heading-pi-a"),
@@ -35,9 +22,9 @@ SCENES = (
 )
 
 
-def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True) -> None:
+def assert_steps(log: Path, archive: Path, preset: Preset, rails: bool = True, table: Path | None = None) -> None:
     found = {one.name: one for one in scored(log, archive, preset, rails)}
-    want = expected(log)
+    want = expected(table or log.parent)
     assert set(found) == set(want)
     for name in want:
         t_us, value, valid = want[name]
@@ -90,10 +77,12 @@ def test_other_settings_of_the_scorers_are_followed(shared_data):
     golden = shared_data / "alpasim-golden"
     folder = golden / "other-settings"
     rows = summary_rows(folder)
+    preset = load_settings(folder / "eval-config.yaml").preset()
     assert len(rows) >= 11
     for (scene, rollout), row in rows.items():
         log, archive = golden / "rollouts" / scene / rollout / "rollout.asl", golden / "scenes" / f"{scene}.usdz"
-        assert_reduced(log, archive, OTHER, row["metrics"])
+        assert_steps(log, archive, preset, table=folder / "rollouts" / scene / rollout)
+        assert_reduced(log, archive, preset, row["metrics"])
 
 
 # Without any map AlpaSim takes 0 for the missing off-road column when it combines events; here that stays unknown.
