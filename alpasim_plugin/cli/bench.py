@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.cli import bench_evaluators
+from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets
 from alpasim_plugin.gaussians.bench import bench_raster
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts.")
@@ -22,6 +22,8 @@ def bench() -> None:
 
 
 app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evaluators)
+app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
+app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
 
 
 @app.command("raster", epilog="Example: `simrun bench raster --repeats 20`")

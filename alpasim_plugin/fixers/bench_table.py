@@ -1,0 +1,111 @@
+"""The fixer's bench as a Markdown table and as a plot of speed against error."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from alpasim_plugin.fixers.bench import Row
+from alpasim_plugin.fixers.measure import STAGES
+
+HEAD = (
+    "setting", "weights", *(f"{stage} ms" for stage in STAGES), "all-in ms", "first block ms", "peak MB",
+    "rounding: mean, max, PSNR", "model: mean, max, PSNR", "hits",
+)  # fmt: skip
+FLOOR = 1e-4  # grey levels; where the plot puts errors that are zero
+MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P"}
+MARK = "<!-- bench fixer: {} -->"
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Return one table per size; times are median / 95th percentile per frame, errors grey levels and dB."""
+    parts = []
+    for size in dict.fromkeys(row.size for row in rows):
+        mine = [row for row in rows if row.size == size]
+        frames = max(row.frames for row in mine)
+        parts.append(f"**{size[0]}x{size[1]}**, {frames} frames\n")
+        parts.append("| " + " | ".join(HEAD) + " |")
+        parts.append("|---|---|" + "---:|" * (len(HEAD) - 2))
+        parts += ["| " + " | ".join(cells(row)) + " |" for row in mine]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def cells(row: Row) -> list[str]:
+    """Return a row's texts under `HEAD`."""
+    name = f"{row.group}: {row.name}"
+    if row.problem:
+        return [name, row.weights, f"not measured: {row.problem}", *([""] * (len(HEAD) - 3))]
+    return [
+        name,
+        row.weights,
+        *(_times(row, stage) for stage in (*STAGES, "all-in")),
+        _number(row.first_ms, ".0f"),
+        _number(row.peak_mb, ".0f"),
+        _error(row.rounding),
+        _error(row.model),
+        "" if row.hit_rate is None else f"{row.hit_rate:.0%}",
+    ]
+
+
+def _times(row: Row, stage: str) -> str:
+    if stage not in row.ms:
+        return ""
+    p50, p95 = row.ms[stage]
+    digits = 2 if p95 < 1 else 1
+    return f"{p50:.{digits}f} / {p95:.{digits}f}"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+def _error(error: tuple[float, int, float | None] | None) -> str:
+    if error is None:
+        return ""
+    mean, largest, psnr = error
+    return "equal" if psnr is None else f"{mean:.2g}, {largest}, {psnr:.1f}"
+
+
+def plot(rows: Sequence[Row], path: str | Path) -> None:
+    """Draw all-in time per frame against both errors, one point a setting, and write a PNG."""
+    sizes = list(dict.fromkeys(row.size for row in rows))
+    figure = Figure(figsize=(13, 5.6 * len(sizes)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(sizes), 2, squeeze=False)
+    titles = {"rounding": "rounding: same setting", "model": "model: base, window over the whole clip"}
+    for line, size in zip(axes, sizes, strict=True):
+        mine = [row for row in rows if row.size == size and not row.problem]
+        for ax, (kind, title) in zip(line, titles.items(), strict=True):
+            shown = [(row, error) for row in mine if (error := getattr(row, kind)) is not None]
+            points = [(row.ms["all-in"][0], max(error[0], FLOOR)) for row, error in shown]
+            for (row, _), (x, y) in zip(shown, points, strict=True):
+                ax.plot(x, y, MARKERS[row.group], color=f"C{list(MARKERS).index(row.group)}", markersize=7)
+                ax.annotate(row.name, (x, y), xytext=(6, 3), textcoords="offset points", fontsize=7)
+            ax.set_xscale("log")
+            ax.set_yscale("log")
+            ax.set_xlabel("all-in, ms per frame (median)")
+            ax.set_ylabel("mean error, grey levels")
+            ax.set_title(f"{size[0]}x{size[1]}: error against float32 whole clip, {title}", fontsize=9)
+            ax.grid(visible=True, which="both", alpha=0.25)
+        for group, marker in MARKERS.items():
+            line[0].plot([], [], marker, color=f"C{list(MARKERS).index(group)}", label=group)
+        line[0].legend(fontsize=8, loc="best")
+    figure.savefig(path, dpi=110)
+
+
+def put_between_marks(page: str, name: str, text: str) -> str:
+    """Replace what stands in a page between ``<!-- bench fixer: NAME -->`` and ``<!-- bench fixer: end of NAME -->``.
+
+    Raises:
+        ValueError: When the page has no such marks.
+    """
+    begin, end = MARK.format(name), MARK.format(f"end of {name}")
+    pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.S)
+    if not pattern.search(page):
+        raise ValueError(f"no marks {begin} ... {end}")
+    return pattern.sub(lambda _: f"{begin}\n{text.strip()}\n{end}", page)
