@@ -2,6 +2,9 @@
 
 A run does not touch the past: it may be made again from the same state, with other frames, any number of times. Its result becomes the past
 when its new state is kept. Only one draft is open at a time, for the cache has one open block.
+
+On a GPU a block is recorded once its shapes repeat, and replayed from then on (`nets.graphs`): one recording for the block, one for the
+cache write, per rollout. A clock at the stages needs every stage to run by itself, so it switches recordings off.
 """
 
 from __future__ import annotations
@@ -9,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,18 +23,26 @@ from alpasim_plugin.fixers.networks import Networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.carry import State
-from alpasim_plugin.nets.kv_cache import BlockCache
+from alpasim_plugin.nets.graphs import CudaRecorder, Function, GraphedFunction, Recorder
+from alpasim_plugin.nets.kv_cache import RollingCache
 from alpasim_plugin.nets.sampling import finalise, mixed_source, opacity_mask, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import from_names
 
 Stage = Callable[[str], AbstractContextManager[object]]
 
 
+def no_clock(name: str) -> AbstractContextManager[object]:
+    """Let a stage pass untimed."""
+    return nullcontext()
+
+
 @dataclass(eq=False)
 class History:
     """The transformer's cache, which of the states stands at its end, and how to keep the open block."""
 
-    cache: BlockCache
+    cache: RollingCache
+    fix: Function  # the block, as it is or through a recording
+    finalise: Function  # the cache write
     kept: PipelineState | None = None
     draft: PipelineState | None = None
     write: Callable[[], None] = field(default=lambda: None, repr=False)
@@ -53,11 +66,17 @@ class BlockPipeline:
         networks: Shared, never written to.
         settings: Window, steps, history, source, decoder.
         stage: Called as ``with stage(name):`` around ``encode``, ``source``, ``dit``, ``decode`` and ``cache write``, for timing.
+        recorder: Makes recordings; None takes CUDA graphs on a GPU unless the settings say ``graphs: off``, and nothing elsewhere.
     """
 
-    def __init__(self, networks: Networks, settings: OneFixerSettings, stage: Stage = lambda name: nullcontext()) -> None:
+    def __init__(
+        self, networks: Networks, settings: OneFixerSettings, stage: Stage = no_clock, recorder: Recorder | None = None
+    ) -> None:
         self.networks, self.settings, self.stage = networks, settings, stage
         self.schedule = from_names(settings.steps)
+        if recorder is None and settings.graphs != "off" and networks.device.type == "cuda":
+            recorder = CudaRecorder(networks.device)
+        self.recorder = recorder
 
     @property
     def draws(self) -> int:
@@ -72,7 +91,10 @@ class BlockPipeline:
             height, width: Pixels, multiples of 16.
         """
         cache = self.networks.dit.new_cache(batch, height // 8, width // 8, self.settings.window, self.settings.sink)
-        history = History(cache)
+        assert isinstance(cache, RollingCache), "a cache for inference"
+        parts = partial(self._fix, cache), partial(self._finalise, cache)
+        fix, finalise = parts if self.recorder is None else (GraphedFunction(part, self.recorder) for part in parts)
+        history = History(cache, fix, finalise)
         history.kept = PipelineState(0, None, None, None, history)
         return history.kept
 
@@ -96,37 +118,71 @@ class BlockPipeline:
             InputError: A state that has been overtaken, a map that comes or goes within a rollout, or another shape.
         """
         self.keep(state)
-        nets, settings = self.networks, self.settings
+        settings = self.settings
         if state.with_map not in (None, sdmap is not None):
             found = "a map after blocks without one" if sdmap is not None else "no map after blocks with one"
             raise InputError("fixing a block", f"latent {state.latent}", found, "give the map in every block of a rollout, or in none")
+        with self.stage("source"):
+            mask = None if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=state.latent == 0)
+        cache, history = state.history.cache, state.history
+        block = rgb, alpha, sdmap, mask, list(noise[: len(self.schedule)]), state.encoder, state.decoder
+        out, z_0, z_map, encoder, decoder = self._call(history, history.fix, *block)
+        new = PipelineState(state.latent + z_0.shape[2], encoder, decoder, sdmap is not None, history)
+
+        def write() -> None:
+            if settings.history == "finalise":
+                self._call(history, history.finalise, z_0, noise[-1], z_map)
+            cache.commit()
+
+        history.draft, history.write = new, write
+        return out, new
+
+    def _call(self, history: History, function: Function, *args: object) -> Any:
+        """Run a part of the block that is open in the cache, through its recording where there is one."""
+        if not isinstance(function, GraphedFunction):
+            return function(*args)
+        if self.stage is not no_clock:
+            return function.eagerly(*args)
+        history.cache.begin(self.settings.block_latents)
+        return function(*args, key=history.cache.in_sight)
+
+    def _fix(
+        self,
+        cache: RollingCache,
+        rgb: Tensor,
+        alpha: Tensor | None,
+        sdmap: Tensor | None,
+        mask: Tensor | None,
+        noise: Sequence[Tensor],
+        encoder: State | None,
+        decoder: State | None,
+    ) -> tuple[Tensor, Tensor, Tensor, State, State]:
+        """Make frames of frames; writes to nothing but the open block of the cache.
+
+        Returns:
+            Frames, latents, the map's latents, and both codecs' states after the block.
+        """
+        nets = self.networks
         with self.stage("encode"):
             views = rgb if sdmap is None else torch.cat([rgb, sdmap])
-            latents, encoder = nets.vae.encode_next(views, state.encoder)
+            latents, encoder = nets.vae.encode_next(views, encoder)
             z_render, z_map = latents[: len(rgb)].float(), latents[len(rgb) :].float()
             z_map = torch.zeros_like(z_render) if sdmap is None else z_map
         with self.stage("source"):
-            mask = None if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=state.latent == 0)
-            sources = [z_render if mask is None else mixed_source(z_render, mask, eps) for eps in noise[: len(self.schedule)]]
+            sources = [z_render if mask is None else mixed_source(z_render, mask, eps) for eps in noise]
         with self.stage("dit"):
-            cache = state.history.cache
             z_0 = sample_block(nets.dit, sources, nets.text, z_map, cache, self.schedule, "last-forward", commit=False)
         with self.stage("decode"):
-            if settings.decoder.kind == "render":
+            if self.settings.decoder.kind == "render":
                 assert isinstance(nets.decoder, TinyVAE), "settings allow no other decoder to see the render"
-                out, decoder = nets.decoder.decode_next(z_0, state.decoder, render=rgb, opacity=alpha, clamp=False)
+                out, decoder = nets.decoder.decode_next(z_0, decoder, render=rgb, opacity=alpha, clamp=False)
             else:
-                out, decoder = nets.decoder.decode_next(z_0, state.decoder, clamp=False)
-        new = PipelineState(state.latent + latents.shape[2], encoder, decoder, sdmap is not None, state.history)
+                out, decoder = nets.decoder.decode_next(z_0, decoder, clamp=False)
+        return out, z_0, z_map, encoder, decoder
 
-        def write() -> None:
-            if settings.history == "last-forward":
-                cache.commit()
-            else:
-                finalise(nets.finalise_dit, z_0, noise[-1], nets.text, z_map, cache)
-
-        state.history.draft, state.history.write = new, write
-        return out, new
+    def _finalise(self, cache: RollingCache, z_0: Tensor, eps: Tensor, z_map: Tensor) -> None:
+        nets = self.networks
+        finalise(nets.finalise_dit, z_0, eps, nets.text, z_map, cache, commit=False)
 
     @torch.inference_mode()
     def keep(self, state: PipelineState) -> PipelineState:

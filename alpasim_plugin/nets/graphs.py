@@ -109,7 +109,7 @@ class GraphedFunction:
         limit: Shapes recorded at most; each holds its buffers for good.
 
     Attributes:
-        counts: Calls so far that ran ``eager``, ``recorded`` (and replayed) or ``replayed``, and those ``beyond limit``.
+        counts: Calls so far that ran ``eager``, ``recorded`` (and replayed) or ``replayed``, those ``beyond limit`` and ``unrecorded``.
 
     Example:
         >>> double = GraphedFunction(lambda x: 2 * x, EagerRecorder(), warmups=1)
@@ -150,6 +150,11 @@ class GraphedFunction:
                     kept.copy_(new)
         entry.recording.replay()
         return tree_map_only(Tensor, lambda x: x.clone(memory_format=torch.preserve_format), entry.recording.outputs)
+
+    def eagerly(self, *args: Any) -> Any:
+        """Run the function as it is, on request; counted as ``unrecorded``."""
+        self.counts["unrecorded"] += 1
+        return self._function(*args)
 
     @staticmethod
     def _signature(args: Any, key: Hashable) -> Hashable:

@@ -135,9 +135,9 @@ class RollingCache(BlockCache):
         return 2 * self.keys.numel() * self.keys.element_size()
 
     @property
-    def in_sight(self) -> int:
-        """Latents that the open block attends to; it grows until the window is full, then stays."""
-        return min(self.size, self.filled + self.open_latents)
+    def in_sight(self) -> tuple[int, int, bool]:
+        """What of the buffer the open block attends to: latents, sinks, whether the block fits; settles once the window is full."""
+        return min(self.size, self.filled + self.open_latents), min(self.sink, self.filled), self._fits
 
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
@@ -161,13 +161,9 @@ class RollingCache(BlockCache):
         # A block longer than the ring sees itself whole but leaves only its newest latents behind.
         kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
-        self._source = None if self._fits else self._token_rows([i - self.filled for i in kept]).to(self.device)
         with torch.inference_mode(False):
-            rows = self._token_rows(slots)
-            if self._rows.shape == rows.shape:
-                self._rows.copy_(rows)
-            else:
-                self._rows = rows.to(self.device)
+            self._rows = self._keep_in_place(self._rows, slots)
+            self._source = None if self._fits else self._keep_in_place(self._source, [i - self.filled for i in kept])
         return table
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
@@ -177,9 +173,9 @@ class RollingCache(BlockCache):
         for buffer, own in ((keys, own_k), (values, own_v)):
             buffer.index_copy_(1, self._rows, own if self._source is None else own[:, self._source])
         if self._fits:
-            end = self.in_sight * self.tokens
+            end = self.in_sight[0] * self.tokens
             return attend(q, keys[:, :end], values[:, :end])
-        past = min(self.sink, self.filled) * self.tokens
+        past = self.in_sight[1] * self.tokens
         return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
 
     def history(self, layer: int) -> tuple[Tensor, Tensor]:
@@ -189,6 +185,11 @@ class RollingCache(BlockCache):
         slots = [*range(min(self.sink, self.filled)), *(self.sink + (i - self.sink) % ring for i in rolling)]
         rows = self._token_rows(slots).to(self.device)
         return self.keys[layer][:, rows], self.values[layer][:, rows]
+
+    def _keep_in_place(self, old: Tensor | None, latents: list[int]) -> Tensor:
+        """Return the rows of these latents, in the old tensor's storage where they are as many."""
+        rows = self._token_rows(latents)
+        return rows.to(self.device) if old is None or old.shape != rows.shape else old.copy_(rows)
 
     def _token_rows(self, latents: list[int]) -> Tensor:
         first = torch.tensor(latents, dtype=torch.long, device="cpu")[:, None] * self.tokens
