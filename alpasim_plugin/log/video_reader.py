@@ -107,8 +107,8 @@ class VideoReader:
 
     def _begin(self) -> None:
         if not self._container.streams.video:
-            kinds = ", ".join(sorted({stream.type for stream in self._container.streams})) or "nothing"
-            raise self._refusal(f"no video stream ({kinds} only)")
+            kinds = ", ".join(sorted({stream.type for stream in self._container.streams}))
+            raise self._refusal(f"no video stream ({kinds} only)" if kinds else "no streams at all")
         self._stream = self._container.streams.video[0]
         self._stream.thread_type = "AUTO"
         self._decoded = self._decode()

@@ -124,9 +124,24 @@ def sound_only(folder: Path) -> Path:
     return path
 
 
+def without_frames(folder: Path) -> Path:
+    with av.open(str(folder / "none.avi"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        container.start_encoding()
+    return folder / "none.avi"
+
+
+def empty(folder: Path) -> Path:
+    (folder / "empty.mp4").touch()
+    return folder / "empty.mp4"
+
+
 @pytest.mark.parametrize(
     ("make", "found"),
     [
+        (without_frames, "no frames"),
+        (empty, "Invalid data"),
         (cut_short, r"stops after frame \d+ of 40|damage after frame"),
         (damaged, "damage after frame"),
         (sound_only, "no video stream"),
