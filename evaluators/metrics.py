@@ -53,6 +53,7 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
     "route_distance_m": MetricInfo(
         "m", "lower", "mean", "mean over the rollout of the distance from the recorded path", is_headline=True
     ),
+    "lateral_bias_m": MetricInfo("m", "none", "mean", "mean signed distance from the recorded path, left of it positive"),
     "dist_to_gt_location": MetricInfo("m", "lower", "max", "distance of the ego centre from where the recording is at that time"),
     "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached", is_headline=True, is_share=True),
     "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then", is_share=True),

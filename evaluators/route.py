@@ -41,6 +41,27 @@ def to_path(path: F64, points: F64) -> tuple[F64, F64]:
     return np.asarray(shapely.distance(line, at)), np.asarray(shapely.line_locate_point(line, at))
 
 
+def left_of(path: F64, s: F64, points: F64) -> F64:
+    """Return ``(T,)`` +1 where a point lies left of the path, -1 right of it, 0 on it, NaN where the path has no length.
+
+    Args:
+        path: ``(N, 2)`` vertices.
+        s: ``(T,)`` arc length of the nearest point of the path.
+        points: ``(T, 2)``.
+
+    At a corner the direction is that of the segment which the nearest point ends.
+    """
+    at = arc_lengths(path)
+    steps = np.diff(path, axis=0)
+    long = np.flatnonzero(np.diff(at) > 0)
+    if not len(long):
+        return np.full(len(points), np.nan)
+    segment = long[np.clip(np.searchsorted(at[long + 1], s), 0, len(long) - 1)]
+    offset = points - path[segment]
+    along = steps[segment]
+    return np.asarray(np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]))
+
+
 def progress_so_far(path: F64, points: F64) -> F64:
     """Return ``(T,)`` how far point k has come along the first k + 1 vertices of a path, as a share of their length.
 
@@ -110,7 +131,9 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
     ]
     if preset.aliases:
         return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
-    return [*out, series("route_distance_m", t_us, distance_m)]
+    side = left_of(path, s, ego)
+    bias = series("lateral_bias_m", t_us, side * distance_m, np.isfinite(side), "the recorded path has no direction")
+    return [*out, series("route_distance_m", t_us, distance_m), bias]
 
 
 def driven(ego: F64, first: int) -> F64:

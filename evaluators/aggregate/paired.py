@@ -13,7 +13,7 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, I64, Bool
-from evaluators.aggregate.intervals import Interval, cluster_means, rate_interval, t_interval
+from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, t_bounds, t_interval
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
 from evaluators.aggregate.rows import Cell, Row, Side, failure_of, metric_names, reason_of, sides
 from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
@@ -110,37 +110,53 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
     entry["p_value"], entry["test"] = p_value(means, facts.is_flag)
     entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, facts.direction)
     entry["difference"] = difference(interval.bounds, entry["p_value"], facts.direction)
-    if entry["verdict"] == "undecided" and facts.direction != "none":
-        seen = harm([interval.centre] * 2, facts.direction)[0]
+    if entry["verdict"] == "undecided" and (facts.direction != "none" or margin > 0.0):
+        seen = abs(interval.centre) if facts.direction == "none" else harm([interval.centre] * 2, facts.direction)[0]
         entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, facts.is_flag)
     return entry
 
 
 def flag_interval(delta: F64, scenes: Sequence[str] | I64) -> Interval:
-    """Return the interval of a difference of rates.
-
-    A t interval on the scenes' mean differences, once enough scenes changed for it to hold. Where fewer than six changed, the rates of
-    cells that gained and that lost the event get their own intervals (`rate_interval`), which are joined by the method of variance
-    estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008): wide, and never without width.
+    """Return the interval of a difference of rates; see `flag_bounds`.
 
     Args:
         delta: ``(N,)`` differences per cell, in [-1, 1].
         scenes: Scene of each cell.
     """
-    means, _ = cluster_means(delta, scenes)
     gained, _ = cluster_means(np.maximum(delta, 0.0), scenes)
     lost, _ = cluster_means(np.maximum(-delta, 0.0), scenes)
+    n, centre = len(gained), float(np.mean(gained - lost))
+    if n < 2:
+        return Interval(centre, reason=f"needs at least two scenes, found {n}")
+    low, high = (float(b) for b in flag_bounds(gained, lost))
     changed = int(np.sum((gained > 0) | (lost > 0)))
-    if len(means) < 2 or changed >= LEAST_DECIDED_FLAGS:
-        return t_interval(means, "scenes")
-    up, down = rate_interval(gained), rate_interval(lost)
-    if up.low is None or up.high is None or down.low is None or down.high is None:
-        raise AssertionError("two scenes or more have a rate interval")
-    centre = float(np.mean(means))
-    low = centre - float(np.hypot(up.centre - up.low, down.high - down.centre))
-    high = centre + float(np.hypot(up.high - up.centre, down.centre - down.low))
-    note = f"{changed} of {len(means)} scenes changed: bounds joined from those of gained and lost events"
-    return Interval(centre, max(low, -1.0), min(high, 1.0), note=note, method="gained and lost rates joined")
+    if changed >= LEAST_DECIDED_FLAGS:
+        note = f"all {n} scenes are equal: the interval has no width" if low == high else ""
+        return Interval(centre, low, high, note=note, method="t on scenes")
+    note = f"{changed} of {n} scenes changed: bounds joined from those of gained and lost events"
+    return Interval(centre, low, high, note=note, method="gained and lost rates joined")
+
+
+def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
+    """Return bounds ``(...,)`` of a difference of rates.
+
+    A t interval on the scenes' mean differences, once enough scenes changed for it to hold. Where fewer than six changed, the rates of
+    cells that gained and that lost the event get their own intervals (`logit_t_bounds`), which are joined by the method of variance
+    estimates recovery (Zou and Donner, Statistics in Medicine 27, 2008): wide, and never without width.
+
+    Args:
+        gained: ``(..., G)`` share of a scene's cells in which only the renderer has the event.
+        lost: ``(..., G)`` share in which only the baseline has it.
+    """
+    low, high = t_bounds(gained - lost)
+    few = np.sum((gained > 0) | (lost > 0), axis=-1) < LEAST_DECIDED_FLAGS
+    if not np.any(few):
+        return low, high
+    up, down = gained.mean(axis=-1), lost.mean(axis=-1)
+    (up_low, up_high), (down_low, down_high) = logit_t_bounds(gained), logit_t_bounds(lost)
+    joined_low = np.maximum(up - down - np.hypot(up - up_low, down_high - down), -1.0)
+    joined_high = np.minimum(up - down + np.hypot(up_high - up, down - down_low), 1.0)
+    return np.asarray(np.where(few, joined_low, low)), np.asarray(np.where(few, joined_high, high))
 
 
 class _Shared:

@@ -21,7 +21,7 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64
 from evaluators.aggregate.bootstrap import resampled_means
 from evaluators.aggregate.intervals import TAIL, Z95, logit_t_bounds, t_bounds
-from evaluators.aggregate.paired import flag_interval
+from evaluators.aggregate.paired import flag_bounds
 
 CORRELATIONS = (0.0, 0.3, 0.6, 0.8)  # within a scene, latent
 PAPER_SCENES, PAPER_SEEDS = 60, 5
@@ -139,11 +139,13 @@ def bootstrap_coverage(design: Design, repeats: int) -> float:
 
 def paired_coverage(design: Design, other_rate: float, repeats: int) -> float:
     """Return the coverage of the interval that summary.json gives for a difference of rates."""
-    first, second = pairs(design, other_rate, SHARED_NOISE, repeats, stream(f"paired {design!r}", 0, "aggregate/study"))
-    scenes = np.repeat(np.arange(design.n_scenes), design.n_seeds)
-    found = [flag_interval(delta.reshape(-1), scenes) for delta in first - second]
-    ends = np.array([one.bounds for one in found])
-    return coverage((ends[:, 0], ends[:, 1]), design.rate - other_rate)
+
+    def measure(n: int, generator: np.random.Generator) -> list[float]:
+        first, second = pairs(design, other_rate, SHARED_NOISE, n, generator)
+        gained, lost = (first > second).mean(axis=2), (second > first).mean(axis=2)
+        return [coverage(flag_bounds(gained, lost), design.rate - other_rate)]
+
+    return in_blocks(measure, repeats, f"paired {design!r}")[0]
 
 
 def power_of(design: Design, other_rate: float, repeats: int) -> list[float]:

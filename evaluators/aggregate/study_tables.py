@@ -109,7 +109,7 @@ def _coverage_paired(repeats: int) -> str:
     for rates in ((RATES[0], RATES[1]), (RATES[1], RATES[1]), (0.3, 0.3)):
         for n_scenes in SCENES[1:]:
             designs = [Design(n_scenes, PAPER_SEEDS, rates[0], c) for c in CORRELATIONS]
-            found = [_judged(paired_coverage(design, rates[1], max(200, repeats // 10))) for design in designs]
+            found = [_judged(paired_coverage(design, rates[1], repeats // 2)) for design in designs]
             rows.append([f"{100 * rates[0]:g} and {100 * rates[1]:g} %", str(n_scenes), *found])
     return _markdown(["rates", "scenes", *(f"correlation {c:g}" for c in CORRELATIONS)], rows)
 

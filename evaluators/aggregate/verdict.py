@@ -20,6 +20,7 @@ MARGINS = {
     "progress": 0.02,
     "progress_rel": 0.02,
     "route_distance_m": 0.1,
+    "lateral_bias_m": 0.1,
     "dist_to_gt_trajectory": 0.25,
     "dist_to_gt_location": 0.5,
     "min_distance_to_obstacle_m": 0.25,
@@ -42,8 +43,8 @@ def verdict(bounds: list[float] | None, p: float | None, margin: float, directio
     """Judge a difference by its 95 % interval.
 
     Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is more than ``margin`` worse, and the test
-    of no difference rejects too (p < 0.05). Undecided: neither, or the metric has no better side. So each of the two claims is wrong in at
-    most 2.5 % of runs, and more data decides.
+    of no difference rejects too (p < 0.05). Undecided: neither. So each of the two claims is wrong in at most 2.5 % of runs, and more data
+    decides. A metric without a better side needs a margin, and a change to either side counts as worse (wrong in at most 5 %).
 
     Args:
         bounds: [low, high] of renderer minus baseline, or None.
@@ -51,12 +52,19 @@ def verdict(bounds: list[float] | None, p: float | None, margin: float, directio
         margin: How much worse is accepted, in the metric's unit, at least 0.
         direction: The better side of the metric.
     """
-    if bounds is None or direction == "none":
+    if bounds is None or (direction == "none" and margin == 0.0):
         return "undecided"
     low, high = harm(bounds, direction)
+    if direction == "none":
+        low, high = _distance_from_zero(low, high)
     if high < margin or (margin == 0.0 and high == low == 0.0):
         return "non-inferior"
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
+
+
+def _distance_from_zero(low: float, high: float) -> tuple[float, float]:
+    """Return the least and greatest absolute value within bounds."""
+    return (0.0 if low <= 0.0 <= high else min(abs(low), abs(high))), max(abs(low), abs(high))
 
 
 def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:

@@ -24,7 +24,7 @@ class _Strict(BaseModel):
 class MetricRule(_Strict):
     """What one metric must meet: a margin on the paired difference, limits on the mean, or both."""
 
-    margin: float | None = Field(default=None, ge=0.0, description="How much worse than the baseline is accepted, in the metric's unit.")
+    margin: float | None = Field(default=None, ge=0.0, description="How much worse is accepted (without a better side: either way).")
     max: float | None = Field(default=None, description="Largest mean accepted.")
     min: float | None = Field(default=None, description="Smallest mean accepted.")
     must_decide: bool = Field(default=True, description="Undecided fails the gate with code 3; false: only worse does.")
@@ -89,8 +89,8 @@ def _check_names(spec: GateSpec, document: Document) -> None:
             facts = info(name)
         except EvaluatorError as error:
             raise document.error(DOING, ("metrics", name), f"no metric {name!r}", "simrun list metrics prints the known ones") from error
-        if rule.margin is not None and facts.direction == "none":
-            found = f"a margin for {name!r}, which has no better side"
-            raise document.error(DOING, ("metrics", name), found, "use max or min")
+        if rule.margin == 0.0 and facts.direction == "none":
+            found = f"a margin of 0 for {name!r}, which has no better side"
+            raise document.error(DOING, ("metrics", name), found, "give the change to either side that is accepted")
     if spec.preset is not None and spec.preset not in PRESETS:
         raise document.error(DOING, ("preset",), f"preset {spec.preset!r}", f"known: {', '.join(PRESETS)}")

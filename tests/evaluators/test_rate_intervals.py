@@ -1,0 +1,118 @@
+"""Intervals of rates and means where they are easy to get wrong: nobody, everybody, one scene, equal scenes, unequal seeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.seeding import stream
+from evaluators import aggregate
+from evaluators.aggregate.bootstrap import cluster_bootstrap
+from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, rate_interval, wilson_rate
+from tests.evaluators.test_tables_over_rollouts import rows_of
+
+shares = st.lists(st.sampled_from([0.0, 0.2, 1 / 3, 0.5, 0.8, 1.0]), min_size=2, max_size=40)
+
+
+@given(shares)
+@settings(max_examples=200, deadline=None)
+def test_bounds_of_a_rate_hold_its_centre_and_never_leave_zero_to_one(means):
+    one = rate_interval(np.array(means))
+    assert 0.0 <= one.low <= one.centre + 1e-12
+    assert one.centre - 1e-12 <= one.high <= 1.0
+    assert one.low < one.high
+
+
+@given(shares)
+@settings(max_examples=100, deadline=None)
+def test_counting_non_events_instead_of_events_mirrors_the_bounds(means):
+    one, other = rate_interval(np.array(means)), rate_interval(1.0 - np.array(means))
+    assert (one.low, one.high) == pytest.approx((1 - other.high, 1 - other.low), abs=1e-9)
+
+
+def test_the_bounds_are_t_on_the_logit_scale():
+    means = np.array([0.0, 0.2, 0.6, 0.0, 0.4])
+    p, error = means.mean(), stats.sem(means)
+    centre, half = np.log(p / (1 - p)), stats.t.ppf(0.975, 4) * error / (p * (1 - p))
+    one = rate_interval(means)
+    assert (one.low, one.high) == pytest.approx(tuple(1 / (1 + np.exp(-(centre + s * half))) for s in (-1, 1)))
+    assert one.method == "t on scenes, logit scale"
+
+
+@pytest.mark.parametrize("n", [2, 5, 60])
+def test_nobody_and_everybody_take_the_exact_bounds_over_scenes(n):
+    nobody, everybody = rate_interval(np.zeros(n)), rate_interval(np.ones(n))
+    assert (nobody.low, nobody.high) == pytest.approx((0.0, 1 - 0.025 ** (1 / n)))
+    assert (everybody.low, everybody.high) == pytest.approx((0.025 ** (1 / n), 1.0))
+
+
+def test_scenes_that_all_have_the_same_share_are_as_many_trials_as_scenes():
+    one = rate_interval(np.full(10, 0.2))
+    want = stats.binomtest(2, 10).proportion_ci(0.95, "exact")
+    assert (one.low, one.high) == pytest.approx((want.low, want.high))
+    assert one.note == "2 of 10 scenes: exact bounds, as equal scenes have no spread"
+
+
+def test_one_scene_has_no_interval_over_scenes_however_many_seeds():
+    one = clustered([0.0, 1.0, 1.0], ["a"] * 3, is_rate=True)
+    assert (one.bounds, one.reason) == (None, "needs at least two scenes, found 1")
+    drawn = cluster_bootstrap([0.0, 1.0, 1.0], ["a"] * 3, stream("x", 0, "test"))
+    assert (drawn.bounds, drawn.reason) == (None, "needs at least two scenes, found 1")
+
+
+def test_unequal_seeds_do_not_let_one_scene_outweigh_the_others():
+    values, scenes = [1.0] * 50 + [0.0] * 4, ["busy"] * 50 + ["a", "b", "c", "d"]
+    one = clustered(values, scenes, is_rate=True)
+    assert one.centre == pytest.approx(0.2)
+    assert one.high > 0.5
+
+
+def test_values_that_are_no_fractions_are_refused_as_rates():
+    with pytest.raises(EvaluatorError, match="give rates as fractions"):
+        rate_interval(np.array([0.0, 12.5]))
+
+
+def test_wilson_and_exact_stay_at_the_edges():
+    for n in (1, 7, 300):
+        assert wilson_rate(0, n)[0] == 0.0
+        assert wilson_rate(n, n)[1] == 1.0
+        assert exact_rate(0, n)[0] == 0.0
+        assert exact_rate(n, n)[1] == 1.0
+
+
+def test_a_rate_carries_wilson_and_exact_bounds_as_if_rollouts_were_independent():
+    found = aggregate(rows_of([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]], "offroad"))["3dgs"]["offroad"]
+    assert found["ci95_wilson"] == pytest.approx(list(wilson_rate(2, 6)))
+    assert found["ci95_exact"] == pytest.approx(list(exact_rate(2, 6)))
+    shares_of_time = aggregate(rows_of([[0.25, 0.0], [0.0, 1.0]], "open_loop_collision"))["3dgs"]["open_loop_collision"]
+    assert (shares_of_time["ci95_wilson"], shares_of_time["ci95_exact"]) == (None, None)
+
+
+def test_the_bootstrap_follows_its_generator_and_nears_t_where_scenes_are_many():
+    rng = np.random.Generator(np.random.Philox(3))
+    values = rng.normal(2.0, 1.0, 400)
+    scenes = [f"s{i // 2:03d}" for i in range(400)]
+    one = cluster_bootstrap(values, scenes, stream("x", 0, "test"))
+    assert one == cluster_bootstrap(values, scenes, stream("x", 0, "test"))
+    assert one != cluster_bootstrap(values, scenes, stream("y", 0, "test"))
+    t = clustered(values, scenes)
+    assert (one.low, one.high) == pytest.approx((t.low, t.high), abs=0.02)
+
+
+def test_bootstrap_draws_scenes_and_not_rollouts():
+    values, scenes = np.repeat([0.0, 10.0], 100), ["a"] * 100 + ["b"] * 100
+    one = cluster_bootstrap(values, scenes, stream("x", 0, "test"))
+    assert (one.low, one.high) == (0.0, 10.0)  # both draws the same scene in a quarter of the draws each
+
+
+def test_design_effect_is_the_number_of_seeds_where_seeds_are_copies_and_about_one_where_they_are_independent():
+    rng = np.random.Generator(np.random.Philox(4))
+    scenes = np.repeat(np.arange(300), 5)
+    assert design_effect(np.repeat(rng.normal(size=300), 5), scenes) == pytest.approx(5.0, rel=0.02)
+    assert design_effect(rng.normal(size=1500), scenes) == pytest.approx(1.0, abs=0.2)
+    assert design_effect([1.0, 1.0], ["a", "b"]) is None
+    assert design_effect([1.0, 2.0], ["a", "a"]) is None
