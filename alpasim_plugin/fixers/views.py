@@ -114,8 +114,8 @@ def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -
 
 def to_images(video: Tensor, size: ClipSize) -> U8:
     """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values beyond the range are cut."""
-    cropped = crop_clip(video, size).float().clamp(-1, 1)
-    images: U8 = cropped.add(1).mul_(HALF).round_().to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
+    levels = crop_clip(video, size).float().clamp(-1, 1).add_(1).mul_(HALF).round_()
+    images: U8 = levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
     return images
 
 

@@ -1,0 +1,105 @@
+"""Small fixers and clips shared by the tests of the streaming fixer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.onefixer import OneFixer
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.stand_in import save_stand_in
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import U8, Frame
+
+SMALL_DIT = (
+    "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5", "dit.text_width=7", "dit.context_width=9",
+)  # fmt: skip
+SIZE = (32, 48)  # height, width
+STEP_US = 100_000
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Frames of one camera and their maps."""
+
+    list_of_frames: list[Frame]
+    maps: list[U8]
+
+    def frames(self) -> list[Frame]:
+        return self.list_of_frames
+
+
+def small_settings(*overrides: str, name: str = "onefixer-tiny") -> OneFixerSettings:
+    settings = fixer_settings(name, (*SMALL_DIT, *overrides))
+    assert isinstance(settings, OneFixerSettings)
+    return settings
+
+
+def busy_settings(folder: Path, *overrides: str) -> OneFixerSettings:
+    """Return settings whose weights make every layer count, which an identity's do not."""
+    settings = small_settings("holes=noise", *overrides)
+    path = folder / f"blocks_of_{settings.block_latents}_{settings.decoder.kind}.safetensors"  # what a bundle must match
+    if not path.exists():
+        save_stand_in(path, settings)
+    return small_settings("holes=noise", *overrides, f"weights.bundle={path}")
+
+
+def fixer(settings: OneFixerSettings, scene_id: str = "scene", seed: int = 0) -> OneFixer:
+    return OneFixer(settings, scene_id, seed)
+
+
+def moving_picture(
+    count: int, size: tuple[int, int] = SIZE, key: str = "picture", holes: bool = True, camera: str = "front"
+) -> list[Frame]:
+    """Return frames of a smooth texture that slides by, with a soft-edged hole in their opacity."""
+    height, width = size
+    texture = stream("tests", 0, key).integers(0, 256, (height + 64, width + 64, 3)).astype(np.float32)
+    texture = cv2.normalize(cv2.GaussianBlur(texture, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    out = []
+    for i in range(count):
+        y, x = (i * 1) % 64, (i * 3) % 64
+        alpha = np.ones(size, np.float32)
+        if holes:
+            alpha[: height // 2, : width // 3] = 0.0
+            alpha[height // 2 :, : width // 6] = 0.5
+        out.append(Frame(i * STEP_US, camera, np.ascontiguousarray(texture[y : y + height, x : x + width]), alpha))
+    return out
+
+
+def maps_of(frames: list[Frame]) -> list[U8]:
+    """Return a map per frame, different from the frame."""
+    return [255 - frame.rgb[::-1].copy() for frame in frames]
+
+
+def run_blocks(fixer: OneFixer, frames: list[Frame], maps: list[U8]) -> list[Frame]:
+    """Step through a clip of one camera in whole blocks; the last may be short."""
+    out: list[Frame] = []
+    block = 0
+    while len(out) < len(frames):
+        cut = slice(len(out), len(out) + fixer.blocks.frames(block))
+        out += fixer.step(frames[cut], maps[cut])
+        block += 1
+    return out
+
+
+def pixels(frames: list[Frame]) -> U8:
+    return np.stack([frame.rgb for frame in frames])
+
+
+def record_videos(fixer: OneFixer) -> list[torch.Tensor]:
+    """Return a list that fills with what the pipeline decodes, before rounding."""
+    seen: list[torch.Tensor] = []
+    run = fixer.pipeline.run
+
+    def spy(*args):
+        video, state = run(*args)
+        seen.append(video)
+        return video, state
+
+    fixer.pipeline.run = spy
+    return seen
