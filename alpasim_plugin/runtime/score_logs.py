@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.config import load_yaml
 from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.runtime.known_scenes import KnownScenes
@@ -94,7 +95,7 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, root: Path, taken: se
         "seed": int(rollout.seed) & (2**63 - 1),
         "session_uuid": rollout.session_uuid,
         "frames": len(rollout.images),
-        "steps": len(rollout.ego),
+        "steps": _steps(rollout),
         "warnings": list(rollout.warnings),
     }
     known = scenes.of(rollout.scene_id)  # a wrong --scene is the command's fault, not the log's
@@ -123,10 +124,9 @@ def check_whole(log: Path, rollout: RolloutLog) -> None:
     """
     if rollout.info["terminated"] or rollout.control_us <= 0 or len(rollout.ego) < 2:
         return
-    first, last = int(rollout.ego.t_us[1]), int(rollout.ego.t_us[-1])
-    recorded = (int(rollout.ego_log.t_us[-1]) - first) // rollout.control_us
+    recorded = (int(rollout.ego_log.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
     steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
-    done = (last - first) // rollout.control_us
+    done = _steps(rollout)
     if done < steps:
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
         raise InfrastructureError(
@@ -135,20 +135,25 @@ def check_whole(log: Path, rollout: RolloutLog) -> None:
         )  # fmt: skip
 
 
+def _steps(rollout: RolloutLog) -> int:
+    """Return how many control steps were driven: since the first policy time, which is the second logged pose."""
+    if len(rollout.ego) < 2 or rollout.control_us <= 0:
+        return 0
+    return (int(rollout.ego.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
+
+
 def run_names(log: Path) -> tuple[str | None, str | None]:
     """Return uuid and name of the run that a log belongs to, of the ``run_metadata.yaml`` in the nearest folder above it.
 
     Raises:
         InputError: The file is there, but broken.
     """
-    from alpasim_plugin.config import load_yaml
-
     for folder in list(log.resolve().parents)[:5]:
         path = folder / "run_metadata.yaml"
         if path.is_file():
             data = load_yaml(path, "reading the names of a run").data
-            names = [data.get(key) if isinstance(data, dict) else None for key in ("run_uuid", "run_name")]
-            return tuple(None if name is None else str(name) for name in names)  # type: ignore[return-value]
+            uuid, name = (data.get(key) if isinstance(data, dict) else None for key in ("run_uuid", "run_name"))
+            return None if uuid is None else str(uuid), None if name is None else str(name)
     return None, None
 
 

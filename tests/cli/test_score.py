@@ -1,0 +1,168 @@
+"""``simrun score``: logs of AlpaSim and ours, several at once, errors by cause, exit codes, and the files of a run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+
+GOLDEN_SCENE = "synthetic-cut-in-a"
+
+
+@pytest.fixture(scope="module")
+def golden(request: pytest.FixtureRequest) -> Path:
+    return request.getfixturevalue("shared_data") / "alpasim-golden"
+
+
+@pytest.fixture(scope="module")
+def our_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of ours: one scene, one policy, two seeds, without pictures."""
+    root = tmp_path_factory.mktemp("runs") / "own"
+    command = ["--renderer", "clean", "--policy", "log-replay", "--seeds", "2", "--images", "none", "--workers", "1", "--quiet"]
+    assert run_command([*command, "--set", "timing.duration_us=1500000", "--out", str(root), "smoke/straight"]) == 0
+    return root
+
+
+def rows(folder: Path) -> list[dict]:
+    return pq.read_table(folder / "rollouts.parquet").to_pylist()
+
+
+def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
+    out = tmp_path / "scored"
+    assert run_command(["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["out"], printed["exit_code"], printed["summary"]["preset"]) == (str(out), 0, "paper")
+    before, after = rows(our_run), rows(out)
+    assert [row["rollout"] for row in after] == ["0", "1"]  # the log's folder name
+    for one, two in zip(before, after, strict=True):
+        for key in one:
+            if key not in ("path", "wall_s"):
+                assert two[key] == one[key], key
+    steps = pq.read_table(out / "steps.parquet")
+    assert set(steps["rollout"].to_pylist()) == {"0", "1"}
+    for name in ("run.json", "summary.json", "summary.md", "junit.xml", "report.html"):
+        assert (out / name).stat().st_size > 0
+    assert json.loads((out / "run.json").read_text())["config"]["preset"]["name"] == "paper"
+    assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
+
+
+def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
+    out = tmp_path / "scored"
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet"]
+    assert run_command(command) == 0
+    first = (out / "steps.parquet").read_bytes()
+    assert run_command(command) == 0
+    assert (out / "steps.parquet").read_bytes() == first
+
+
+def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_path, capsys):
+    out = tmp_path / "scored"
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet"]
+    assert run_command(command) == 0
+    assert run_command([*command, "--preset", "strict"]) == 2
+    assert "holds other results" in capsys.readouterr().err
+
+
+def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):
+    out = tmp_path / "scored"
+    pattern = str(golden / "rollouts" / "synthetic-c*-in-a" / "*" / "rollout.asl")
+    command = ["score", pattern, "--scene", str(golden / "scenes"), "--preset", "alpasim", "--settings", str(golden / "eval-config.yaml")]
+    assert run_command([*command, "--out", str(out)]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("[1/2] ")
+    want = {row["rollout_id"]: row for row in json.loads((golden / "aggregate" / "results-summary.json").read_text())["rollouts"]}
+    got = {row["rollout"]: row for row in rows(out)}
+    assert len(got) == 2
+    for name, row in got.items():
+        assert row["scene"] == GOLDEN_SCENE
+        assert row["scene_score"] == pytest.approx(want[name]["score"], abs=1e-5)
+        assert row["collision_at_fault"] == want[name]["metrics"]["collision_at_fault"]
+        assert row["offroad_or_collision"] == want[name]["metrics"]["offroad_or_collision"]
+    summary = json.loads((out / "aggregate" / "results-summary.json").read_text())
+    assert {row["rollout_id"]: row["score"] for row in summary["rollouts"]} == pytest.approx({name: want[name]["score"] for name in got})
+    names = pq.read_table(out / "aggregate" / "metrics_results.parquet").column_names
+    assert set(names) == set(pq.read_table(golden / "aggregate" / "metrics_results.parquet").column_names)
+    assert summary["metrics_results"][0]["run_name"] == "golden-dev"
+
+
+def test_an_incomplete_rollout_is_a_failed_row_and_skips_alpasims_aggregation(golden, tmp_path, capsys):
+    folder = golden / "cases" / "failed-rollout"
+    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--preset", "alpasim", "--quiet"]
+    assert run_command([*command, "--out", str(tmp_path / "a")]) == 4
+    assert "aggregation was not written" in capsys.readouterr().err
+    assert not (tmp_path / "a" / "aggregate").exists()
+    allowed = [*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(tmp_path / "b")]
+    assert run_command(allowed) == 0
+    table = rows(tmp_path / "b")
+    assert [row["status"] for row in table].count("failed") == 1
+    assert next(row for row in table if row["status"] == "failed")["failure"] == "the rollout ended after 25 of 46 control steps"
+    summary = json.loads((tmp_path / "b" / "aggregate" / "results-summary.json").read_text())
+    assert [(row["status"], row["score"]) for row in summary["rollouts"]] == [("fail", 0.0)] * 3
+
+
+def test_a_missing_map_stops_the_scene_score_and_nothing_else(golden, tmp_path, capsys):
+    folder = golden / "cases" / "no-map"
+    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--quiet"]
+    assert run_command([*command, "--preset", "alpasim", "--out", str(tmp_path / "a")]) == 5
+    assert "missing metric 'offroad'" in capsys.readouterr().err
+    assert sorted(p.name for p in (tmp_path / "a" / "aggregate").iterdir()) == ["metrics_results.parquet", "metrics_unprocessed.parquet"]
+    off = ["--settings", str(folder / "eval-config-no-scene-score.yaml"), "--out", str(tmp_path / "b")]
+    assert run_command([*command, "--preset", "alpasim", *off]) == 0
+    assert run_command([*command, "--preset", "strict", "--out", str(tmp_path / "c")]) == 5
+    assert {row["failure_class"] for row in rows(tmp_path / "c")} == {"evaluator"}
+
+
+def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
+    logs = tmp_path / "logs"
+    first = sorted((golden / "rollouts" / GOLDEN_SCENE).glob("*/rollout.asl"))[0]
+    (logs / "whole").mkdir(parents=True)
+    shutil.copy(first, logs / "whole")
+    for name, size in (("cut", 150_000), ("beheaded", 900)):
+        (logs / name).mkdir()
+        (logs / name / "rollout.asl").write_bytes(first.read_bytes()[:size])
+    out = tmp_path / "scored"
+    assert run_command(["score", str(logs), "--scene", str(golden / "scenes" / f"{GOLDEN_SCENE}.usdz"), "--out", str(out)]) == 2
+    found = {row["rollout"]: (row["status"], row["failure_class"]) for row in rows(out)}
+    assert found == {"whole": ("ok", None), "cut": ("failed", "infrastructure"), "beheaded": ("failed", "input")}
+    assert "of 80 control steps" in capsys.readouterr().err
+
+
+def test_lanes_without_rails_are_centres_widened(golden, tmp_path):
+    folder = golden / "cases" / "rails-stripped"
+    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--preset", "alpasim", "--quiet", "--no-rails"]
+    out = tmp_path / "scored"
+    assert run_command([*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(out)]) == 0
+    want = {row["rollout_id"]: row for row in json.loads((folder / "aggregate" / "results-summary.json").read_text())["rollouts"]}
+    for row in rows(out):
+        name = "min_distance_to_lane_boundary_m"
+        assert row[name] == pytest.approx(want[row["rollout"]]["metrics"][name], abs=1e-4)
+
+
+def test_bad_commands_say_what_to_do(our_run, tmp_path, capsys):
+    own = ["score", str(our_run), "--out", str(tmp_path / "x")]
+    settings = tmp_path / "eval.yaml"
+    settings.write_text("vehicle: {vehicle_shrink: 0.1}\n")
+    (tmp_path / "nothing").mkdir()
+    cases = {
+        "another scene": ([*own, "--scene", "smoke/curve"], "not among the 1 scenes"),
+        "no such scene": ([*own, "--scene", str(tmp_path / "none.usdz")], "none.usdz"),
+        "unknown preset": ([*own, "--scene", "smoke/straight", "--preset", "alpasimm"], "known: paper, alpasim"),
+        "settings of another preset": ([*own, "--scene", "smoke/straight", "--settings", str(settings)], "--preset alpasim"),
+        "unknown setting": (
+            [*own, "--scene", "smoke/straight", "--preset", "alpasim", "--settings", str(settings)],
+            "vehicle_shrink_factor",
+        ),
+        "no log": (["score", str(tmp_path / "nothing"), "--scene", "smoke/straight"], "a folder without .asl logs"),
+        "no match": (["score", str(tmp_path / "*.asl"), "--scene", "smoke/straight"], "no such file, folder or match"),
+    }
+    for situation, (command, text) in cases.items():
+        assert run_command(command) == 2, situation
+        printed = capsys.readouterr().err
+        assert text in printed, situation
+        assert printed.startswith("error: "), situation
+        assert "do: " in printed, situation
