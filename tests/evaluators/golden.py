@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import defaultdict
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,8 +17,14 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.types import MetricSeries, RolloutLog, Scene
+from evaluators import score
+from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, scene_score
 from evaluators.presets import Preset
 from scenarios.usdz import read_usdz_scene
+
+RUN = ("00000000-0000-4000-8000-00000000000a", "golden-dev")
+CASES = ("failed-rollout", "no-actors", "rails-stripped", "no-map", "no-road-edges")
+SETS = ("rollouts", "other-settings", *CASES)
 
 
 def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, Scene]:
@@ -26,8 +34,6 @@ def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, S
 @lru_cache(maxsize=128)
 def scored(log: Path, archive: Path, preset: Preset, rails: bool = True) -> tuple[MetricSeries, ...]:
     """Score a log against its scene; several tests look at the same series."""
-    from evaluators import score
-
     return tuple(score(*read_case(log, archive, rails), preset))
 
 
@@ -49,25 +55,89 @@ def expected(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray
     return {name: tuple(np.array(column) for column in zip(*rows, strict=True)) if rows else empty for name, rows in out.items()}
 
 
-def parity_table(folder: Path) -> str:
-    """Compare every step of every metric over the logs of ``rollouts/``."""
-    from evaluators import score
+@dataclass(frozen=True)
+class GoldenSet:
+    """Logs that AlpaSim scored with one settings file."""
 
-    compared: dict[str, list] = defaultdict(lambda: [0, 0, 0, 0.0])  # logs, values, equal, largest difference
-    for log in sorted(folder.glob("rollouts/*/*/rollout.asl")):
-        name = log.parent.parent.name
-        rollout, scene = read_case(log, folder / "scenes" / f"{name}.usdz")
-        found = {one.name: one for one in score(rollout, scene, "alpasim")}
-        for metric, (_, value, _) in expected(log.parent).items():
-            got = found[metric].value
-            both_missing = np.isnan(got) & np.isnan(value)
-            off = np.where((got == value) | both_missing, 0.0, np.abs(got - value))
-            row = compared[metric]
-            row[0], row[1], row[2] = row[0] + 1, row[1] + len(value), row[2] + int(np.sum(off == 0))
-            row[3] = max(row[3], float(off.max(initial=0.0)))
+    name: str
+    folder: Path  # holds its tables
+    logs: tuple[Path, ...]
+    scenes: Path
+    settings: EvalSettings
+    aggregate: str
+    rails: bool = True
+
+    def series(self, log: Path) -> tuple[MetricSeries, ...]:
+        return scored(log, self.scenes / f"{log.parent.parent.name}.usdz", self.settings.preset(), self.rails)
+
+    def run(self) -> list[ScoredRollout]:
+        return [ScoredRollout(log.parent.parent.name, log.parent.name, self.series(log), *RUN) for log in self.logs]
+
+    def table(self, log: Path) -> Path:
+        """Give the folder with AlpaSim's table of a log."""
+        return self.folder / "rollouts" / log.parent.parent.name / log.parent.name
+
+
+def golden_set(root: Path, name: str) -> GoldenSet:
+    """Return the main set ("rollouts"), "other-settings", or one of the cases."""
+    if name == "rollouts":
+        logs = sorted(root.glob("rollouts/*/*/rollout.asl"))
+        return GoldenSet(name, root, tuple(logs), root / "scenes", load_settings(root / "eval-config.yaml"), "aggregate")
+    if name == "other-settings":
+        folder = root / name
+        logs = [root / table.relative_to(folder).with_name("rollout.asl") for table in sorted(folder.glob("rollouts/*/*/*.parquet"))]
+        return GoldenSet(name, folder, tuple(logs), root / "scenes", load_settings(folder / "eval-config.yaml"), "aggregate")
+    folder = root / "cases" / name
+    unscored = (folder / "aggregate-no-scene-score").exists()
+    settings = load_settings(folder / ("eval-config-no-scene-score.yaml" if unscored else "eval-config.yaml"))
+    aggregate = "aggregate-no-scene-score" if unscored else "aggregate"
+    logs = sorted(folder.glob("rollouts/*/*/rollout.asl"))
+    return GoldenSet(name, folder, tuple(logs), folder / "scenes", settings, aggregate, name != "rails-stripped")
+
+
+class Tally:
+    """Count of compared values, of equal ones, and the largest difference."""
+
+    def __init__(self) -> None:
+        self.logs, self.values, self.equal, self.largest = 0, 0, 0, 0.0
+
+    def add(self, got: np.ndarray, want: np.ndarray) -> None:
+        got, want = np.asarray(got, dtype=float), np.asarray(want, dtype=float)
+        same = (got == want) | (np.isnan(got) & np.isnan(want))
+        off = np.where(same, 0.0, np.abs(np.where(same, 0.0, got) - np.where(same, 0.0, want)))
+        self.logs, self.values, self.equal = self.logs + 1, self.values + len(want), self.equal + int(same.sum())
+        self.largest = max(self.largest, float(off.max(initial=0.0)))
+
+    def row(self, name: str) -> str:
+        return f"| {name} | {self.logs} | {self.values} | {self.equal} | {self.largest:.1e} |"
+
+
+def parity_table(root: Path) -> str:
+    """Compare every step of every metric, and every value of the tables over sweeps, of all golden sets."""
+    steps: dict[str, Tally] = defaultdict(Tally)
+    tables: dict[str, Tally] = defaultdict(Tally)
+    for name in SETS:
+        one = golden_set(root, name)
+        for log in one.logs:
+            found = {series.name: series for series in one.series(log)}
+            for metric, (_, value, _) in expected(one.table(log)).items():
+                steps[metric].add(found[metric].value, value)
+        reduced = reduce_run(one.run(), one.settings.preset())
+        want = pq.read_table(one.folder / one.aggregate / "metrics_results.parquet").to_pylist()[0]
+        numbers = {key: value for key, value in over_sweeps(reduced).items() if key in want}
+        assert set(numbers) == set(want) - {"run_uuid", "run_name"}
+        both = [(numbers[key], want[key]) for key in numbers if want[key] is not None]
+        tables[f"over sweeps, {name}"].add(*np.array(both, dtype=float).T)
+        rows = json.loads((one.folder / one.aggregate / "results-summary.json").read_text())["rollouts"]
+        marks = {(row["clipgt_id"], row["rollout_id"]): row.get("score") for row in rows}
+        kept = [r for r in reduced if not r.dropped and one.settings.scene_score.enabled]
+        if kept:
+            scores = [scene_score(r.values, one.settings.scene_score).score for r in kept]
+            tables[f"scene score, {name}"].add(np.array(scores), np.array([marks[r.of.scene, r.of.rollout] for r in kept]))
     lines = ["| metric | logs | values | exactly equal | largest difference |", "|---|---|---|---|---|"]
-    lines += [f"| `{metric}` | {n} | {total} | {equal} | {worst:.1e} |" for metric, (n, total, equal, worst) in sorted(compared.items())]
-    return "\n".join(lines)
+    lines += [tally.row(f"`{metric}`") for metric, tally in sorted(steps.items())]
+    lines += ["", "| table | tables | values | exactly equal | largest difference |", "|---|---|---|---|---|"]
+    return "\n".join([*lines, *(tally.row(name) for name, tally in tables.items())])
 
 
 if __name__ == "__main__":

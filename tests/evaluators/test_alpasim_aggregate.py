@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,6 @@ import pytest
 from alpasim_plugin.errors import EvaluatorError, InputError
 from evaluators import PRESETS
 from evaluators.alpasim import (
-    EvalSettings,
     ScoredRollout,
     load_settings,
     metrics_results_table,
@@ -27,19 +24,9 @@ from evaluators.alpasim import (
 )
 from evaluators.alpasim.settings import SceneScoreSettings
 from evaluators.base import series
-from tests.evaluators.golden import close, scored
+from tests.evaluators.golden import RUN, SETS, close, golden_set
 
-RUN = ("00000000-0000-4000-8000-00000000000a", "golden-dev")
 ALPASIM = PRESETS["alpasim"]
-
-
-def golden_run(logs: Sequence[Path], scenes: Path, settings: EvalSettings, rails: bool = True) -> list[ScoredRollout]:
-    preset = settings.preset()
-    out = []
-    for log in logs:
-        name = log.parent.parent.name
-        out.append(ScoredRollout(name, log.parent.name, scored(log, scenes / f"{name}.usdz", preset, rails), *RUN))
-    return out
 
 
 def same(got: Any, want: Any, path: str = "") -> list[str]:
@@ -54,65 +41,36 @@ def same(got: Any, want: Any, path: str = "") -> list[str]:
     return [] if got == want and type(got) is type(want) else [f"{path}: {got!r} for {want!r}"]
 
 
-def assert_run(folder: Path, aggregate: str, config: str, run: list[ScoredRollout], failed: Sequence[dict] = ()) -> None:
-    settings = load_settings(folder / config)
-    reduced = reduce_run(run, settings.preset())
+@pytest.mark.parametrize("name", SETS)
+def test_golden_runs_give_alpasims_tables(shared_data, name):
+    one = golden_set(shared_data / "alpasim-golden", name)
+    run = one.run()
+    assert len(run) == {"rollouts": 46, "other-settings": 22}.get(name, 2)
+    reduced = reduce_run(run, one.settings.preset())
     sweeps = over_sweeps(reduced)
-    want = pq.read_table(folder / aggregate / "metrics_results.parquet")
-    got = metrics_results_table(sweeps, run)
-    assert same(got.to_pylist(), want.to_pylist()) == []
+    want = pq.read_table(one.folder / one.aggregate / "metrics_results.parquet")
+    assert same(metrics_results_table(sweeps, run).to_pylist(), want.to_pylist()) == []
     marks = {}
-    if settings.scene_score.enabled:
-        marks = {i: scene_score(one.values, settings.scene_score) for i, one in enumerate(reduced) if not one.dropped}
-    summary = results_summary(reduced, marks, failed, sweeps, settings.scene_score)
-    expected = json.loads((folder / aggregate / "results-summary.json").read_text())
+    if one.settings.scene_score.enabled:
+        marks = {i: scene_score(r.values, one.settings.scene_score) for i, r in enumerate(reduced) if not r.dropped}
+    failures = one.folder / "failed_rollouts.json"
+    failed = json.loads(failures.read_text()) if failures.exists() else ()
+    summary = results_summary(reduced, marks, failed, sweeps, one.settings.scene_score)
+    expected = json.loads((one.folder / one.aggregate / "results-summary.json").read_text())
     assert same(json.loads(json.dumps(summary, allow_nan=False)), expected) == []
-
-
-def test_the_golden_run_gives_alpasims_tables(shared_data):
-    folder = shared_data / "alpasim-golden"
-    run = golden_run(sorted(folder.glob("rollouts/*/*/rollout.asl")), folder / "scenes", load_settings(folder / "eval-config.yaml"))
-    assert len(run) == 46
-    assert_run(folder, "aggregate", "eval-config.yaml", run)
-
-
-def test_other_settings_give_alpasims_tables(shared_data):
-    golden = shared_data / "alpasim-golden"
-    folder = golden / "other-settings"
-    logs = [golden / table.relative_to(folder).with_name("rollout.asl") for table in sorted(folder.glob("rollouts/*/*/*.parquet"))]
-    assert_run(folder, "aggregate", "eval-config.yaml", golden_run(logs, golden / "scenes", load_settings(folder / "eval-config.yaml")))
-
-
-@pytest.mark.parametrize(
-    ("case", "aggregate", "config"),
-    [
-        ("failed-rollout", "aggregate", "eval-config.yaml"),
-        ("no-actors", "aggregate", "eval-config.yaml"),
-        ("rails-stripped", "aggregate", "eval-config.yaml"),
-        ("no-map", "aggregate-no-scene-score", "eval-config-no-scene-score.yaml"),
-        ("no-road-edges", "aggregate-no-scene-score", "eval-config-no-scene-score.yaml"),
-    ],
-)
-def test_unusual_runs_give_alpasims_tables(shared_data, case, aggregate, config):
-    folder = shared_data / "alpasim-golden" / "cases" / case
-    logs = sorted(folder.glob("rollouts/*/*/rollout.asl"))
-    run = golden_run(logs, folder / "scenes", load_settings(folder / config), rails=case != "rails-stripped")
-    failures = folder / "failed_rollouts.json"
-    assert_run(folder, aggregate, config, run, json.loads(failures.read_text()) if failures.exists() else ())
 
 
 @pytest.mark.parametrize("case", ["no-map", "no-road-edges"])
 def test_runs_that_alpasim_stops_at_stop_here_with_the_same_metric(shared_data, case):
-    folder = shared_data / "alpasim-golden" / "cases" / case
-    settings = load_settings(folder / "eval-config.yaml")
-    run = golden_run(sorted(folder.glob("rollouts/*/*/rollout.asl")), folder / "scenes", settings)
-    reduced = reduce_run(run, settings.preset())
-    want = pq.read_table(folder / "aggregate-partial" / "metrics_results.parquet")
+    one = golden_set(shared_data / "alpasim-golden", case)
+    run = one.run()
+    reduced = reduce_run(run, one.settings.preset())
+    want = pq.read_table(one.folder / "aggregate-partial" / "metrics_results.parquet")
     assert same(metrics_results_table(over_sweeps(reduced), run).to_pylist(), want.to_pylist()) == []
     stops = reduced[-1]  # in the run without edges the first rollout stays in its lane and has a score
     with pytest.raises(EvaluatorError, match="'offroad'"):
-        scene_score(stops.values, settings.scene_score)
-    assert "'offroad'" in json.loads((folder / "expected_failure.json").read_text())["error"]
+        scene_score(stops.values, load_settings(one.folder / "eval-config.yaml").scene_score)
+    assert "'offroad'" in json.loads((one.folder / "expected_failure.json").read_text())["error"]
 
 
 # --- by hand ----------------------------------------------------------------------------------------------------------
