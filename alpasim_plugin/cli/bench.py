@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets
+from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline
 from alpasim_plugin.gaussians.bench import bench_raster
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts.")
@@ -24,6 +24,7 @@ def bench() -> None:
 app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evaluators)
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
+app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
 
 
 @app.command("raster", epilog="Example: `simrun bench raster --repeats 20`")

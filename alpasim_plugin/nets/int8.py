@@ -48,7 +48,7 @@ def sum_exactly(q: Tensor, weight: Tensor) -> Tensor:
 class Int8Linear(nn.Module):
     """A frozen `nn.Linear` with int8 weights, for inference.
 
-    Engine: oneDNN on a CPU that has it, ``torch._int_mm`` on CUDA, else `sum_exactly`.
+    Engine: oneDNN on a CPU that has it, ``torch._int_mm`` on CUDA (and without numbers on ``meta``), else `sum_exactly`.
 
     Args:
         linear: What to quantise.
@@ -83,7 +83,7 @@ class Int8Linear(nn.Module):
         """Return ``(Q q) s``, ``(rows, outputs)`` float32."""
         if q.device.type == "cpu" and torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
             return self._onednn(q)
-        if q.device.type == "cuda":
+        if q.device.type in ("cuda", "meta"):
             return self._int_mm(q) * self.scale
         return sum_exactly(q, self.weight) * self.scale
 

@@ -138,7 +138,7 @@ class _Dispatch(TorchDispatchMode):
 
 
 def _flops(name: str, args: tuple[Any, ...], out: Tensor) -> int:
-    if name in {"mm", "bmm", "linear"}:
+    if name in {"mm", "bmm", "linear", "_int_mm"}:
         return 2 * out.numel() * int(args[0].shape[-1])
     if name in {"addmm", "baddbmm"}:
         return 2 * out.numel() * int(args[1].shape[-1])

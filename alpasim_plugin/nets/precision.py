@@ -40,15 +40,20 @@ def stream_dtype(precision: Precision, device: torch.device | str = "cpu") -> to
     return DTYPES[precision]
 
 
-def at_precision(net: CosmosCausalDiT, precision: Precision) -> CosmosCausalDiT:
+def at_precision(net: CosmosCausalDiT, precision: Precision, device: torch.device | str | None = None) -> CosmosCausalDiT:
     """Return a frozen copy of a transformer, folded or not, at another precision.
 
     Equal bit for bit to loading the same tensors with ``dtype=``, except that int8 has no such dtype.
 
+    Args:
+        net: At float32, for one rounding only.
+        precision: See the module.
+        device: Where it will run, if not where it is.
+
     Raises:
         InputError: A weight that overflows the precision, named.
     """
-    out = _cast(net, stream_dtype(precision, net.device), lambda key: any(part in key for part in FLOAT32_KEYS))
+    out = _cast(net, stream_dtype(precision, device or net.device), lambda key: any(part in key for part in FLOAT32_KEYS))
     if precision == "int8":
         quantise_linears(out.blocks)
     return out
@@ -63,10 +68,10 @@ def codec_at_precision(codec: Net, precision: Literal["fp32", "bf16", "fp16"]) -
     return _cast(codec, DTYPES[precision], lambda key: False)
 
 
-def text_at_precision(text: TextContext, precision: Precision) -> TextContext:
-    """Return a prompt's keys and values in the stream's precision of a network."""
+def text_at_precision(text: TextContext, precision: Precision, device: torch.device | str | None = None) -> TextContext:
+    """Return a prompt's keys and values in the stream's precision of a network; ``device`` as in `at_precision`."""
     pairs = text.keys_values
-    return TextContext(tuple((k.to(dtype := stream_dtype(precision, k.device)), v.to(dtype)) for k, v in pairs))
+    return TextContext(tuple((k.to(dtype := stream_dtype(precision, device or k.device)), v.to(dtype)) for k, v in pairs))
 
 
 def weight_bytes(net: nn.Module) -> int:

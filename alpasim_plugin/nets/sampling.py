@@ -61,6 +61,16 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
     if opacity.ndim != 5 or opacity.shape[1] != 1 or frames < 1 or (frames - first) % 4 or opacity.shape[3] % 8 or opacity.shape[4] % 8:
         do = f"give (B, 1, {'1 + 4 n' if first else '4 n'} frames, H, W) with H and W in multiples of 8"
         raise InputError(doing, "opacity", f"shape {list(opacity.shape)}", do)
+    if not opacity.is_meta:
+        opacity = _without_nan(opacity, nan_as, doing)
+    video = opacity.clamp(0, 1)
+    if first:
+        video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
+    return F.max_pool3d(video, POOL, POOL)
+
+
+def _without_nan(opacity: Tensor, nan_as: float | None, doing: str) -> Tensor:
+    """Replace opacities that are not numbers, if allowed, and refuse values outside [0, 1]."""
     unknown = opacity.isnan()
     count = int(unknown.sum())
     if count and nan_as is None:
@@ -72,10 +82,7 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
     low, high = float(opacity.min()), float(opacity.max())
     if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
         raise InputError(doing, "opacity", f"values from {low:.4g} to {high:.4g}", "give accumulated alpha between 0 and 1")
-    video = opacity.clamp(0, 1)
-    if first:
-        video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
-    return F.max_pool3d(video, POOL, POOL)
+    return opacity
 
 
 def mixed_source(z_r: Tensor, m: Tensor, eps: Tensor) -> Tensor:
