@@ -114,7 +114,7 @@ class Region:
         What sticks out is cut into ever smaller pieces. The distance to one border segment is convex, and so is the mean of two; over a
         piece neither exceeds its greatest value at the piece's corners, and the distance to the shape exceeds neither. Pieces that
         cannot hold a greater distance than one already found are dropped. Two segments are needed for gaps: halfway between two parallel
-        borders no single one bounds the distance well.
+        borders no single one bounds the distance well, and no corner of a piece need lie there.
         """
         best = np.zeros(len(footprints))
         pieces = shapely.difference(footprints, self.shape)
@@ -124,10 +124,27 @@ class Region:
             corner, piece = shapely.get_coordinates(pieces, return_index=True)
             nearest, distance = self._nearest(shapely.points(corner))
             np.maximum.at(best, owner[piece], distance)
+            np.maximum.at(best, owner, self._halfway_m(corner, piece, nearest, distance))
             bound = self._bound_m(pieces, corner, piece, nearest, distance)
             rows = np.flatnonzero(bound > best[owner] + MARGIN_M)
             owner, pieces = _quartered(owner[rows], pieces[rows])
         return best
+
+    def _halfway_m(self, corner: F64, piece: I64, nearest: I64, distance: F64) -> F64:
+        """Return for each piece the distance ``(M,)`` of a point of the footprint about as far from one border as from another."""
+        n = np.bincount(piece)
+        last = np.cumsum(n) - 1
+        a = np.lexsort((distance, piece))[last]
+        other = nearest != nearest[a][piece]
+        b = np.lexsort((np.where(other, distance, -1.0), piece))[last]
+        lead = []  # by how much the border near a is nearer than the one near b, at a and at b
+        for at in (a, b):
+            to = [segment_distance(self._start[nearest[k]], self._end[nearest[k]], corner[at]) for k in (a, b)]
+            lead.append(to[1] - to[0])
+        span = lead[0] - lead[1]
+        f = np.clip(np.divide(lead[0], span, out=np.zeros_like(span), where=span > 0), 0.0, 1.0)
+        point = corner[a] + f[:, None] * (corner[b] - corner[a])
+        return np.where(shapely.contains_xy(self.shape, point), 0.0, self.border_distance_m(point))
 
     def _bound_m(self, pieces: Geometries, corner: F64, piece: I64, nearest: I64, distance: F64) -> F64:
         """Return for each piece a distance ``(M,)`` that none of its points exceeds."""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import Lane, LaneMap
-from evaluators import PRESETS, reduce_rollout, score
+from evaluators import PRESETS, reduce_rollout, score, surface
 from evaluators.footprint import corners
 from evaluators.reference_strict import depth_by_points
 from evaluators.surface import MARGIN_M, Region, Surface, closed_union
@@ -91,6 +91,16 @@ def test_closing_leaves_the_outer_border_where_the_map_has_it():
 def test_a_wide_gap_between_parallel_lanes_costs_half_its_width_under_the_car():
     lanes = road_map(lane("right", 0.0), lane("left", 4.5))
     assert margins(rollout(track(0.0, 2.25)), lanes) == pytest.approx([-0.5], abs=MARGIN_M)
+
+
+@pytest.mark.parametrize("x", [24.5, 25.003, 25.093, 25.9])
+def test_a_nose_across_a_wide_gap_is_settled_in_a_few_pieces(monkeypatch, x):
+    """Halfway between two parallel borders the distance is the same along a whole line, which no corner of a piece need meet."""
+    region = Region(shapely.MultiPolygon([shapely.box(0, -1.75, 24, 1.75), shapely.box(26, -1.75, 60, 1.75)]))
+    quartered, cut = [], surface._quartered
+    monkeypatch.setattr(surface, "_quartered", lambda owner, pieces: quartered.append(len(owner)) or cut(owner, pieces))
+    assert region.margin_m(np.array([shapely.box(x - 4.8, -1.05, x, 1.05)])) == pytest.approx([-min(x - 24.0, 1.0)], abs=MARGIN_M)
+    assert sum(quartered) < 20
 
 
 def test_a_hole_under_the_car_counts_although_all_corners_are_on_the_road():
@@ -191,8 +201,8 @@ def layouts(draw):
 def test_random_layouts_agree_with_distances_point_by_point(rings, x, y, yaw):
     areas = np.array([lane_polygon(_as_lane(ring)) for ring in rings], dtype=object)
     body = box(x, y, yaw)
-    surface = Surface(areas, [np.zeros((2, 3))] * len(rings), 0.0, 3.0)
-    found = float(surface.margin_m(np.array([shapely.Polygon(body)]), np.array([[x, y, 0.0]]))[0])
+    drivable = Surface(areas, [np.zeros((2, 3))] * len(rings), 0.0, 3.0)
+    found = float(drivable.margin_m(np.array([shapely.Polygon(body)]), np.array([[x, y, 0.0]]))[0])
     kept = [
         list(map(tuple, shapely.get_coordinates(part)[:-1]))
         for area in areas
