@@ -141,8 +141,8 @@ class _Rhythm:
         else:
             frames, shown = self._make_draft(requests), exact
         self.tally.shown += shown
-        missed = forecasts or [None] * len(frames)
-        return {frame.camera: _measured(frame, *errors) for frame, *errors in zip(frames, shown, missed, strict=True)}
+        missed: Sequence[Deviation | None] = forecasts or [None] * len(frames)
+        return {frame.camera: _measured(frame, off, miss) for frame, off, miss in zip(frames, shown, missed, strict=True)}
 
     def _shot(self, request: RenderRequest, foretold: list[tuple[Shot, Frame]] | None, i: int) -> Shot:
         if foretold is not None and same_view(foretold[i][0].request, request):
