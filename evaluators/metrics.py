@@ -33,7 +33,7 @@ def _flag(
     return MetricInfo("", direction, aggregation, help_text, is_flag=True, derived=derived, is_headline=is_headline)
 
 
-MIN_ADE = "min_ade@{:.1f}s({})"
+MIN_ADE = "min_ade@{}s({})"  # seconds as Python writes a float: 0.5, 1.0, 0.25
 
 METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, after the headline ones
     "collision_at_fault": _flag("front or lateral contact", is_headline=True),

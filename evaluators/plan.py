@@ -145,7 +145,7 @@ def min_ade(rollout: RolloutLog, plans: Sequence[LoggedPlan], preset: Preset, or
                 errors = [_errors(samples, k, usable[span], target_xyz[span], preset).mean() for k in reach]
                 values[i, j] = min(errors, default=np.nan)
     reason = "the log, the target or every sample ends before the horizon"
-    names = [MIN_ADE.format(horizon_s, preset.min_ade_target) for horizon_s in preset.min_ade_horizons_s]
+    names = [MIN_ADE.format(float(horizon_s), preset.min_ade_target) for horizon_s in preset.min_ade_horizons_s]
     return [series(name, now_us, values[:, j], np.isfinite(values[:, j]), reason) for j, name in enumerate(names)]
 
 
@@ -173,7 +173,7 @@ def _min_ade_by_index(
         reads = [int(np.searchsorted(line_us, plan.now_us + horizon_s * 1e6)) - after_now for horizon_s in preset.min_ade_horizons_s]
         for j, read in enumerate([read for read in reads if read < len(span)]):
             rows[j].append((plan.now_us, float(best[read])))
-    names = [MIN_ADE.format(horizon_s, preset.min_ade_target) for horizon_s in preset.min_ade_horizons_s]
+    names = [MIN_ADE.format(float(horizon_s), preset.min_ade_target) for horizon_s in preset.min_ade_horizons_s]
     return [
         series(name, np.array([t for t, _ in found], dtype=np.int64), np.array([v for _, v in found]))
         for name, found in zip(names, rows, strict=True)

@@ -155,3 +155,26 @@ def test_bytes_that_are_no_image_are_an_error():
     log = rollout(drive(), images=[LoggedImage("front", 0, 0, b"not a picture")])
     with pytest.raises(EvaluatorError, match="13 bytes that are no image"):
         score(log, scene(TWO_LANES, log))
+
+
+def test_min_ade_names_carry_every_digit_of_the_horizon():
+    xs = np.arange(1.0, 31.0)
+    log = rollout(drive(), plans=[plan(1, xs, samples=[(xs, 0.5)])])
+    names = [f"min_ade@{text}s(gt)" for text in ("0.25", "0.5", "2.0")]
+    for name in ("alpasim", "paper"):
+        chosen = replace(PRESETS[name], min_ade_horizons_s=(0.25, 0.5, 2))
+        found = by_name(score(log, scene(TWO_LANES, log), chosen))
+        assert [key for key in found if key.startswith("min_ade")] == names
+        assert found["min_ade@0.25s(gt)"].value == pytest.approx([0.5])
+
+
+def test_horizons_in_any_order_are_read_as_alpasim_reads_them():
+    # Near the log's end the long horizon has no value; AlpaSim then gives it the short one's, since it drops by place.
+    xs = np.arange(35.0, 65.0)
+    log = rollout(drive(), plans=[plan(35, xs, samples=[(xs, 0.1 * np.arange(30))])])
+    found = by_name(score(log, scene(TWO_LANES, log), replace(PRESETS["alpasim"], min_ade_horizons_s=(2.0, 0.2))))
+    assert found["min_ade@2.0s(gt)"].value == pytest.approx([0.15])
+    assert "min_ade@0.2s(gt)" not in found
+    ours = by_name(score(log, scene(TWO_LANES, log), replace(PRESETS["paper"], min_ade_horizons_s=(2.0, 0.2))))
+    assert not ours["min_ade@2.0s(gt)"].valid.any()
+    assert ours["min_ade@0.2s(gt)"].value == pytest.approx([0.15])
