@@ -161,6 +161,7 @@ class Region:
         return bound
 
 
+@np.errstate(divide="ignore", invalid="ignore")  # flags that the geometry library raises inside and has dealt with
 def closed_union(areas: Geometries, seam_m: float) -> Any:
     """Return the union of areas with the gaps between them up to ``seam_m`` wide filled.
 
