@@ -14,9 +14,9 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from evaluators.report.charts import ARM, GRID, INK, MUTED, N_COLOURS, RC, Chart, themed_svg
 from evaluators.report.headline import WORDS
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
-from evaluators.report.numbers import finite, interval, short
+from evaluators.report.numbers import finite, interval
 from evaluators.report.run_folder import Run
-from evaluators.report.strata import VALUES, Strata
+from evaluators.report.strata import NOT_BESIDE, VALUES, Strata
 
 WIDTH_IN = 4.6
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
@@ -86,7 +86,7 @@ def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
         axes.spines["left"].set_visible(False)
         axes.set_xlabel(f"{'percentage points' if unit == 'points' else unit or 'no unit'} worse than the baseline \u2192")
         svg = themed_svg(figure)
-    title = "Rates and shares" if unit == "points" else f"In {unit or 'numbers without unit'}"
+    title = "Rates and shares" if unit == "points" else "Distances" if unit == "m" else f"In {unit or 'numbers without unit'}"
     return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
 
 
@@ -119,28 +119,36 @@ def _speed_chart(metric: str, unit: str, points: Sequence[tuple[str, float, _Lin
             colour = ARM[line.arm % N_COLOURS]
             axes.plot([ms, ms], [line.low, line.high], color=colour, linewidth=1.8)
             axes.plot([ms], [line.centre], MARKERS[line.arm % len(MARKERS)], color=colour, markersize=7, label=arm)
-            axes.annotate(arm, (ms, line.centre), (7, 5), textcoords="offset points", fontsize=9, color=colour)
-        _log_time(axes, [ms for _, ms, _ in points])
+            left = ms <= min(t for _, t, _ in points)  # the intervals of the slower ones lie to its right
+            axes.annotate(
+                arm, (ms, line.centre), (-7 if left else 7, 5), textcoords="offset points", ha="right" if left else "left", color=colour
+            )
+        _time_axis(axes, [ms for _, ms, _ in points])
         axes.set_xlabel("ms per camera frame, median")
         axes.set_ylabel("points worse" if unit == "points" else f"{unit} worse")
         axes.tick_params(length=0)
         return Chart(WORDS.get(metric, metric), "Paired with the baseline, which lies on the line; 95 % over scenes.", themed_svg(figure))
 
 
-def _log_time(axes: Axes, ms: Sequence[float]) -> None:
-    axes.set_xscale("log")
+def _time_axis(axes: Axes, ms: Sequence[float]) -> None:
+    """Take a logarithmic axis where renderers differ by much, with room for their names on both sides."""
     low, high = min(ms), max(ms)
-    axes.set_xlim(low / 1.6, high * 2.2)
-    ticks = [t for t in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000) if low / 1.6 <= t <= high * 2.2]
-    axes.set_xticks(ticks or [low])
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    if high < 4.0 * low:
+        room = max(high - low, 0.1 * high)
+        axes.set_xlim(max(low - 0.6 * room, 0.0), high + 0.6 * room)
+        return
+    axes.set_xscale("log")
+    low, high = low / 2.0, high * 2.0
+    axes.set_xlim(low, high)
+    axes.set_xticks([t for t in (base * 10**k for k in range(-1, 6) for base in (1, 2, 5)) if low <= t <= high])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def strata_chart(one: Strata) -> Chart | None:
     """Draw the steadiness of plans by stratum; None where it is known in fewer than two."""
     name = VALUES[0]
-    known = [s for s in one.strata if any(name in b.means for b in s.bins)]
+    known = [s for s in one.strata if s.label != NOT_BESIDE and any(name in b.means for b in s.bins)]
     if len(known) < 2:
         return None
     arms = sorted({b.arm for s in known for b in s.bins})
@@ -159,11 +167,16 @@ def strata_chart(one: Strata) -> Chart | None:
                 axes.plot([x], [mean], MARKERS[b.arm % len(MARKERS)], color=colour, markersize=6)
         for k in range(1, len(known)):
             axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
-        axes.set_xticks(range(len(known)), [s.label.replace(" and more", "+").replace("below ", "< ") for s in known], fontsize=8)
+        axes.set_xticks(range(len(known)), [_tick(s.label, one.unit) for s in known], fontsize=8.5)
         axes.set_xlim(-0.5, len(known) - 0.5)
         axes.set_ylim(bottom=0.0)
         axes.set_ylabel("m between plans in a row")
-        axes.set_xlabel(one.axis)
+        axes.set_xlabel(f"{one.axis}, {one.unit}" if one.unit else one.axis)
         axes.tick_params(length=0)
         svg = themed_svg(figure)
-    return Chart(f"Steadiness of plans by {one.axis}", "Mean over steps of plan_deviation; bars: 95 % over scenes.", svg)
+    return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", svg)
+
+
+def _tick(label: str, unit: str) -> str:
+    short_label = label.replace("\u00a0" + unit, "") if unit else label
+    return short_label.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013")

@@ -21,7 +21,9 @@ OPACITY_SHARES = (25, 50, 75)  # percentiles of the run's own frames: what is mu
 EVENTS = (("collision_at_fault", "at-fault collisions"), ("offroad", "off-road"))
 VALUES = ("plan_deviation", "min_ade@1.0s(gt)")
 SERIES = (DISTANCE, OPACITY, *VALUES, *COLLISION, "offroad", "eval_relevant")
+NOT_BESIDE = "not beside the path"
 LEAST_STEPS = 10  # fewer steps in a stratum give no mean
+LEAST_SCENES = 3  # fewer scenes give no interval
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -34,7 +36,8 @@ class Bin:
     Attributes:
         seconds: Time driven there, of the scored part of all rollouts.
         events: Rollouts whose first event of the kind began there, by metric.
-        means: Mean over steps by metric with its interval over scenes (low, high None where there is none); absent where unknown.
+        means: By metric: mean over scenes of the scene's mean over steps, and its interval (None, None where there is none); absent where
+            unknown.
     """
 
     arm: int
@@ -60,6 +63,7 @@ class Strata:
     title: str
     note: str
     axis: str
+    unit: str
     strata: tuple[Stratum, ...]
 
 
@@ -81,17 +85,17 @@ def strata(run: Run) -> list[Strata]:
     steps = [one for one in steps if len(one.t_us)]
     found = []
     if steps:
-        labels = [*_labels(DISTANCE_EDGES_M, "m"), "not beside the path"]
+        labels = [*_labels(DISTANCE_EDGES_M, "m"), NOT_BESIDE]
         note = "Time, events and plans by how far the ego's rear axle was from the logged path at that moment."
         groups = [one.distance_bin() for one in steps]
-        found.append(_split("By distance from the logged path", note, "distance from the path", labels, steps, groups, run))
+        found.append(_split("By distance from the logged path", note, "distance from the path", "m", labels, steps, groups, run))
     covered = [one for one in steps if one.opacity is not None]
     if covered:
         every = np.concatenate([one.opacity[np.isfinite(one.opacity)] for one in covered if one.opacity is not None])
         edges = tuple(dict.fromkeys(round(float(v), 3) for v in np.percentile(every, OPACITY_SHARES))) if every.size else ()
         note = "Opacity: mean over the picture of what the Gaussians cover; little means sky, or holes. Limits are quartiles of this run."
         groups = [one.opacity_bin(edges) for one in covered]
-        found.append(_split("By rendered opacity", note, "rendered opacity", _labels(edges, ""), covered, groups, run))
+        found.append(_split("By rendered opacity", note, "rendered opacity", "", _labels(edges, ""), covered, groups, run))
     return found
 
 
@@ -160,7 +164,9 @@ class _Steps:
         return np.asarray(values[np.isin(times, self.t_us[group == k])])
 
 
-def _split(title: str, note: str, axis: str, labels: Sequence[str], steps: list[_Steps], groups: list[I64], run: Run) -> Strata:
+def _split(
+    title: str, note: str, axis: str, unit: str, labels: Sequence[str], steps: list[_Steps], groups: list[I64], run: Run
+) -> Strata:
     strata_found = []
     for k, label in enumerate(labels):
         bins = []
@@ -170,7 +176,7 @@ def _split(title: str, note: str, axis: str, labels: Sequence[str], steps: list[
                 bins.append(_bin(arm, renderer, mine, k))
         if bins:
             strata_found.append(Stratum(label, tuple(bins)))
-    return Strata(title, note, axis, tuple(strata_found))
+    return Strata(title, note, axis, unit, tuple(strata_found))
 
 
 def _bin(arm: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) -> Bin:
@@ -186,7 +192,9 @@ def _bin(arm: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) -> Bin
         scenes = [scene for v, scene in parts for _ in v]
         if len(values) >= LEAST_STEPS:
             interval = clustered(values, scenes)
-            means[name] = (float(np.mean(values)), interval.low, interval.high)
+            enough = len(set(scenes)) >= LEAST_SCENES and interval.low is not None
+            # Neither metric can be negative; a t interval over few scenes does not know that.
+            means[name] = (interval.centre, max(interval.low or 0.0, 0.0) if enough else None, interval.high if enough else None)
     return Bin(arm, renderer, seconds, len(mine), events, means)
 
 
@@ -195,7 +203,7 @@ def _mean(b: Bin, name: str) -> Cell:
         return missing(f"fewer than {LEAST_STEPS} steps here have it")
     mean, low, high = b.means[name]
     detail = "" if low is None or high is None else f"{short(low)} to {short(high)}"
-    return Cell(short(mean), "" if detail else "no interval: it needs two scenes", detail, sort=mean)
+    return Cell(short(mean), "" if detail else f"no interval: it needs {LEAST_SCENES} scenes", detail, sort=mean)
 
 
 def _rate(n: int, seconds: float) -> str:

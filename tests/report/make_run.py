@@ -16,6 +16,8 @@ import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
 from evaluators.aggregate import aggregate, censoring, paired
+from evaluators.report.flips import find_flips
+from evaluators.report.run_folder import read_run
 
 METRICS = (
     "collision_any",
@@ -50,6 +52,8 @@ class Plan:
     invalid: Sequence[str] = ("min_distance_to_obstacle_m",)  # metrics that are invalid in the first scene
     pictures: bool = True
     clips: bool = True
+    flip_frames: bool = False
+    certificate: str = "equal"  # equal | different | skipped
     picture_px: tuple[int, int] = (256, 144)
     harm: dict[str, float] = field(default_factory=lambda: {"clean": 0.15, "3dgs": 2.6, "onefixer": 0.45})
     rng_seed: int = 7
@@ -77,7 +81,28 @@ def make_run(folder: Path, plan: Plan | None = None) -> Path:
     _write_steps(folder, steps)
     _json(folder / "run.json", _run_json(plan, maps))
     _json(folder / "summary.json", summary_of(rows, plan))
+    if plan.flip_frames:
+        _write_flips(folder, plan)
     return folder
+
+
+def _write_flips(folder: Path, plan: Plan) -> None:
+    """Write when plans parted for every flip, as the runtime does from the logs; the second one has no answer."""
+    flips, compared = find_flips(read_run(folder))
+    cells = []
+    for number, flip in enumerate(flips):
+        key = dict(zip(("renderer", "policy", "scene", "seed"), flip.key, strict=True)) | {"baseline": flip.base.renderer}
+        if number == 1:
+            cells.append(key | {"t_us": None, "reason": "the plans never part by more than 0.5 m"})
+            continue
+        frames = {}
+        for side, rollout in enumerate((flip.base, flip.other)):
+            frames[rollout.renderer] = f"flips/{number:03d}-{side}.jpg"
+            (folder / "flips").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / frames[rollout.renderer]), _picture(rollout.renderer, 2, *plan.picture_px))
+        part_us = 1_000_000 + 100_000 * number
+        cells.append(key | {"t_us": part_us, "after_us": part_us, "gap_m": 0.5 + 0.01 * number, "source": "logs", "frames": frames})
+    _json(folder / "flips.json", {"threshold_m": 0.5, "horizon_s": 3.0, "n_flips": len(flips), "n_pairs": compared, "cells": cells})
 
 
 def _slug(name: str) -> str:
@@ -178,6 +203,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "ego_speed_mps": np.full(plan.steps, 8.0),
         "lateral_offset_m": offset,
         "opacity_mean": np.clip(0.995 - 0.04 * harm * np.abs(offset), 0, 1),
+        "plan_deviation": 0.05 + 0.04 * harm * np.abs(offset),
         "collision_any": hit.astype(float),
         "collision_at_fault": hit.astype(float),
         "offroad": off.astype(float),
@@ -303,8 +329,21 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
             "cells": [_failed(r) for r in failed],
         },
         "speed": speed,
+        "determinism": _certificate(plan),
         "pool": {"workers": 2, "threads_per_worker": 1, "frames_per_s_total": 41.2, "wall_s": sum(r["wall_s"] for r in rows) / 2},
     }
+
+
+def _certificate(plan: Plan) -> dict[str, Any]:
+    if plan.certificate == "skipped":
+        return {"status": "skipped", "reason": "no rollout was run to its end"}
+    digests = {name: f"{k}a" * 32 for k, name in enumerate(("ego", "actors", "frames", "plans", "scores"))}
+    cell = {"renderer": "clean", "policy": "lane-camera", "scene": "smoke/straight", "seed": 0}
+    entry = {"status": plan.certificate, "cell": cell, "path": "rollouts/x", "steps": 120, "digests": digests, "wall_s": 3.2}
+    if plan.certificate == "equal":
+        return entry | {"repeated": digests, "first_difference": None}
+    first = {"component": "frames", "t_us": 400_000, "step": 4, "what": "camera <b>front</b>"}
+    return entry | {"repeated": digests | {"frames": "ff" * 32}, "first_difference": first}
 
 
 def _failed(row: dict[str, Any]) -> dict[str, Any]:

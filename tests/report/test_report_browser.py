@@ -55,6 +55,41 @@ def test_clicking_a_head_sorts_by_value_and_again_turns_it_round(browser: Browse
     assert browser.evaluate("document.querySelectorAll('#table-scenes th[aria-sort]').length") == 1
 
 
+def test_changed_outcomes_lead_to_their_frames(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run), width=390)
+    opened = "[...document.querySelectorAll('.flip-card')].map(d => d.open)"
+    assert browser.evaluate(opened)[0]
+    assert not browser.evaluate(opened)[-1]
+    browser.evaluate("[...document.querySelectorAll('#table-flips a.to-flip')].at(-1).click()")
+    assert browser.evaluate(opened)[-1]
+    assert browser.evaluate("location.hash") == "#" + browser.evaluate("[...document.querySelectorAll('.flip-card')].at(-1).id")
+    shown = "[...document.querySelectorAll('.flip-card[open] img')].every(i => i.complete && i.naturalWidth > 0)"
+    assert browser.evaluate(shown)
+    links = browser.evaluate("[...document.querySelectorAll('#table-flips td.all a:not(.to-flip)')].map(a => a.getAttribute('href'))")
+    assert links
+    assert all((usual_run / link).exists() for link in links)
+
+
+def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run))
+    head = "[...document.querySelectorAll('#table-flips th .sort')].find(b => b.textContent.startsWith('Plans part')).click()"
+    for _ in range(2):
+        browser.evaluate(head)
+        times = column(browser, "table-flips", 6)
+        known = [float(text.split("\u00a0")[0]) for text in times if text != "\u2014"]
+        assert known in (sorted(known), sorted(known)[::-1])
+        assert times[-1] == "\u2014"
+
+
+def test_folds_open_and_close(browser: Browser, usual_run: Path) -> None:
+    browser.open(write_report(usual_run))
+    table = "document.getElementById('table-strata-0').checkVisibility()"
+    assert not browser.evaluate(table)
+    for seen in (True, False):
+        browser.evaluate("document.getElementById('table-strata-0').closest('details').querySelector('summary').click()")
+        assert browser.evaluate(table) is seen
+
+
 def test_missing_values_stay_last_both_ways(browser: Browser, usual_run: Path) -> None:
     browser.open(write_report(usual_run))
     browser.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true; })")

@@ -63,6 +63,11 @@
     });
   }
 
+  // A link to the frames of a changed outcome opens their card.
+  for (const link of all("a.to-flip")) {
+    link.addEventListener("click", () => { document.getElementById(link.hash.slice(1)).open = true; });
+  }
+
   // Copy: the clipboard may be refused for files; the command is then selected instead.
   const copy = document.getElementById("copy");
   copy?.addEventListener("click", async () => {

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from evaluators.report import write_report
+from evaluators.report.flips import Flip, events, find_flips, flip_rows, in_words
+from evaluators.report.run_folder import Rollout, Run, read_run
+from tests.report.make_run import Plan, make_run
+
+
+def rollout(renderer: str, seed: int = 0, status: str = "ok", **metrics: float) -> Rollout:
+    return Rollout(renderer, "p", "s", seed, status, metrics=metrics)
+
+
+def run_of(*rollouts: Rollout) -> Run:
+    return Run(Path(), {"renderers": ["clean", "3dgs"]}, {}, rollouts, ())
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "tone", "words"),
+    [
+        ({}, {"offroad": 1.0}, "worse", ("no event", "off-road")),
+        ({"collision_any": 1.0}, {"collision_any": 1.0, "collision_at_fault": 1.0}, "worse", ("collision", "at-fault collision")),
+        ({"collision_any": 1.0, "collision_at_fault": 1.0}, {}, "better", ("at-fault collision", "no event")),
+        ({"offroad": 1.0}, {"collision_any": 1.0}, "mixed", ("off-road", "collision")),
+        ({"offroad": 1.0}, {"offroad": 1.0, "collision_any": 1.0}, "worse", ("off-road", "collision and off-road")),
+    ],
+)
+def test_a_flip_has_a_side_and_words(was: dict[str, float], now: dict[str, float], tone: str, words: tuple[str, str]) -> None:
+    flips, compared = find_flips(run_of(rollout("clean", **was), rollout("3dgs", **now)))
+    assert compared == 1
+    (flip,) = flips
+    assert (flip.tone, (flip.was, flip.now)) == (tone, words)
+
+
+def test_equal_outcomes_failed_sides_and_missing_partners_are_no_flips() -> None:
+    same = (rollout("clean", 0, offroad=1.0), rollout("3dgs", 0, offroad=1.0))
+    failed = (rollout("clean", 1), rollout("3dgs", 1, "failed", offroad=1.0))
+    alone = (rollout("3dgs", 2, offroad=1.0),)
+    assert find_flips(run_of(*same, *failed, *alone)) == ([], 1)
+
+
+def test_events_name_the_gravest_word_only() -> None:
+    had = events(rollout("clean", collision_any=1.0, collision_at_fault=1.0, offroad=1.0))
+    assert in_words(had) == "at-fault collision and off-road"
+
+
+def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
+    rows, more, compared = flip_rows(read_run(usual_run), 10**7)
+    assert (more, compared) == (0, 44)  # 48 pairs less two failed cells, which both policies share
+    assert len(rows) > 3
+    assert [name for name, *_ in rows[0].pictures] == ["clean", rows[0].flip.other.renderer]
+    assert rows[0].time.text == "1.0\u00a0s"
+    assert rows[0].gap.text == "0.500\u00a0m"
+    assert rows[1].time.missing
+    assert rows[1].why_not == "the plans never part by more than 0.5 m"
+    assert [tone for tone in ("worse", "mixed", "better") if any(r.flip.tone == tone for r in rows)] == list(
+        dict.fromkeys(row.flip.tone for row in rows)
+    )
+    with_clip = next(row for row in rows if row.flip.other.seed == 0)
+    assert all(clip is not None and clip.endswith("front.mp4") for _, _, clip, _ in with_clip.links)
+
+
+def test_pictures_stop_at_the_budget_and_say_so(usual_run: Path) -> None:
+    rows, _, _ = flip_rows(read_run(usual_run), 1)
+    assert rows[0].pictures
+    assert not any(row.pictures for row in rows[1:])
+    assert "flips/" in rows[2].why_not
+
+
+def test_a_run_without_logs_lists_flips_with_the_reason_why_nothing_is_known(usual_run: Path, tmp_path: Path) -> None:
+    for name in ("run.json", "summary.json", "rollouts.parquet"):
+        shutil.copy(usual_run / name, tmp_path / name)
+    rows, _, _ = flip_rows(read_run(tmp_path), 10**7)
+    assert {row.why_not for row in rows} == {"the run folder has no logs to look for it in"}
+    text = write_report(tmp_path).read_text()
+    assert "No frames: the run folder has no logs to look for it in." in text
+
+
+def test_frames_outside_the_run_folder_are_not_read(usual_run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(usual_run, folder)
+    told = json.loads((folder / "flips.json").read_text())
+    shutil.copy(folder / "flips/000-0.jpg", tmp_path / "secret.jpg")
+    told["cells"][0]["frames"] = dict.fromkeys(told["cells"][0]["frames"], "../secret.jpg")
+    (folder / "flips.json").write_text(json.dumps(told))
+    assert not flip_rows(read_run(folder), 10**7)[0][0].pictures
+
+
+def test_a_run_whose_pairs_all_end_alike_says_so(tmp_path: Path) -> None:
+    plan = Plan(renderers=("clean", "same"), harm={"clean": 0.0, "same": 0.0}, scenes=("a",), seeds=(0,))
+    folder = make_run(tmp_path, plan)
+    flips: tuple[list[Flip], int] = find_flips(read_run(folder))
+    assert flips == ([], 1)
+    assert "None: all 1\u00a0pair of rollouts end as they do behind clean." in write_report(folder).read_text()
