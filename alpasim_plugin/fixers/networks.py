@@ -18,6 +18,7 @@ from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
 from alpasim_plugin.nets.schedule import CONTEXT_STEP, from_names
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
 from alpasim_plugin.seeding import derive_seed
 
@@ -124,7 +125,9 @@ class _Parts:
         if given is not None:
             return (TinyVAE if tiny else WanVAE).from_state_dict(given[0], source=given[1])
         self.made_up("vae", always_random=not tiny)
-        return TinyVAE.random(seed=self.seed) if tiny else WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed)
+        if tiny:
+            return TinyVAE.random(TinySizes(*self.settings.vae.widths), self.seed)
+        return WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed)
 
     def decoder(self) -> TinyDecoder:
         """Build the tiny Wan decoder."""

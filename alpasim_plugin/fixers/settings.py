@@ -55,6 +55,10 @@ class CodecSettings(Part):
 
     kind: Literal["tiny", "wan"] = Field(description="tiny: TinyVAE. wan: the Wan 2.1 autoencoder at any width.")
     base: Positive = Field(default=96, description="Width of an untrained wan autoencoder: 96 as published, 24 for LightVAE.")
+    widths: tuple[Positive, Positive, Positive, Positive, Positive] = Field(
+        default=(64, 96, 96, 64, 48),
+        description="Channels of an untrained tiny autoencoder: encoder at 1/4 and 1/8, decoder at 1/8, 1/4 and per frame.",
+    )
 
 
 class DecoderSettings(Part):
@@ -81,7 +85,7 @@ class DigestSettings(Part):
 class WeightsSettings(Part):
     """Files with weights; relative paths start at the folder of the file that names them, or at the working folder."""
 
-    bundle: str | None = Field(default=None, description="A safetensors file or a folder with everything (docs/fixers.md).")
+    bundle: str | None = Field(default=None, description="One safetensors file with everything (docs/fixers.md).")
     dit: str | None = Field(default=None, description="The transformer alone.")
     vae: str | None = Field(default=None, description="The autoencoder alone.")
     decoder: str | None = Field(default=None, description="The tiny Wan decoder.")

@@ -10,7 +10,8 @@ from alpasim_plugin.errors import FixerError, InputError
 from alpasim_plugin.fixers import FIXERS, BlockRule, fixer_settings, make_fixer
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
-from alpasim_plugin.nets import DiTSizes
+from alpasim_plugin.nets import DiTSizes, TinyVAE
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.fixers.fixer_cases import small_settings
 
 
@@ -94,6 +95,14 @@ def test_paths_start_where_they_were_written() -> None:
 def test_the_large_fixer_does_not_go_without_weights() -> None:
     with pytest.raises(InputError, match=r"weights\.dit=FILE"):
         make_fixer("onefixer-2b", scene_id="scene")
+
+
+def test_widths_of_an_untrained_tiny_autoencoder() -> None:
+    vae = load_networks(small_settings("vae.widths=[8,16,12,10,6]")).vae
+    assert isinstance(vae, TinyVAE)
+    assert vae.sizes == TinySizes(8, 16, 12, 10, 6)
+    assert load_networks(small_settings()).vae.sizes == TinySizes()
+    assert "vae.widths" in refusal("vae.widths=[8,16]")
 
 
 def test_an_untrained_wan_autoencoder_is_no_identity() -> None:
