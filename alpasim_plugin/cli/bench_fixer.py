@@ -20,7 +20,6 @@ from alpasim_plugin.fixers.bench_table import HEAD, MARKERS, cells, markdown, pl
 from alpasim_plugin.runtime.bench_fixer import Bench, bench_fixer
 
 PAGE, PICTURE = Path("docs/speed-and-error.md"), Path("docs/img/speed-and-error.png")
-
 EPILOG = """
 Examples:
 
@@ -69,10 +68,13 @@ def fixer(
         return
     table = Table(box=None, header_style="bold")
     for title in HEAD:
-        table.add_column(title, justify="left" if title in HEAD[:2] else "right")
+        table.add_column(title, justify="left" if title in HEAD[:2] else "right", no_wrap=True)
     for row in bench.rows:
         table.add_row(*cells(row))
-    Console().print(table)
+    console = Console()
+    # Cells that are cut off cannot be read; a line that is too long for a terminal can be scrolled to, or read in --out.
+    console.width = max(console.width, Console(width=1000).measure(table).maximum)
+    console.print(table)
     print(machine_line(bench.facts))
 
 

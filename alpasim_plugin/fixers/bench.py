@@ -28,7 +28,6 @@ from alpasim_plugin.fixers.measure import Clip, Timing, measure
 from alpasim_plugin.fixers.reference import whole_clip
 from alpasim_plugin.fixers.refine import Difference
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.stand_in import NOTE as STAND_IN
 from alpasim_plugin.fixers.stand_in import save_stand_in
 from alpasim_plugin.types import U8
 
@@ -98,7 +97,8 @@ class Row:
         weights: Which weights.
         size: Width and height, pixels.
         frames: Frames of the clip.
-        ms: By stage and ``all-in``: median and 95th percentile over blocks after the first, milliseconds per frame.
+        ms: By stage, ``all-in`` and its processor time ``cpu``: median and 95th percentile over blocks after the first, milliseconds per
+            frame.
         first_ms: First block, whole, all-in.
         load_ms: Networks from nothing to ready.
         peak_mb: Largest memory beyond an empty process, 1e6 bytes; None where the system does not tell.
@@ -205,7 +205,7 @@ class Settings:
 
     def label(self, case: Case) -> str:
         """Say which weights a case uses."""
-        return "given" if self.given and case.weights == "stand-in" else STAND_IN if case.weights == "stand-in" else case.weights
+        return "given" if self.given and case.weights == "stand-in" else case.weights
 
     def _read(self, overrides: Sequence[str]) -> OneFixerSettings:
         settings = fixer_settings(self.plan.name, (*self.plan.overrides, *overrides))
@@ -224,7 +224,7 @@ def _row(plan: Plan, settle: Settings, case: Case, clip: Clip, truth: U8 | None,
     except SimrunError as error:
         return Row(case.group, case.name, settle.label(case), size, 0, {}, problem=error.found)
     n = len(timing.images)
-    times = spread(timing.stages | {"all-in": timing.all_in})
+    times = spread(timing.stages | {"all-in": timing.all_in, "cpu": timing.cpu})
     return Row(
         case.group, case.name, settle.label(case), size, n, times, timing.first_ms, timing.load_ms, timing.peak_mb,
         difference(timing.images, same[:n]), None if truth is None else difference(timing.images, truth[:n]),

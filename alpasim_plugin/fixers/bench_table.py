@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from alpasim_plugin.fixers.bench import Row
 from alpasim_plugin.fixers.measure import STAGES
 
 HEAD = (
-    "setting", "weights", *(f"{stage} ms" for stage in STAGES), "all-in ms", "first block ms", "peak MB",
+    "setting", "weights", *(f"{stage} ms" for stage in STAGES), "all-in ms", "CPU ms", "first block ms", "peak MB",
     "rounding: mean, max, PSNR", "model: mean, max, PSNR", "hits",
 )  # fmt: skip
+NEAR = 0.15  # decades between points that share a label
 FLOOR = 1e-4  # grey levels; where the plot puts errors that are zero
 MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P"}
 MARK = "<!-- bench fixer: {} -->"
@@ -43,7 +47,7 @@ def cells(row: Row) -> list[str]:
     return [
         name,
         row.weights,
-        *(_times(row, stage) for stage in (*STAGES, "all-in")),
+        *(_times(row, stage) for stage in (*STAGES, "all-in", "cpu")),
         _number(row.first_ms, ".0f"),
         _number(row.peak_mb, ".0f"),
         _error(row.rounding),
@@ -74,28 +78,50 @@ def _error(error: tuple[float, int, float | None] | None) -> str:
 def plot(rows: Sequence[Row], path: str | Path) -> None:
     """Draw all-in time per frame against both errors, one point a setting, and write a PNG."""
     sizes = list(dict.fromkeys(row.size for row in rows))
-    figure = Figure(figsize=(13, 5.6 * len(sizes)), layout="constrained")
+    figure = Figure(figsize=(14, 6.2 * len(sizes)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(sizes), 2, squeeze=False)
-    titles = {"rounding": "rounding: same setting", "model": "model: base, window over the whole clip"}
+    titles = {"rounding": "rounding: the same setting", "model": "model: the base with a window over the whole clip"}
     for line, size in zip(axes, sizes, strict=True):
         mine = [row for row in rows if row.size == size and not row.problem]
         for ax, (kind, title) in zip(line, titles.items(), strict=True):
-            shown = [(row, error) for row in mine if (error := getattr(row, kind)) is not None]
-            points = [(row.ms["all-in"][0], max(error[0], FLOOR)) for row, error in shown]
-            for (row, _), (x, y) in zip(shown, points, strict=True):
-                ax.plot(x, y, MARKERS[row.group], color=f"C{list(MARKERS).index(row.group)}", markersize=7)
-                ax.annotate(row.name, (x, y), xytext=(6, 3), textcoords="offset points", fontsize=7)
-            ax.set_xscale("log")
-            ax.set_yscale("log")
-            ax.set_xlabel("all-in, ms per frame (median)")
-            ax.set_ylabel("mean error, grey levels")
-            ax.set_title(f"{size[0]}x{size[1]}: error against float32 whole clip, {title}", fontsize=9)
-            ax.grid(visible=True, which="both", alpha=0.25)
-        for group, marker in MARKERS.items():
-            line[0].plot([], [], marker, color=f"C{list(MARKERS).index(group)}", label=group)
-        line[0].legend(fontsize=8, loc="best")
-    figure.savefig(path, dpi=110)
+            _panel(ax, [(row, error[0]) for row in mine if (error := getattr(row, kind)) is not None])
+            ax.set_title(f"{size[0]}x{size[1]}, against the float32 whole clip of {title.partition(': ')[2]} ({kind})", fontsize=9)
+    figure.savefig(path, dpi=100)
+
+
+def _panel(ax: Any, errors: Sequence[tuple[Row, float]]) -> None:
+    points = [(row, row.ms["all-in"][0], max(error, FLOOR)) for row, error in errors]
+    for row, x, y in points:
+        ax.plot(x, y, MARKERS[row.group], color=f"C{list(MARKERS).index(row.group)}", markersize=7)
+    for x, y, names in _clusters(points):
+        side = "bottom" if y <= FLOOR else "top"
+        ax.annotate("\n".join(names), (x, y), xytext=(7, 4), textcoords="offset points", fontsize=7, va=side)
+    for group, marker in MARKERS.items():
+        ax.plot([], [], marker, color=f"C{list(MARKERS).index(group)}", label=group)
+    ax.legend(fontsize=8, loc="center left")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.margins(x=0.3, y=0.12)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(ScalarFormatter())
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.set_xlabel("all-in, ms per frame (median)")
+    ax.set_ylabel(f"mean error, grey levels ({FLOOR:g}: that or less)")
+    ax.grid(visible=True, which="both", alpha=0.25)
+
+
+def _clusters(points: Sequence[tuple[Row, float, float]]) -> list[tuple[float, float, list[str]]]:
+    """Join the names of points whose labels would lie on each other; the label stands at the rightmost of them."""
+    out: list[tuple[float, float, list[str]]] = []
+    for row, x, y in sorted(points, key=lambda point: (point[2], point[1])):
+        for i, (right, height, names) in enumerate(out):
+            if abs(math.log10(x / right)) < NEAR and abs(math.log10(y / height)) < NEAR:
+                out[i] = (max(x, right), height, [*names, row.name])
+                break
+        else:
+            out.append((x, y, [row.name]))
+    return out
 
 
 def put_between_marks(page: str, name: str, text: str) -> str:

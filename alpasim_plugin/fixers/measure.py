@@ -103,6 +103,7 @@ class Timing:
         load_ms: Networks from nothing to ready.
         first_ms: Very first block, all-in, whole: buffers are made and kernels chosen.
         all_in: Blocks after the first, frames in to frames out.
+        cpu: Processor time of the same, all threads together: what remains comparable on a busy machine, best with one thread.
         stages: By stage, from a pass of its own.
         peak_mb: Largest resident memory (device memory on an accelerator) beyond what the process held before the networks; None where
             the system does not tell.
@@ -112,6 +113,7 @@ class Timing:
     load_ms: float
     first_ms: float
     all_in: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
     stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
     peak_mb: float | None = None
     images: U8 = field(default_factory=lambda: np.zeros((0, 0, 0, 3), np.uint8))
@@ -141,11 +143,12 @@ def measure(
     for run in range(passes):
         fixer.reset(seed)
         for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
-            begin = clock.now()
+            begin, used = clock.now(), time.process_time()
             fixed = fixer.step(frames, maps)
-            ms = (clock.now() - begin) * 1e3
+            ms, cpu_ms = (clock.now() - begin) * 1e3, (time.process_time() - used) * 1e3
             if index:
                 timing.all_in.append(ms / len(frames))
+                timing.cpu.append(cpu_ms / len(frames))
             elif not run:
                 timing.first_ms = ms
             if not run:

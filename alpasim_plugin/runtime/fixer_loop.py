@@ -109,7 +109,7 @@ class _Tap:
     def __post_init__(self) -> None:
         self.blocks, self.trained, self.label = self.fixer.blocks, self.fixer.trained, self.fixer.label
         self.clock = StageClock(self.device)
-        if isinstance(self.fixer, OneFixer):
+        if isinstance(self.fixer, OneFixer) and self.device == "cpu":  # elsewhere clocks at the stages would slow the whole
             self.fixer.pipeline.stage = self.clock
 
     def reset(self, seed: int) -> None:
