@@ -14,6 +14,7 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.init import initial_weights
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.seeding import derive_seed, stream
 
 VELOCITY = 0.25  # root mean square of the predicted velocity; latents have about unit variance
@@ -23,7 +24,7 @@ NOTE = "random weights, small corrections"
 
 
 def save_stand_in(path: str | Path, settings: OneFixerSettings, seed: int = 0) -> None:
-    """Write a bundle with stand-in weights for the tiny autoencoder and a transformer of the settings' sizes.
+    """Write a bundle with stand-in weights for the tiny autoencoder and a transformer, both of the settings' sizes.
 
     Args:
         path: A ``.safetensors`` file.
@@ -36,7 +37,7 @@ def save_stand_in(path: str | Path, settings: OneFixerSettings, seed: int = 0) -
     last = dit["final_layer.adaln_modulation.2.weight"]
     draw = stream("fixer-stand-in", seed, "modulation").standard_normal(tuple(last.shape))
     dit["final_layer.adaln_modulation.2.weight"] = torch.from_numpy(draw).float() * (MODULATION / last.shape[1] ** 0.5)
-    vae = TinyVAE.random(seed=key)
+    vae = TinyVAE.random(TinySizes(*settings.vae.widths), key)
     with torch.no_grad():
         for name, head in (("encoder", vae.encoder.head), ("decoder", vae.decoder.head)):
             weight = head.weight
