@@ -27,11 +27,12 @@ def doctor(
     checks: dict[str, Callable[[], str]] = {
         "rasteriser (cpu)": lambda: _raster("cpu"),
         "rasteriser (gsplat)": lambda: _raster("gsplat"),
+        "fixer": _fixer,
         "video": _video,
         "log messages": _wire,
         "disk": _disk,
     }
-    needed = {"rasteriser (cpu)", "video", "log messages", "disk"}
+    needed = {"rasteriser (cpu)", "fixer", "video", "log messages", "disk"}
     rows = []
     for name, check in checks.items():
         try:
@@ -63,6 +64,17 @@ def _raster(backend: Literal["cpu", "gsplat"]) -> str:
     camera = PinholeCamera(32, 32, np.array([[32.0, 0, 16], [0, 32, 16], [0, 0, 1]]), np.eye(4))
     out = rasterize(cloud, camera, background=(0.0, 0.0, 0.0), backend=backend)
     return f"one Gaussian rendered, peak alpha {float(np.asarray(out.alpha).max()):.2f}"
+
+
+def _fixer() -> str:
+    from alpasim_plugin.fixers import make_fixer
+    from alpasim_plugin.types import Frame
+
+    fixer = make_fixer("onefixer", scene_id="doctor", threads=1)
+    grey = [Frame(i, "front", np.full((32, 48, 3), 40 * i, dtype=np.uint8)) for i in range(fixer.blocks.first)]
+    fixed = fixer.step(grey, [frame.rgb for frame in grey])
+    refused = sum(bool(frame.events) for frame in fixed)
+    return f"{fixer.label}: a block of {len(fixed)} frames fixed, {refused} refused by its guard"
 
 
 def _video() -> str:

@@ -11,6 +11,7 @@ import pytest
 
 from alpasim_plugin import make_policy, run_rollout
 from alpasim_plugin.errors import FixerError, InputError, RendererError
+from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.renderers import make_renderer
@@ -110,6 +111,23 @@ def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straigh
     assert facts["exact"] >= 4  # while the log is forced forecasts are equal to the last bit
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
     assert_same_pictures(run.policy.seen, run.frames)
+
+
+@pytest.mark.parametrize("mode", ["speculative", "chunk"])
+def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road: Scenario, mode: str) -> None:
+    small = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random", "uses_map=false")
+
+    def network() -> Blend:
+        return make_fixer("onefixer", fixer_settings("onefixer", small), scene_id="straight-road", threads=1)  # type: ignore[return-value]
+
+    scenario = replace(straight_road, end_us=2_000_000)
+    run = drive(scenario, Zigzag, network, mode=mode, tolerance_m=0.01)
+    if mode == "speculative":
+        assert run.session.facts()["redrafts"] > 0
+    offline = fixed_offline(network(), rendered(scenario, run.requests))
+    shown = range(13) if mode == "chunk" else (4, 12)  # in speculative mode a block's last frame is of the true block
+    for i in shown:
+        assert_same_pictures(run.frames[i : i + 1], offline[i : i + 1])
 
 
 @pytest.mark.parametrize("tolerance_m", [0.0, 0.02, 100.0])
