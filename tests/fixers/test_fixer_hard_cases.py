@@ -153,8 +153,8 @@ def test_reduced_precision_does_not_drift(weights: Path, history: str, precision
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_reduced_precision_over_3600_frames(weights: Path, precision: str) -> None:
-    series = drift(busy_settings(weights, "history=finalise"), precision, 3600)
-    print(f"\n{precision}: " + "  ".join(f"{i * 8}: {series[i : i + 10].mean():.4f}" for i in (1, 28, 56, 112, 225, 337, 440)))
+    series = drift(busy_settings(weights, "history=finalise"), precision, 3600, TINY)
+    print(f"\n{precision}: " + "  ".join(f"{i * 8}: {series[i : i + 10].mean():.4f}" for i in (2, 56, 112, 225, 337, 440)))
     assert series[-50:].mean() < 1.5 * series[2:52].mean()
 
 
