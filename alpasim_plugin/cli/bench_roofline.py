@@ -42,6 +42,9 @@ def roofline(
     measure: Annotated[bool, typer.Option("--measure", help="Also run it, with random weights, on --device.")] = False,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where to measure.")] = "cuda",
     blocks: Annotated[int, typer.Option("--blocks", min=1, help="Steady blocks to time.")] = 30,
+    attention: Annotated[
+        Literal["auto", "flash", "cudnn", "efficient", "math"], typer.Option("--attention", help="Attention kernel to measure with.")
+    ] = "auto",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
@@ -57,7 +60,7 @@ def roofline(
     width, height = parse_size(size)
     limits = device_of(on)
     work = block_work(settings, height, width, views, text_tokens)
-    times = measure_blocks(settings, work, height, width, device, blocks, text_tokens) if measure else None
+    times = measure_blocks(settings, work, height, width, device, blocks, text_tokens, attention) if measure else None
     if as_json:
         print(json.dumps(as_document(settings, work, limits, times)))
         return

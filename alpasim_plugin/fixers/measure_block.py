@@ -11,7 +11,9 @@ from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.fixers.random_networks import random_networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.work import TEXT_TOKENS, BlockWork, check_device, run_block, steady_after
+from alpasim_plugin.nets.attention_kernels import Kernel, attention_kernel
 from alpasim_plugin.nets.graphs import GraphedFunction
+from alpasim_plugin.nets.precision import stream_dtype
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,14 @@ class BlockTimes:
 
 
 def measure_blocks(
-    settings: OneFixerSettings, work: BlockWork, height: int, width: int, device: str, blocks: int = 30, text_tokens: int = TEXT_TOKENS
+    settings: OneFixerSettings,
+    work: BlockWork,
+    height: int,
+    width: int,
+    device: str,
+    blocks: int = 30,
+    text_tokens: int = TEXT_TOKENS,
+    attention: Kernel = "auto",
 ) -> BlockTimes:
     """Run a fixer's networks block by block over noise.
 
@@ -47,11 +56,20 @@ def measure_blocks(
         device: ``cpu`` or ``cuda``.
         blocks: Steady blocks to time, and as many again with a clock at each stage.
         text_tokens: Of the prompt.
+        attention: The transformer's and the autoencoder's attention kernel.
 
     Raises:
         FixerError: A GPU that is absent or too small, before anything is put on it.
+        InputError: An attention kernel that is not there.
     """
     check_device(settings, work, device)
+    with attention_kernel(attention, device, stream_dtype(settings.precision, device), settings.dit.head_width):
+        return _measured(settings, work, height, width, device, blocks, text_tokens)
+
+
+def _measured(
+    settings: OneFixerSettings, work: BlockWork, height: int, width: int, device: str, blocks: int, text_tokens: int
+) -> BlockTimes:
     pipeline = BlockPipeline(random_networks(settings, device, text_tokens), settings)
     clock = StageClock(device)
     state, index = pipeline.start(work.views, height, width), 0
