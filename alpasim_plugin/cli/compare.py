@@ -8,15 +8,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from alpasim_plugin.errors import InputError
 from evaluators.gate.across import Comparison, compare_runs, compare_within
 from evaluators.gate.spec import load_gate
-from evaluators.report.metric_info import HEADLINE
+from evaluators.report.metric_info import HEADLINE, in_percent
+from evaluators.report.numbers import plural
 from evaluators.report.run_folder import read_run
 from evaluators.report.tables import PairRow, pair_rows
 
@@ -30,7 +27,7 @@ Examples:
 - `simrun compare runs/main runs/change --gate configs/gates/default.yaml --json`
 """
 EVERY_MISSING = 10**9
-SHOWN_MISSING = 10
+SHOWN, NAMED = 10, 3  # lines about what has no pair; cells named in each
 
 
 def compare(
@@ -49,11 +46,10 @@ def compare(
     if gate is not None:
         margins = {name: rule.margin for name, rule in load_gate(gate)[0].metrics.items() if rule.margin is not None}
     found = [read_run(run) for run in runs]
-    listed = EVERY_MISSING if as_json else SHOWN_MISSING
     result = (
-        compare_within(found[0], baseline, margins, listed)
+        compare_within(found[0], baseline, margins, EVERY_MISSING)
         if len(found) == 1
-        else compare_runs(found[0], found[1], baseline, margins, listed)
+        else compare_runs(found[0], found[1], baseline, margins, EVERY_MISSING)
     )
     if as_json:
         print(json.dumps({"runs": [str(run) for run in runs], "notes": list(result.notes), "paired": result.paired}))
@@ -62,46 +58,49 @@ def compare(
 
 
 def _print(result: Comparison, only: Sequence[str] | None) -> None:
-    console = Console()
     for note in result.notes:
         print(f"note: {note}")
     rows = [row for row in pair_rows({"paired": result.paired}) if only is None or row.metric in only]
-    for arm in result.paired:
+    for arm, entries in result.paired.items():
         mine = [row for row in rows if row.arm == arm]
-        if mine:
-            console.print(_table(arm, mine, result.paired[arm]))
-        for line in _missing(result.paired[arm]):
+        baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
+        print(f"\n{arm} minus {baseline}")
+        for line in [*_table(mine, entries), *_missing(entries)]:
             print(line)
 
 
-def _table(arm: str, rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, title=f"{arm} minus {rows[0].baseline}", title_justify="left")
-    for head in ("metric", "difference", "95 %", "p", "margin", "pairs", "verdict"):
-        table.add_column(head, justify="left" if head in ("metric", "verdict") else "right", overflow="fold")
+def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Lay out one line a metric; wide, so that a line is never broken in the middle of a number."""
+    lines = [("metric", "difference", "95 %", "p", "margin", "pairs", "verdict")]
     for row in rows:
         entry = entries[row.metric]
         more = entry["more_scenes"]
         verdict = f"{entry['verdict']}, about {more} more scenes" if more else str(entry["verdict"])
-        if entry["difference"] == "better":
-            verdict += " (better)"
-        pairs = f"{entry['n_cells']} in {entry['n_scenes']}"
-        cells = [row.metric, row.diff.text, row.interval.text, row.p_value.text, f"{entry['margin']:g}", pairs, verdict]
-        table.add_row(*(Text(cell.replace("\u00a0", " ")) for cell in cells))
-    return table
+        verdict += " (better)" if entry["difference"] == "better" else ""
+        scale = 100.0 if in_percent(row.metric, str(entry["unit"])) else 1.0
+        pairs = f"{entry['n_cells']} in {plural(int(entry['n_scenes']), 'scene')}"
+        lines.append((row.metric, row.diff.text, row.interval.text, row.p_value.text, f"{scale * entry['margin']:g}", pairs, verdict))
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    padded = (zip(line, widths, strict=True) for line in lines)
+    return ["  " + "  ".join(cell.ljust(width) for cell, width in line).replace("\u00a0", " ").rstrip() for line in padded]
 
 
 def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Name cells without a pair once, with the metrics that lack them."""
-    lacking: dict[tuple[Any, ...], list[str]] = {}
-    most = 0
-    for metric, entry in entries.items():
-        most = max(most, entry["n_missing"])
+    """Say what has no pair: metrics without any, cells that lack every metric, and metrics that lack some cells."""
+    paired = {metric: entry for metric, entry in entries.items() if entry["n_cells"]}
+    lines = [f"  no pair: {metric}: {entry.get('reason')}" for metric, entry in entries.items() if metric not in paired]
+    lacking: dict[tuple[str, str], list[str]] = {}  # (cell, why) -> metrics
+    for metric, entry in paired.items():
         for cell in entry["missing"]:
-            lacking.setdefault((cell["policy"], cell["scene"], cell["seed"], cell["why"]), []).append(metric)
-    lines = []
-    for (policy, scene, seed, why), metrics in list(lacking.items())[:SHOWN_MISSING]:
-        which = "every metric" if len(metrics) == len(entries) else ", ".join(metrics[:3]) + (", ..." if len(metrics) > 3 else "")
-        lines.append(f"no pair: {policy}, {scene}, seed {seed}: {which}: {why}")
-    if len(lacking) > SHOWN_MISSING or most > SHOWN_MISSING:
-        lines.append("more cells have no pair: --json lists all")
-    return lines
+            name = f"{cell['policy']}, {cell['scene']}, seed {cell['seed']}"
+            lacking.setdefault((name, cell["why"]), []).append(metric)
+    partly: dict[tuple[str, str], list[str]] = {}  # (metrics, why) -> cells
+    for (name, why), metrics in lacking.items():
+        if len(metrics) == len(paired):
+            lines.append(f"  no pair: {name}: every metric: {why}")
+        else:
+            partly.setdefault((", ".join(metrics), why), []).append(name)
+    for (metrics_text, why), names in partly.items():
+        where = "; ".join(names[:NAMED]) + (f"; {len(names) - NAMED} more" if len(names) > NAMED else "")
+        lines.append(f"  no pair: {metrics_text} in {plural(len(names), 'cell')} ({where}): {why}")
+    return lines if len(lines) <= SHOWN else [*lines[:SHOWN], f"  {len(lines) - SHOWN} more lines: --json lists all"]

@@ -189,7 +189,7 @@ def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: s
         "scene": scene,
         "seed": seed,
         "missing": "both" if len(gone) == 2 else next(iter(gone)),
-        "why": "; ".join(f"{side}: {text}" for side, text in gone.items()),
+        "why": f"both: {why['here']}" if len(set(why.values())) == 1 else "; ".join(f"{side}: {text}" for side, text in gone.items()),
     }
 
 

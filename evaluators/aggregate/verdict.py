@@ -15,6 +15,7 @@ Difference = Literal["better", "worse", "none shown"]
 
 ALPHA = 0.05
 RATE_MARGIN = 0.02
+ROUNDING = 1e-12  # differences that vary by no more than this, relative, are equal
 # How much worse is accepted, in the metric's unit, where no gate says otherwise. A metric that is not here has none.
 MARGINS = {
     "progress": 0.02,
@@ -92,6 +93,7 @@ def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
     Flags, and differences that are all alike (where t has no spread to go by), take the exact two-sided sign test on the scenes that
     changed; other metrics the paired t test.
     """
-    if is_flag or bool(np.all(means == means[0])):
+    alike = float(np.ptp(means)) <= ROUNDING * float(np.max(np.abs(means)))
+    if is_flag or alike:
         return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
     return float(stats.ttest_1samp(means, 0.0).pvalue), "paired t test on scene means"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from evaluators.report import tables
-from evaluators.report.failures import failure_rows
+from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.files import write_whole
 from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.headline import find
@@ -17,6 +17,8 @@ from evaluators.report.speed import speed
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
 CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
+LEDGER_RATES = ("collision_at_fault", "collision_any", "offroad")
+LEDGER_NOTE = "Rates: least and greatest, had every missing rollout and every cut step been without, and with, the event."
 INTERVAL_NOTE = "\u00b1 is 1.96 \u03c3/\u221aN over rollouts; a to b is the 95 % interval with scenes as clusters."
 
 
@@ -57,6 +59,11 @@ def summary_md(run: Run) -> str:
         head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *times.stages]
         body = [[r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)] for r in times.rows]
         parts.append(f"\n### Speed\n\n{table(head, body)}" + (f"{escape(times.pool)}\n" if times.pool else ""))
+    removed = ledger(run, LEDGER_RATES)
+    if removed:
+        head = ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES]
+        body = [[r.renderer, *(_tally(c) for c in r.counts), *(c.text for c in r.bounds)] for r in removed]
+        parts.append(f"\n### Not in the numbers\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
     failures, more = failure_rows(run)
     if failures:
         head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
@@ -87,6 +94,10 @@ def cut(text: str, limit: int = MAX_BYTES) -> str:
         return text
     kept = data[: limit - len(CUT_NOTE.encode())]
     return kept[: kept.rfind(b"\n") + 1].decode() + CUT_NOTE
+
+
+def _tally(cell: Cell) -> str:
+    return f"{cell.text} ({cell.note})" if cell.note and cell.text != "0" else cell.text
 
 
 def _key(rollout: Rollout) -> list[str]:

@@ -1,0 +1,230 @@
+"""``simrun compare`` and ``simrun gate`` as a CI job meets them: exit codes, files, baselines that do not fit."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from tests.report.make_run import Plan, make_run
+
+SCENES = tuple(f"scene-{i:02d}" for i in range(8))
+EASY = """version: 1
+min_scenes: 5
+metrics:
+  route_distance_m: {margin: 0.3}
+  offroad: {margin: 0.05, must_decide: false}
+"""
+
+
+def plan(**fields) -> Plan:
+    small = {"scenes": SCENES, "seeds": (0, 1), "steps": 40, "pictures": False, "clips": False, "invalid": ()}
+    return Plan(**{"renderers": ("clean", "onefixer"), **small, **fields})
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Make a good run, a bad one, one with a failed rollout, one with few scenes, one of other scene content."""
+    folder = tmp_path_factory.mktemp("runs")
+    bad = {"clean": 0.15, "onefixer": 12.0}
+    plans = {
+        "good": plan(harm={"clean": 0.15, "onefixer": 0.15}),
+        "bad": plan(harm=bad),
+        "failed": plan(fail=[("onefixer", SCENES[3], 1)]),
+        "unscored": plan(fail=[("onefixer", SCENES[3], 1)]),
+        "few": plan(scenes=SCENES[:3]),
+    }
+    made = {name: make_run(folder / name, one) for name, one in plans.items()}
+    for rollout in ("failed", "unscored"):
+        summary = json.loads((made[rollout] / "summary.json").read_text())
+        assert summary["failures"]["n_failed"] == 1
+    _set_failure_class(made["unscored"], "evaluator")
+    return made
+
+
+def _set_failure_class(folder: Path, name: str) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(folder / "rollouts.parquet")
+    column = table.column_names.index("failure_class")
+    classes = [None if value is None else name for value in table["failure_class"].to_pylist()]
+    pq.write_table(table.set_column(column, "failure_class", pa.array(classes, pa.string())), folder / "rollouts.parquet")
+
+
+@pytest.fixture
+def gate_file(tmp_path: Path) -> str:
+    path = tmp_path / "gate.yaml"
+    path.write_text(EASY)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("run", "code", "title"),
+    [
+        ("good", 0, "PASS"),
+        ("bad", 1, "FAIL"),
+        ("few", 3, "UNDECIDED"),
+        ("failed", 4, "INFRASTRUCTURE FAILURE"),
+        ("unscored", 5, "EVALUATOR FAILURE"),
+    ],
+)
+def test_the_exit_code_follows_the_cause_and_agrees_with_what_is_printed(runs, gate_file, capsys, run, code, title):
+    assert run_command(["gate", str(runs[run]), "--gate", gate_file]) == code
+    last = capsys.readouterr().out.strip().splitlines()[-1]
+    assert last.startswith(f"{title} (exit code {code})")
+    page = (runs[run] / "gate.md").read_text()
+    assert page.startswith(f"## Gate: {title}\n")
+    assert f"Exit code {code}." in page
+
+
+def test_json_is_one_document_with_every_check(runs, gate_file, capsys):
+    assert run_command(["gate", str(runs["bad"]), "--gate", gate_file, "--json"]) == 1
+    said = json.loads(capsys.readouterr().out)
+    assert said["outcome"]["cause"] == "regression"
+    assert {c["metric"] for c in said["checks"]} == {"route_distance_m", "offroad"}
+    assert [c["entry"]["verdict"] for c in said["checks"] if c["cause"] == "regression"] == ["worse"]
+
+
+def test_junit_has_a_failure_for_each_broken_rule_and_keeps_the_rollouts(runs, gate_file, tmp_path):
+    run_command(["gate", str(runs["bad"]), "--gate", gate_file, "--out", str(tmp_path)])
+    root = ET.parse(tmp_path / "gate.junit.xml").getroot()
+    gate, rollouts = root.findall("testsuite")
+    assert gate.attrib["name"].startswith("gate ")
+    failures = gate.findall("testcase/failure")
+    assert [f.attrib["type"] for f in failures] == ["regression"] * len(failures)
+    assert len(failures) == int(gate.attrib["failures"]) == int(root.attrib["failures"]) >= 1
+    assert len(rollouts.findall("testcase")) == 2 * 8 * 2
+    assert int(root.attrib["tests"]) == len(list(root.iter("testcase")))
+
+
+def test_an_undecided_rule_that_need_not_decide_is_skipped_in_junit(runs, gate_file, tmp_path):
+    run_command(["gate", str(runs["good"]), "--gate", gate_file, "--out", str(tmp_path)])
+    gate = ET.parse(tmp_path / "gate.junit.xml").getroot().find("testsuite")
+    assert [c.attrib["name"] for c in gate.findall("testcase") if c.find("skipped") is not None] == ["offroad margin"]
+    assert gate.attrib["skipped"] == "1"
+
+
+def test_the_ci_summary_file_is_appended_to_and_stays_below_one_mebibyte(runs, gate_file, tmp_path, monkeypatch):
+    page = tmp_path / "step.md"
+    page.write_text("earlier step")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(page))
+    run_command(["gate", str(runs["good"]), "--gate", gate_file])
+    assert page.read_text().startswith("earlier step\n## Gate: PASS\n")
+    page.write_text("x" * (2**20 - 48_700))  # nearly full: room for 120 bytes
+    run_command(["gate", str(runs["good"]), "--gate", gate_file])
+    assert page.stat().st_size < 2**20
+    page.write_text("x" * (2**20 - 10))
+    run_command(["gate", str(runs["good"]), "--gate", gate_file])
+    assert page.stat().st_size == 2**20 - 10
+
+
+def test_a_run_passes_against_its_own_stored_baseline_and_a_worse_one_fails(runs, gate_file, tmp_path, capsys):
+    stored = tmp_path / "baseline.json"
+    assert run_command(["gate", str(runs["good"]), "--write-baseline", str(stored)]) == 0
+    assert run_command(["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 0
+    assert run_command(["gate", str(runs["bad"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 1
+    assert run_command(["gate", str(runs["few"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 3  # scenes missing
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("change", "mention"),
+    [
+        ({"preset": "strict"}, "preset 'strict', the run has 'paper'"),
+        ({"weights": {"onefixer": "sha256:1"}}, "other weights: onefixer"),
+        ({"scenes": {"scene-00": "another content"}}, "scenes with another content: scene-00"),
+        ({"scenes": {"elsewhere": "x"}}, "no scene in common"),
+        ({"schema_version": 99}, "not a baseline of version 1"),
+    ],
+)
+def test_a_baseline_made_with_something_else_is_refused(runs, gate_file, tmp_path, capsys, change, mention):
+    stored = tmp_path / "baseline.json"
+    run_command(["gate", str(runs["good"]), "--write-baseline", str(stored)])
+    stored.write_text(json.dumps(json.loads(stored.read_text()) | change))
+    assert run_command(["gate", str(runs["good"]), "--gate", gate_file, "--baseline-file", str(stored)]) == 2
+    assert mention in capsys.readouterr().err
+
+
+def test_a_run_with_holes_cannot_become_a_baseline(runs, tmp_path, capsys):
+    assert run_command(["gate", str(runs["failed"]), "--write-baseline", str(tmp_path / "b.json")]) == 2
+    assert "1 of 32 rollouts failed" in capsys.readouterr().err
+    assert not (tmp_path / "b.json").exists()
+
+
+def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, capsys):
+    other = tmp_path / "strict.yaml"
+    other.write_text(EASY + "preset: strict\n")
+    for command in (
+        ["gate", str(runs["good"]), "--gate", str(other)],
+        ["gate", str(runs["good"]), "--gate", "no-such-gate"],
+        ["gate"],
+        ["gate", str(runs["good"]), "--self-test"],
+        ["gate", str(tmp_path / "nowhere")],
+        ["compare", *[str(runs["good"])] * 3],
+        ["compare", str(runs["good"]), "--baseline", "difix"],
+    ):
+        assert run_command(command) == 2, command
+    capsys.readouterr()
+
+
+# --- compare ------------------------------------------------------------------------------------------------------------
+
+
+def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
+    assert run_command(["compare", str(runs["bad"]), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["paired"]["onefixer"]["route_distance_m"]
+    stored = json.loads((runs["bad"] / "summary.json").read_text())["paired"]["onefixer"]["route_distance_m"]
+    assert said == stored
+    turned = _compare(capsys, str(runs["bad"]), "--baseline", "onefixer")["clean"]["route_distance_m"]
+    assert turned["diff"] == pytest.approx(-said["diff"])
+
+
+def _compare(capsys, *arguments: str) -> dict:
+    assert run_command(["compare", *arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["paired"]
+
+
+def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_the_rest(runs, capsys):
+    found = _compare(capsys, str(runs["good"]), str(runs["few"]))
+    entry = found["onefixer"]["route_distance_m"]
+    assert (entry["n_scenes"], entry["n_missing"]) == (3, 10)
+    assert len(entry["missing"]) == 10
+    assert {cell["why"] for cell in entry["missing"]} == {"here: not planned"}
+    assert entry["baseline"] == f"{runs['good']}: onefixer"
+    with_one = _compare(capsys, str(runs["good"]), str(runs["bad"]), "--baseline", "clean")
+    assert with_one["onefixer"]["offroad"]["verdict"] == "worse"
+
+
+def test_compare_prints_verdicts_and_cells_without_a_pair(runs, gate_file, capsys):
+    assert run_command(["compare", str(runs["good"]), str(runs["failed"]), "--gate", gate_file]) == 0
+    out = capsys.readouterr().out
+    assert "onefixer minus" in out
+    assert "no pair: lane-camera, scene-03, seed 1: every metric: here: failed (renderer)" in out
+    assert "route_distance_m" in out
+
+
+def test_two_policies_are_compared_where_each_run_has_one(tmp_path, capsys):
+    small = {"renderers": ("clean",), "scenes": SCENES[:4], "seeds": (0,)}
+    first = make_run(tmp_path / "a", plan(**small))
+    second = make_run(tmp_path / "b", plan(**small, policies=("pure-pursuit",)))
+    assert run_command(["compare", str(first), str(second), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["notes"] == ["policy pure-pursuit is compared with policy lane-camera"]
+    assert said["paired"]["clean"]["route_distance_m"]["n_cells"] == 4
+
+
+def test_runs_of_another_preset_or_scene_content_are_not_compared(runs, tmp_path, capsys):
+    other = make_run(tmp_path / "other", plan())
+    info = json.loads((other / "run.json").read_text())
+    info["scenes"][SCENES[2]]["content_hash"] = "changed"
+    (other / "run.json").write_text(json.dumps(info))
+    assert run_command(["compare", str(runs["good"]), str(other)]) == 2
+    assert f"scenes with another content: {SCENES[2]}" in capsys.readouterr().err
+    summary = json.loads((other / "summary.json").read_text()) | {"preset": "strict"}
+    (other / "summary.json").write_text(json.dumps(summary))
+    assert run_command(["compare", str(runs["good"]), str(other)]) == 2
+    assert "presets 'paper' and 'strict'" in capsys.readouterr().err
