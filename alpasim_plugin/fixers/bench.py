@@ -105,6 +105,7 @@ class Row:
         rounding: Mean, largest and PSNR (None: equal) against the same setting in float32 over the whole clip; None where there is none.
         model: The same against the base over the whole clip; None where the networks are others.
         hit_rate: Of foretold frames, the share that was used; None where nothing is foretold.
+        guarded: Frames that the guard passed on unfixed; they are left out of the errors.
         problem: Why the setting was not measured, else empty.
     """
 
@@ -120,6 +121,7 @@ class Row:
     rounding: tuple[float, int, float | None] | None = None
     model: tuple[float, int, float | None] | None = None
     hit_rate: float | None = None
+    guarded: int = 0
     problem: str = ""
 
 
@@ -223,16 +225,19 @@ def _row(plan: Plan, settle: Settings, case: Case, clip: Clip, truth: U8 | None,
         same = whole_clip(settings, given, SCENE, plan.seed)
     except SimrunError as error:
         return Row(case.group, case.name, settle.label(case), size, 0, {}, problem=error.found)
-    n = len(timing.images)
+    n, fixed = len(timing.images), ~timing.guarded
     times = spread(timing.stages | {"all-in": timing.all_in, "cpu": timing.cpu})
     return Row(
         case.group, case.name, settle.label(case), size, n, times, timing.first_ms, timing.load_ms, timing.peak_mb,
-        difference(timing.images, same[:n]), None if truth is None else difference(timing.images, truth[:n]),
+        difference(timing.images[fixed], same[:n][fixed]), None if truth is None else difference(timing.images[fixed], truth[:n][fixed]),
+        guarded=int(timing.guarded.sum()),
     )  # fmt: skip
 
 
-def difference(images: U8, reference: U8) -> tuple[float, int, float | None]:
-    """Return mean and largest difference in grey levels, and PSNR in dB, None for equal clips."""
+def difference(images: U8, reference: U8) -> tuple[float, int, float | None] | None:
+    """Return mean and largest difference in grey levels, and PSNR in dB, None for equal clips; None for no images at all."""
+    if not len(images):
+        return None
     total = Difference()
     for image, wanted in zip(images, reference, strict=True):
         total.add(image, wanted)

@@ -50,7 +50,7 @@ def cells(row: Row) -> list[str]:
         *(_times(row, stage) for stage in (*STAGES, "all-in", "cpu")),
         _number(row.first_ms, ".0f"),
         _number(row.peak_mb, ".0f"),
-        _error(row.rounding),
+        _error(row.rounding) + (f" (guard: {row.guarded} of {row.frames} frames unfixed)" if row.guarded else ""),
         _error(row.model),
         "" if row.hit_rate is None else f"{row.hit_rate:.0%}",
     ]

@@ -16,7 +16,7 @@ import torch
 
 from alpasim_plugin.fixers.onefixer import OneFixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.types import F32, I64, U8, Frame
+from alpasim_plugin.types import F32, I64, U8, Bool, Frame
 
 STAGES = ("encode", "dit", "decode", "cache write")
 MB = 1e6
@@ -108,6 +108,7 @@ class Timing:
         peak_mb: Largest resident memory (device memory on an accelerator) beyond what the process held before the networks; None where
             the system does not tell.
         images: ``(T, H, W, 3)`` uint8 output of the first pass.
+        guarded: ``(T,)`` whether the guard passed the raw frame on instead.
     """
 
     load_ms: float
@@ -117,6 +118,7 @@ class Timing:
     stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
     peak_mb: float | None = None
     images: U8 = field(default_factory=lambda: np.zeros((0, 0, 0, 3), np.uint8))
+    guarded: Bool = field(default_factory=lambda: np.zeros(0, np.bool_))
 
 
 def measure(
@@ -140,6 +142,7 @@ def measure(
     fixer = OneFixer(settings, scene_id, seed, device, threads)
     timing = Timing((clock.now() - begin) * 1e3, 0.0)
     images: list[U8] = []
+    guarded: list[bool] = []
     for run in range(passes):
         fixer.reset(seed)
         for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
@@ -153,7 +156,8 @@ def measure(
                 timing.first_ms = ms
             if not run:
                 images += [frame.rgb for frame in fixed]
-    timing.images = np.stack(images)
+                guarded += [bool(frame.events) for frame in fixed]
+    timing.images, timing.guarded = np.stack(images), np.array(guarded)
     peak = peak_mb(device)
     timing.peak_mb = None if peak is None or (before_mb is None and device == "cpu") else peak - (before_mb or 0.0)
     fixer.pipeline.stage = clock
