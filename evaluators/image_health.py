@@ -1,6 +1,11 @@
-"""Health of the camera images in a log. A black image is the renderer's failure; it is counted, and only some presets drop its rollout."""
+"""Health of the camera images in a log: black ones, and ones that stand still while the car moves.
+
+Both are the renderer's failure. They are counted; only some presets drop the rollout of a black image.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,6 +15,7 @@ from evaluators.base import register, series
 from evaluators.presets import Preset
 
 BLACK_MAX = 10  # an image is black when no byte is above this
+FROZEN_MOVE_M = 0.1  # the ego's way between two images after which they cannot be equal
 
 
 def is_black(pixels: U8) -> bool:
@@ -37,9 +43,9 @@ def decode(image: LoggedImage) -> U8:
     return np.asarray(pixels, dtype=np.uint8)
 
 
-@register("image_health", "black camera images")
+@register("image_health", "black and frozen camera images")
 def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``img_is_black``, one row per image time: 1 if any camera's image of that time is black. No images, no rows."""
+    """Give ``img_is_black`` and ``img_is_frozen``, one row per image time: 1 if any camera's image of that time is. No images, no rows."""
     images = [image for image in rollout.images if preset.image_camera in (None, image.camera)]
     if preset.image_rule == "at_or_after_step":
         return _at_or_after_steps(images, rollout)
@@ -47,7 +53,27 @@ def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     for image in images:
         black[image.end_us] = black.get(image.end_us, False) or is_black(decode(image))
     t_us = np.array(sorted(black), dtype=np.int64)
-    return [series("img_is_black", t_us, np.array([black[int(t)] for t in t_us], dtype=np.float64))]
+    stuck = frozen_times(images, rollout)
+    return [
+        series("img_is_black", t_us, np.array([black[int(t)] for t in t_us], dtype=np.float64)),
+        series("img_is_frozen", t_us, np.array([int(t) in stuck for t in t_us], dtype=np.float64)),
+    ]
+
+
+def frozen_times(images: Sequence[LoggedImage], rollout: RolloutLog) -> set[int]:
+    """Return the times of images that equal the one before from the same camera, byte for byte, though the ego moved more than 0.1 m."""
+    before: dict[str, LoggedImage] = {}
+    found: set[int] = set()
+    for image in sorted(images, key=lambda one: one.end_us):
+        last = before.get(image.camera)
+        if last is None or last.data != image.data:
+            before[image.camera] = image
+            continue
+        # Counted from the first of the equal pictures, so that a creeping car leaves it behind as well.
+        ends = [np.interp([last.end_us, image.end_us], rollout.ego.t_us, rollout.ego.xyz[:, k]) for k in (0, 1)]
+        if float(np.hypot(*(np.diff(e)[0] for e in ends))) > FROZEN_MOVE_M:
+            found.add(image.end_us)
+    return found
 
 
 def _at_or_after_steps(images: list[LoggedImage], rollout: RolloutLog) -> list[MetricSeries]:

@@ -69,6 +69,7 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
         for horizon in (0.5, 1.0, 2.5, 5.0)
     },
     "img_is_black": _flag("a camera image is black (no byte above 10)"),
+    "img_is_frozen": _flag("a camera image equals the one before although the ego moved"),
     "safety_monitor_triggered": _flag("the policy's own safety monitor fired", direction="none"),
     "eval_relevant": _flag("the policy drives: the warm-up is over", direction="none"),
     "offroad_or_collision": _flag("off-road or any contact", derived=True),

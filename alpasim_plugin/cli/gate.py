@@ -88,7 +88,7 @@ def _self_test(gate_file: str, out: Path | None, workers: int | None, as_json: b
     spec, source = load_gate(gate_file)
     root = out or Path("runs", f"gate-self-test-{spec.preset or 'paper'}")
     began = time.perf_counter()
-    result = run_self_test(spec, root, workers, ["simrun", *sys.argv[1:]], make_progress(as_json))
+    result = run_self_test(spec, root, workers, ["simrun", *sys.argv[1:]], lambda: make_progress(as_json))
     took_s = time.perf_counter() - began
     if as_json:
         trials = [trial.as_dict() for trial in result.trials]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def broken_renderers() -> list[str]:
     return [name for name in RENDERERS if name.startswith("broken-")]
 
 
-def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequence[str], progress: Progress) -> SelfTest:
+def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequence[str], progress: Callable[[], Progress]) -> SelfTest:
     """Drive the suite behind the reference and every broken renderer and judge each pair by the gate.
 
     The gate's rules are taken as they are, except what ties it to one run: the reference is `REFERENCE`, and no more scenes are asked for
@@ -72,14 +72,14 @@ def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequ
         root: Run folder; finished rollouts in it are reused.
         workers: As for a run.
         command: Written to run.json.
-        progress: Shows the drives.
+        progress: Makes what shows the drives, once for each of the two runs.
     """
     broken = broken_renderers()
     options = RunOptions(preset=spec.preset or "paper", baseline=REFERENCE)
     plan = make_plan(load_suite(SUITE), [REFERENCE, *broken], [POLICY], [SEED], options)
     control = make_plan(load_suite(SUITE), [REFERENCE], [POLICY], [OTHER_SEED], options)
     runs = [(plan, root), (control, root / "control")]
-    results = [execute_run(one, folder, workers, command, progress, certificate="none") for one, folder in runs]
+    results = [execute_run(one, folder, workers, command, progress(), certificate="none") for one, folder in runs]
     rows = rows_of_run(read_run(root))
     # The other seed's rollouts take the first one's place, so that they are paired with it.
     again = [{**row, "renderer": CONTROL, "seed": SEED} for row in rows_of_run(read_run(root / "control"))]

@@ -178,3 +178,20 @@ def test_horizons_in_any_order_are_read_as_alpasim_reads_them():
     ours = by_name(score(log, scene(TWO_LANES, log), replace(PRESETS["paper"], min_ade_horizons_s=(2.0, 0.2))))
     assert not ours["min_ade@2.0s(gt)"].valid.any()
     assert ours["min_ade@0.2s(gt)"].value == pytest.approx([0.15])
+
+
+def test_a_picture_that_stays_while_the_car_moves_is_frozen_until_it_changes():
+    log = rollout(drive(), images=[image(k * DT_US, level) for k, level in enumerate((90, 90, 90, 91))])
+    assert scored(log)["img_is_frozen"].value.tolist() == [0.0, 1.0, 1.0, 0.0]
+
+
+def test_one_frozen_camera_of_two_is_enough():
+    pictures = [image(0, 90, "left"), image(0, 50, "right"), image(DT_US, 91, "left"), image(DT_US, 50, "right")]
+    assert scored(rollout(drive(), images=pictures))["img_is_frozen"].value.tolist() == [0.0, 1.0]
+
+
+def test_equal_pictures_of_a_standing_car_are_not_frozen_but_creeping_on_behind_one_is():
+    still = rollout(track(np.full(4, 3.0), 0.0), images=[image(k * DT_US, 90) for k in range(4)])
+    assert scored(still)["img_is_frozen"].value.max() == 0.0
+    creeping = rollout(track(0.06 * np.arange(4), 0.0), images=[image(k * DT_US, 90) for k in range(4)])
+    assert scored(creeping)["img_is_frozen"].value.tolist() == [0.0, 0.0, 1.0, 1.0]

@@ -129,3 +129,29 @@ def test_progress_so_far_is_the_same_in_blocks(monkeypatch):
     whole = progress_so_far(points, points * 0.9)
     monkeypatch.setattr("evaluators.route._MAX_CELLS", 120)
     np.testing.assert_array_equal(progress_so_far(points, points * 0.9), whole)
+
+
+def test_lateral_bias_is_the_signed_mean_left_positive_and_follows_the_paths_direction():
+    for heading in (0.0, 0.9, np.pi, -2.0):
+        c, s = np.cos(heading), np.sin(heading)
+        x, y = np.arange(5.0), np.array([0.0, 9.0, 0.5, 0.5, -1.6])
+        log = rollout(track(c * x - s * y, s * x + c * y, yaw=heading), log=track(c * x, s * x, yaw=heading))
+        assert scored(log)["lateral_bias_m"].value == pytest.approx(y, abs=1e-9)
+    log = rollout(track(np.arange(5.0), np.array([9.0, 9.0, 0.5, 0.5, -0.4])), log=track(np.arange(5.0), 0.0), warmup_us=200_000)
+    assert rollout_values(score(log, scene(TWO_LANES, log)))["lateral_bias_m"].value == pytest.approx(0.2)  # the warm-up does not count
+
+
+def test_lateral_bias_changes_side_with_a_bend_and_agrees_with_the_distance():
+    angle = np.linspace(0.0, 1.5, 16)
+    path = 20 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    inside = 18 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) + [0.0, 2.0]  # nearer to the centre of a left bend: left
+    found = scored(rollout(track(inside[:, 0], inside[:, 1]), log=track(path[:, 0], path[:, 1])))
+    assert (found["lateral_bias_m"].value > 1.9).all()
+    assert np.abs(found["lateral_bias_m"].value) == pytest.approx(found["route_distance_m"].value)
+
+
+def test_a_recording_that_stands_still_has_no_left():
+    log = rollout(track(np.arange(3.0), 0.0), log=track(np.zeros(3), 0.0))
+    bias = scored(log)["lateral_bias_m"]
+    assert not bias.valid.any()
+    assert bias.reason == "the recorded path has no direction"
