@@ -28,6 +28,7 @@ from evaluators.surface import MARGIN_M
 WRONG_HEADING_RAD = 2 * np.pi / 3
 
 NO_LANES = "the map has no lanes"
+NO_SURFACE = "nothing drivable is on the ego's level"
 NO_EDGES = "no lane contains the footprint and the map has no road edges to decide"
 
 
@@ -91,12 +92,7 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
         if preset.missing_road == "absent":
             return []
         if preset.missing_road == "error":
-            raise EvaluatorError(
-                "scoring lane keeping",
-                f"scene {rollout.scene_id!r}, preset {preset.name!r}",
-                NO_LANES,
-                "score with a scene that has a map, or with a preset that can do without (paper, alpasim)",
-            )
+            raise _no_map(rollout, preset, NO_LANES)
         return [series(name, t_us, np.nan, False, NO_LANES) for name in names]
     origin = origin_of(scene.ego_log, preset)
     road = road_of(lane_map, origin, preset)
@@ -104,11 +100,13 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     shapes = ego.shapes()
     xyz = rollout.ego.xyz - origin
     if preset.offroad_rule == "margin":
+        if preset.missing_road == "error" and road.surface.is_empty:
+            raise _no_map(rollout, preset, "no lane of the map has an area")
         margin_m = road.surface.margin_m(shapes, xyz)
         against = wrong_lane(road, road.lanes_near(xyz), ego.centres(), ego.yaw, preset)
         return [
             series("offroad", t_us, margin_m < -MARGIN_M),
-            series("offroad_margin_m", t_us, margin_m),
+            series("offroad_margin_m", t_us, margin_m, np.isfinite(margin_m), NO_SURFACE),
             series("wrong_lane", t_us, against),
             series("min_distance_to_lane_boundary_m", t_us, np.maximum(margin_m, 0.0)),
         ]
@@ -127,3 +125,12 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
         series("wrong_lane", t_us, against),
         series("min_distance_to_lane_boundary_m", t_us, held.boundary_gap_m),
     ]
+
+
+def _no_map(rollout: RolloutLog, preset: Preset, found: str) -> EvaluatorError:
+    return EvaluatorError(
+        "scoring lane keeping",
+        f"scene {rollout.scene_id!r}, preset {preset.name!r}",
+        found,
+        "score with a scene that has a map, or with a preset that can do without (paper, alpasim)",
+    )

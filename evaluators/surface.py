@@ -43,8 +43,13 @@ class Surface:
         self._bounds = np.array([(line.min(axis=0), line.max(axis=0)) for line in self._outlines]).reshape(-1, 2, 3)
         self._regions: dict[bytes, Region] = {}
 
+    @property
+    def is_empty(self) -> bool:
+        """Tell whether nothing here has an area."""
+        return bool(np.all(shapely.is_empty(self._areas)))
+
     def margin_m(self, footprints: Geometries, xyz: F64) -> F64:
-        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with box centres ``(T, 3)``."""
+        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with box centres ``(T, 3)``, -inf where nothing is on their level."""
         level = self.on_level(xyz)
         out = np.full(len(footprints), -np.inf)
         _, first, group = np.unique(np.packbits(level, axis=1), axis=0, return_index=True, return_inverse=True)

@@ -121,6 +121,13 @@ def test_a_bridge_above_does_not_carry_the_ego():
     assert margins(rollout(track(0.0, 10.0, yaw=math.pi / 2, z=height + 0.8)), lanes) == pytest.approx([2.0 - HALF_W], abs=MARGIN_M)
 
 
+def test_above_every_road_the_ego_is_off_the_road_by_no_number():
+    found = scored(rollout(track(0.0, 0.0, z=40.0)))
+    assert found["offroad"].value.tolist() == [1]
+    assert not found["offroad_margin_m"].valid.any()
+    assert found["offroad_margin_m"].reason == "nothing drivable is on the ego's level"
+
+
 def test_a_road_that_climbs_is_one_road():
     n = 60
     climb = np.array([[5.0 * k, 0.0, 0.6 * k] for k in range(n)])
@@ -151,8 +158,8 @@ def test_self_crossing_reversed_needle_and_empty_rings(offset):
     log = rollout(track(offset[0] + np.array([0.0, 0.0]), offset[1] + np.array([0.5, 5.0])))
     # None of the odd rings adds area outside the good one; the spike is a line without area.
     assert margins(log, LaneMap(lanes)) == pytest.approx([2 - 0.5 - HALF_W, -(5 + HALF_W - 2)], abs=MARGIN_M)
-    only_needle = LaneMap({"needle": lanes["needle"]})
-    assert margins(log, only_needle).tolist() == [-math.inf, -math.inf]
+    with pytest.raises(EvaluatorError, match="no lane of the map has an area"):
+        margins(log, LaneMap({"needle": lanes["needle"]}))
 
 
 def test_no_map_is_an_error_that_says_what_to_do():
