@@ -111,16 +111,18 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "ms_per_frame_mean": round(float(np.mean(per_frame)), 3),
         "frames_per_s": round(1e3 / float(np.mean(per_frame)), 2),
         "first_frame_ms": round(float(np.median(first)), 3),
-        "stages": {
-            name: {
-                "p50_ms": round(float(np.percentile(d, 50)), 3),
-                "p95_ms": round(float(np.percentile(d, 95)), 3),
-                "share": round(sum(d) / all_ms, 4),
-                "per_frame_ms": round(sum(d) / len(per_frame), 3),
-            }
-            for name, d in stages.items()
-            if d
-        },
+        "stages": {name: _stage(d, all_ms, len(per_frame)) for name, d in stages.items() if any(d)},
+    }
+
+
+def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, float]:
+    """Return percentiles of the passes that took place (a frame from a draft has none through the fixer), share and mean per frame."""
+    passes, total = [d for d in durations if d > 0.0], sum(durations)
+    return {
+        "p50_ms": round(float(np.percentile(passes, 50)), 3),
+        "p95_ms": round(float(np.percentile(passes, 95)), 3),
+        "share": round(total / all_ms, 4),
+        "per_frame_ms": round(total / frames, 3),
     }
 
 

@@ -365,7 +365,8 @@ def test_stages_are_told_apart_and_shared_by_the_frames_of_a_call(straight_road:
     assert facts["first_call_frames"] == (5 if mode == "chunk" else 1)
     assert len(facts["stage_ms"]["render"]) == frames
     assert set(facts["stage_ms"]) >= {"render", "map", "fix"}
-    assert len(facts["stage_ms"]["map"]) <= frames
+    assert len(facts["stage_ms"]["map"]) == len(facts["stage_ms"]["fix"]) == frames
+    assert facts["stage_ms"]["fix"].count(0.0) == (0 if mode == "chunk" else 30 - 5 - 4)  # five drafts, four whole blocks
     assert all(ms >= 0 for stage in ("render", "map", "fix") for ms in facts["stage_ms"][stage])
 
 
