@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.renderers import RENDERERS
+from alpasim_plugin.runtime.compose import parse_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
 from alpasim_plugin.runtime.past import find_rollout
 from alpasim_plugin.runtime.plan import slug
@@ -109,7 +109,7 @@ def _gap(pair: dict[str, dict[str, float]], key: str) -> dict[str, float] | None
 
 def _check_names(renderers: list[str] | tuple[str, ...], policy: str | None) -> None:
     for name in renderers:
-        RENDERERS.get(name)
+        parse_renderer(name)
     if policy is not None:
         find_policy(policy)
     if any("," in name for name in renderers):

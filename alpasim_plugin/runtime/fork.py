@@ -21,6 +21,7 @@ from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Difference, Trace, first_difference, trace_log
 from alpasim_plugin.runtime.cell import MANIFEST, Parts, own_parts, run_cell
+from alpasim_plugin.runtime.compose import card_of
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.past import PastRollout
@@ -94,6 +95,7 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     if manifest["status"] == "ok":
         manifest["fork"] = asdict(change) | {"of": past.name} | _compared(past, change, at_us, root / fork.folder)
         write_json(root / fork.folder / MANIFEST, manifest)
+    parts = ((past.cell.renderer, past.cell.renderer), (fork.renderer, change.of(past.cell).renderer))
     plan = RunPlan(
         (past.cell, fork),
         {past.cell.scene: past.scenario},
@@ -101,6 +103,7 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
         (past.cell.policy,),
         (past.cell.seed,),
         options,
+        {name: card for name, part in parts if (card := card_of(part, options.fixer)) is not None},
     )
     write_run_info(root, plan, command, threads)
     write_json(root / "run.json", read_json(root / "run.json") | {"fork": manifest.get("fork")})

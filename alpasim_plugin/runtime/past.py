@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, make_plan
+from alpasim_plugin.runtime.compose import card_of
+from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
@@ -66,7 +67,10 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRoll
     if where is None:
         raise InputError(DOING, f"{root / 'run.json'}", "it does not say where the scenario lies", "name it with --scenario PATH")
     ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())))
-    plan = plan_like(info, ref, row["renderer"], row["policy"], int(row["seed"]))
+    options = _options(info)
+    # Settings of fixers may belong to another renderer of the run; a plan refuses settings that no renderer takes.
+    own = options if card_of(row["renderer"], options.fixer) is not None else replace(options, fixer=())
+    plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row["scene"])
     if loaded is None or cell.rollout_key != manifest["rollout_key"]:
@@ -77,13 +81,13 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRoll
             f"{what}: the scenario, a part or the version is not what it was when the log was made",
             "run the rollout again, or name its scenario with --scenario PATH",
         )
-    return PastRollout(root, cell, plan.options, loaded, manifest)
+    return PastRollout(root, cell, options, loaded, manifest)
 
 
-def plan_like(info: Mapping[str, Any], ref: ScenarioRef, renderer: str, policy: str, seed: int) -> RunPlan:
-    """Return the plan of one rollout under the options of an earlier run."""
+def _options(info: Mapping[str, Any]) -> RunOptions:
+    """Return the options of an earlier run."""
     stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
-    return make_plan([ref], [renderer], [policy], [seed], RunOptions(**stated | {"baseline": None, "video": "none"}))
+    return RunOptions(**stated | {"baseline": None, "video": "none", "fixer": tuple(stated.get("fixer", ()))})
 
 
 def _row(root: Path, name: str) -> dict[str, Any]:

@@ -7,10 +7,11 @@ request, a policy has answered every question. What it answered before its turn 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.offers import batch_of, chunk_of, lookahead_of, spent_by
+from alpasim_plugin.runtime.offers import batch_of, chunk_of, facts_of, lookahead_of, spent_by
 from alpasim_plugin.types import EgoState, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
 
 
@@ -47,6 +48,10 @@ class SwitchedRenderer:
         if early and self.then is not self.first:
             batch_of(self.then)(requests)
         return frames
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the fixer of the part that took over, or else of the first, has to say."""
+        return facts_of(self.then) or facts_of(self.first)
 
 
 class SwitchedPolicy:

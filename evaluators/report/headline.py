@@ -25,6 +25,7 @@ WORDS = {
     "route_distance_m": "distance to the logged path",
     "progress": "progress",
 }
+MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
 
 
@@ -37,7 +38,6 @@ class Point:
     text: str
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
-    hinted: tuple[str, ...] = ()  # a difference for the worse is shown, but not that it exceeds the margin
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,6 @@ def _clause(point: Point, baseline: str) -> str:
         return f"{point.name} is worse than {baseline} in {_listing(point.worse)} and better in {_listing(point.better)}"
     if point.tone == "neutral":
         return f"{point.name} drives no worse than {baseline} by more than the margins"
-    if point.hinted:
-        return f"{point.name} drives worse than {baseline} in {_listing(point.hinted)}, undecided whether by more than the margin"
     return f"no difference shown between {point.name} and {baseline}"
 
 
@@ -141,8 +139,7 @@ def _paired_point(run: Run, arm: str, pairs: Mapping[str, Any]) -> Point:
     parts += [f"no difference at all in {_listing(same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    hinted = tuple(m for m in lead if tones[m] == "unclear" and pairs[m].get("difference") == "worse")
-    return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better, hinted)
+    return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better)
 
 
 def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
@@ -160,13 +157,20 @@ def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any], brief
     text = f"{WORDS.get(metric, metric)}: {here} against {there} ({fixed(difference, places, sign=True)}{tail}"
     if ends:
         text += f", 95\u00a0% interval {fixed(ends[0], places, sign=True)} to {fixed(ends[1], places, sign=True)}"
-    return f"{text}{_needed(entry)})"
+    needed = more_scenes_text(entry.get("more_scenes"))
+    margin = finite(entry.get("margin"))
+    if needed and margin is not None:
+        text += f"; {needed} on the margin of {short(margin * scale, unit)}"
+    return f"{text})"
 
 
-def _needed(entry: Mapping[str, Any]) -> str:
-    """Say how much more would decide an undecided difference, where that is known."""
-    more = entry.get("more_scenes")
-    return f"; about {plural(int(more), 'more scene')} would decide" if isinstance(more, int) and more > 0 else ""
+def more_scenes_text(more: Any) -> str:
+    """Say how many more scenes would decide an undecided verdict; empty where that is unknown."""
+    if not isinstance(more, int) or more <= 0:
+        return ""
+    if more > MANY_SCENES:
+        return f"more than {MANY_SCENES} more scenes would decide"
+    return f"about {plural(more, 'more scene')} would decide"
 
 
 def _level(run: Run, arm: str, metric: str) -> str:

@@ -92,7 +92,8 @@ def strata(run: Run) -> list[Strata]:
     covered = [one for one in steps if one.opacity is not None]
     if covered:
         every = np.concatenate([one.opacity[np.isfinite(one.opacity)] for one in covered if one.opacity is not None])
-        edges = tuple(dict.fromkeys(round(float(v), 3) for v in np.percentile(every, OPACITY_SHARES))) if every.size else ()
+        quartiles = np.floor(np.percentile(every, OPACITY_SHARES) * 1000) / 1000 if every.size else ()  # down: 0.9996 is not 1
+        edges = tuple(dict.fromkeys(float(v) for v in quartiles))
         note = "Opacity: mean over the picture of what the Gaussians cover; little means sky, or holes. Limits are quartiles of this run."
         groups = [one.opacity_bin(edges) for one in covered]
         found.append(_split("By rendered opacity", note, "rendered opacity", "", _labels(edges, ""), covered, groups, run))
@@ -215,4 +216,5 @@ def _labels(edges: Sequence[float], unit: str) -> list[str]:
     if not edges:
         return ["all"]
     inner = [f"{a:g} to {b:g}{tail}" for a, b in pairwise(edges)]
-    return [f"below {edges[0]:g}{tail}", *inner, f"{edges[-1]:g}{tail} and more"]
+    top = "1" if not unit and edges[-1] >= 1.0 else f"{edges[-1]:g}{tail} and more"  # no more than all of a picture can be covered
+    return [f"below {edges[0]:g}{tail}", *inner, top]

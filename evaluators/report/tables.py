@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evaluators.report.headline import tone_of
+from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, meaning, ordered
 from evaluators.report.numbers import (
     ARROW_WORDS,
@@ -212,18 +212,19 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
     p_cell = missing(reason or "no test was made") if p is None else Cell(_p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
-    if verdict != "worse" and entry.get("difference") in ("better", "worse"):
-        verdict += f", {entry['difference']}"
+    verdict = {
+        ("undecided", "worse"): "worse, margin undecided",
+        ("non-inferior", "worse"): "worse within margin",
+        ("non-inferior", "better"): "better",
+    }.get((verdict, str(entry.get("difference"))), verdict)
     base, hint = str(entry.get("baseline") or "\u2014"), _hint(entry, scale, unit)
     return PairRow(arm, base, name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
 
 
 def _hint(entry: Mapping[str, Any], scale: float, unit: str) -> str:
-    margin, more = finite(entry.get("margin")), entry.get("more_scenes")
+    margin, more = finite(entry.get("margin")), more_scenes_text(entry.get("more_scenes"))
     said = [f"margin {short(margin * scale, unit)}"] if margin is not None and entry.get("direction") != "none" else []
-    if isinstance(more, int) and more > 0:
-        said.append(f"about {plural(more, 'more scene')} would decide")
-    return "; ".join(said)
+    return "; ".join([*said, *([more] if more else [])])
 
 
 def _pair_note(entry: Mapping[str, Any]) -> str:
