@@ -15,12 +15,13 @@ from alpasim_plugin.geometry_lanes import densify, lane_polygon
 from alpasim_plugin.types import F64, Lane, LaneMap, Paint
 from scenarios.opendrive_geometry import beside, cubics_at, reference_line
 from scenarios.opendrive_links import following
-from scenarios.opendrive_road import OdrLane, OdrMap, Road, Section, curved, lane_key
+from scenarios.opendrive_road import MAX_ROAD_M, OdrLane, OdrMap, Road, Section, curved, lane_key
 from scenarios.reading import SourceFiles
 from scenarios.road_edges import border_lines, merge_areas
 
 STEP_M = 0.5  # stations on bends and where widths change
 STRAIGHT_STEP_M = 2.0
+MAX_ASIDE_M = 1000.0  # no lane is farther beside its reference line
 MIN_WIDTH_M = 0.1  # lanes that nowhere get this wide exist on paper only
 KINDS = {
     **dict.fromkeys(("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane", "bidirectional"), "vehicle"),
@@ -45,7 +46,11 @@ def lane_map_of(files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map:
     for road in odr.roads:
         for index, section in enumerate(road.sections):
             if road.records and section.end_m - section.s_m > 1e-6:
-                lanes.update({one.lane_id: one for one in _section(road, index, section, T_local_map, left_out)})
+                found = _section(road, index, section, T_local_map, left_out)
+                if found is None:
+                    here = f"{where}, road {road.road_id}, section {index}"
+                    raise files.fail(here, "points that are not finite or not on a road", "repair its numbers")
+                lanes.update({one.lane_id: one for one in found})
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
         raise files.fail(where, "a map without a lane for vehicles", "use a map with lanes of type driving")
     linked = following(odr, lanes)
@@ -56,12 +61,15 @@ def lane_map_of(files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map:
     return LaneMap(linked, border_lines(surface, heights)), tuple(notes)
 
 
-def _section(road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]) -> list[Lane]:
+def _section(road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]) -> list[Lane] | None:
+    """Return the lanes of a section; None where its numbers give no road."""
     s = _stations(road, section)
     line = reference_line(road.records, s)
     tilt = np.tan(cubics_at(road.superelevation, s))
     height = cubics_at(road.elevation, s)
     middle = cubics_at(road.lane_offset, s)
+    if not (np.abs(line[:, :2] - line[0, :2]).max() <= MAX_ROAD_M and np.abs(height).max() <= MAX_ROAD_M and np.isfinite(tilt).all()):
+        return None
 
     def points(t: F64) -> F64:
         return transform_points(T_local_map, np.column_stack([beside(line, t), height + t * tilt]))
@@ -73,6 +81,8 @@ def _section(road: Road, index: int, section: Section, T_local_map: F64, left_ou
         side = section.side(sign)
         for k, lane in enumerate(side):
             outer_t = _outer(lane, sign, s, inner_t, middle)
+            if not np.abs(outer_t).max() <= MAX_ASIDE_M:
+                return None
             kind = KINDS.get(lane.kind)
             wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M
             if kind is None or not wide:

@@ -22,7 +22,7 @@ import shapely
 from alpasim_plugin.geometry import transform_points
 from alpasim_plugin.types import F64, Lane, LaneMap
 from scenarios.opendrive_geometry import Cubic, beside, cubics_at
-from scenarios.opendrive_road import OdrMap, Road
+from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road
 from scenarios.vertices import with_vertices
 
 STEP_M = 0.5
@@ -40,7 +40,9 @@ def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:
     kept = _without_twins(_without_crossing(edges, lanes))
 
     def local(line: F64) -> F64:
-        return with_vertices(transform_points(T_local_map, line))
+        moved = transform_points(T_local_map, line)
+        # A width that is read far beyond its section can be astronomic; AlpaSim would then fill the memory with vertices.
+        return with_vertices(moved) if np.abs(moved - moved[0]).max() <= MAX_ROAD_M else moved
 
     return LaneMap(
         {key: Lane(key, local(centre), local(left), local(right)) for key, (centre, left, right) in lanes.items()},

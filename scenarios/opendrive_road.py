@@ -12,6 +12,7 @@ import numpy as np
 from scenarios.opendrive_geometry import KINDS, Cubic, Geometry
 from scenarios.reading import SourceFiles
 
+MAX_ROAD_M = 200_000.0  # a longer one is a broken number, not a road
 _ABCD = ("a", "b", "c", "d")
 _PARAMETERS = {
     "line": (),
@@ -110,7 +111,7 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     connections = tuple(
         Connection(
             c.get("incomingRoad", ""), c.get("connectingRoad", ""), c.get("contactPoint", "start") == "start",
-            tuple((int(link.get("from", "0")), int(link.get("to", "0"))) for link in c.findall("laneLink")),
+            tuple((_integer(files, where, link, "from"), _integer(files, where, link, "to")) for link in c.findall("laneLink")),
         )
         for j in root.findall("junction") for c in j.findall("connection")
     )  # fmt: skip
@@ -145,19 +146,25 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             raise files.fail(here, f"a <geometry> of {[child.tag for child in record]}", f"use {', '.join(KINDS)}")
         numbers = tuple(number(shape, name) for name in _PARAMETERS[shape.tag])
         s, x, y, heading, length = (number(record, name) for name in ("s", "x", "y", "hdg", "length"))
+        if not 0 <= length <= MAX_ROAD_M:
+            raise files.fail(here, f"a <geometry> of {length} m", f"give 0 to {MAX_ROAD_M / 1000:.0f} km")
         kind = next(k for k in KINDS if k == shape.tag)
         return Geometry(s, x, y, heading, length, kind, numbers, shape.get("pRange", "normalized") != "arcLength")
 
     def lane(one: Element, start_m: float) -> OdrLane:
         mark = one.find("roadMark")
-        links = {tag: tuple(int(str(e.get("id"))) for e in one.findall(f"link/{tag}")) for tag in ("successor", "predecessor")}
+        links = {
+            tag: tuple(_integer(files, here, e, "id") for e in one.findall(f"link/{tag}")) for tag in ("successor", "predecessor")
+        }
         return OdrLane(
-            int(str(one.get("id"))), one.get("type", "none"), cubics(one, "width", "sOffset", start_m),
+            _integer(files, here, one, "id"), one.get("type", "none"), cubics(one, "width", "sOffset", start_m),
             cubics(one, "border", "sOffset", start_m), links["successor"], links["predecessor"],
             None if mark is None else (mark.get("type", "none"), mark.get("color", "standard")),
         )  # fmt: skip
 
     length = number(element, "length")
+    if not 0 <= length <= MAX_ROAD_M:
+        raise files.fail(here, f"a length of {length} m", f"give 0 to {MAX_ROAD_M / 1000:.0f} km")
     lanes = element.find("lanes")
     elements = sorted(lanes.findall("laneSection") if lanes is not None else [], key=lambda e: number(e, "s", 0.0))
     starts = [number(e, "s", 0.0) for e in elements]
@@ -165,6 +172,8 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         Section(start, end, tuple(lane(one, start) for side in ("left", "center", "right") for one in e.findall(f"{side}/lane")))
         for e, start, end in zip(elements, starts, [*starts[1:], length], strict=True)
     )
+    if any(not 0 <= start <= length for start in starts):
+        raise files.fail(here, f"lane sections at {starts} of a road of {length} m", "start every section on the road")
     view = element.find("planView")
     records = tuple(geometry(r) for r in (view.findall("geometry") if view is not None else []))
     return Road(
@@ -172,6 +181,13 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         cubics(element.find("elevationProfile"), "elevation"), cubics(element.find("lateralProfile"), "superelevation"),
         cubics(lanes, "laneOffset"), sections, _link(element, "successor"), _link(element, "predecessor"),
     )  # fmt: skip
+
+
+def _integer(files: SourceFiles, where: Path | str, element: Element, name: str) -> int:
+    try:
+        return int(str(element.get(name)))
+    except ValueError as error:
+        raise files.fail(where, f"<{element.tag}> with {name} = {element.get(name)!r}", "give an integer") from error
 
 
 def _link(road: Element, tag: str) -> RoadLink | None:

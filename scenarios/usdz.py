@@ -201,6 +201,9 @@ def _actors(archive: Archive) -> tuple[tuple[Actor, ...], int]:
         rows = list(zip(*columns, sizes, strict=True))
     except (KeyError, TypeError, ValueError) as error:
         raise files.fail(where, f"{type(error).__name__}: {error}", "give lists of equal length for every track") from error
+    odd = next((row for row in rows if not isinstance(row[0], str | int) or not isinstance(row[2], str | list)), None)
+    if odd is not None:
+        raise files.fail(where, f"a track with id {odd[0]!r} and flags {odd[2]!r}", "give text as id and a list of texts as flags")
     twice = [name for name, n in Counter(row[0] for row in rows).items() if n > 1]
     if twice:
         raise files.fail(where, f"track id {twice[0]!r} twice", "give each track its own id")

@@ -108,6 +108,10 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
         (changed(rig_trajectories_dot_json=json.dumps(rig(1)).encode()), "1 pose"),
         (changed(sequence_tracks_dot_json=json.dumps(sequence() | {"t": {}}).encode()), "2 sequences"),
         (changed(sequence_tracks_dot_json=None), "no such member"),
+        (
+            changed(sequence_tracks_dot_json=json.dumps(sequence()).replace('"CONTROLLABLE"', "7").encode().replace(b"[7]", b"7")),
+            "and flags 7",
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
