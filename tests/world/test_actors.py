@@ -171,3 +171,32 @@ def test_reset_gives_the_same_drive_again() -> None:
     first = run(actors, ego_at(70.0), 6_000_000)
     actors.reset()
     assert run(actors, ego_at(70.0), 6_000_000) == first
+
+
+def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:
+    replayed = Actor("replayed", "car", BOX, line_track(40.0, 7.0, y=3.5))
+    actors = Actors([replayed, idm("driver", 0.0, 10.0)], Vehicle(), 0, None, flat())
+    for t in (0, 100_000):
+        actors.step(t, FAR_AWAY)
+    outlook = actors.outlook()
+    expected = {t: outlook.at(t) for t in (100_000, 500_000, 1_000_000)}
+    for t in range(200_000, 1_500_000, 100_000):
+        moved = actors.step(t, FAR_AWAY)
+        if t == 1_000_000:
+            np.testing.assert_array_equal(moved["replayed"], expected[t]["replayed"])
+            # Foreseen at the speed of 0.1 s; free of a leader the driver keeps close to it.
+            assert abs(moved["driver"][0, 3] - expected[t]["driver"][0, 3]) < 0.5
+    for t, poses in expected.items():
+        for name, pose in poses.items():
+            np.testing.assert_array_equal(outlook.at(t)[name], pose)
+    assert expected[1_000_000]["driver"][0, 3] - expected[500_000]["driver"][0, 3] == pytest.approx(5.0, abs=0.1)
+
+
+def test_an_outlook_ends_with_the_track_and_with_the_drivers_way() -> None:
+    replayed = Actor("replayed", "car", BOX, line_track(40.0, 7.0, seconds=1.0, y=3.5))
+    short = Actor("driver", "car", BOX, line_track(0.0, 10.0, seconds=1.0), behaviour=Behaviour("idm", {"desired_speed_mps": 10.0}))
+    actors = Actors([replayed, short], Vehicle(), 0)
+    for t in (0, 100_000):
+        actors.step(t, FAR_AWAY)
+    assert set(actors.outlook().at(900_000)) == {"replayed", "driver"}
+    assert set(actors.outlook().at(1_100_000)) == set()
