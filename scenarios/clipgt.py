@@ -6,12 +6,13 @@ direction; the centre is halfway, point by point. Vertices are set as AlpaSim's 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.types import F64, Box, Lane, LaneMap
+from scenarios.reading import MAX_REACH_M
 from scenarios.usdz_archive import Archive
 from scenarios.vertices import with_vertices
 
@@ -36,7 +37,7 @@ def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
         if missing:
             notes.append(f"map tables in {folder}/ passed over: no {', '.join(missing)}")
             continue
-        lanes = archive.table(f"{folder}/lane.parquet")
+        lanes = _rows(archive, folder, "lane")
         if not lanes:
             notes.append(f"map tables in {folder}/ passed over: no lane")
             continue
@@ -45,21 +46,44 @@ def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
     return None, tuple(notes)
 
 
-def _read(archive: Archive, folder: str, rows: list[dict[str, Any]]) -> LaneMap:
-    where = f"{archive.path}, {folder}/lane.parquet"
+@dataclass(frozen=True)
+class _Row:
+    """One row of a table: where it stands, its key and its content; null structs are empty."""
+
+    where: str
+    key: dict[str, Any]
+    own: dict[str, Any]
+
+    @property
+    def map_id(self) -> str | None:
+        """Give the element's id; None in the placeholder row of an empty table."""
+        return None if self.key.get("map_id") is None else str(self.key["map_id"])
+
+
+def _rows(archive: Archive, folder: str, table: str) -> list[_Row]:
+    where = f"{archive.path}, {folder}/{table}.parquet"
+    out = []
+    for i, row in enumerate(archive.table(f"{folder}/{table}.parquet")):
+        key, own = ({} if row.get(name) is None else row[name] for name in ("key", table))
+        if not isinstance(key, dict) or not isinstance(own, dict):
+            raise archive.files.fail(f"{where}, row {i}", f"columns key and {table} that are no structs", "write the table again")
+        out.append(_Row(f"{where}, {key.get('map_id', f'row {i}')}", key, own))
+    return out
+
+
+def _read(archive: Archive, folder: str, rows: list[_Row]) -> LaneMap:
     links = _links(archive, folder)
     lanes: dict[str, Lane] = {}
     for row in rows:
-        key = str(row["key"]["map_id"])
-        fields = row.get("lane") or {}
+        key, fields = row.map_id, row.own
         absent = [side for side in ("left_rail", "right_rail") if not fields.get(side)]
-        if absent:
-            found = f"lane {key} without {absent[0]}, only {', '.join(fields) or 'nothing'}"
-            raise archive.files.fail(where, found, "use a map whose lanes have both rails; AlpaSim refuses this scene too")
-        left, right = (points(archive, f"{where}, lane {key}", fields[side]) for side in ("left_rail", "right_rail"))
+        if key is None or absent:
+            lacks = f"{absent[0]}, only {', '.join(fields) or 'nothing'}" if absent else "an id"
+            raise archive.files.fail(row.where, f"lane {key} without {lacks}", "give every lane both rails; AlpaSim refuses this scene too")
+        left, right = (points(archive, row.where, fields[side]) for side in ("left_rail", "right_rail"))
         if len(left) != len(right) or len(left) < 2:
             found = f"lane {key} with rails of {len(left)} and {len(right)} points"
-            raise archive.files.fail(where, found, "give both rails the same number of points, at least two")
+            raise archive.files.fail(row.where, found, "give both rails the same number of points, at least two")
         lanes[key] = Lane(
             key, with_vertices((left + right) / 2), with_vertices(left), with_vertices(right),
             successors=links.get(("NEXT_LANE", key), ()),
@@ -67,14 +91,14 @@ def _read(archive: Archive, folder: str, rows: list[dict[str, Any]]) -> LaneMap:
             right_neighbour=next(iter(links.get(("RIGHT_LANE", key), ())), None),
         )  # fmt: skip
     edges: dict[str, F64] = {}
-    for row in archive.table(f"{folder}/road_boundary.parquet"):
-        edges.setdefault(str(row["key"]["map_id"]), _line(archive, folder, "road_boundary", row))  # the first of an id counts
-    stops = [row for row in archive.table(f"{folder}/wait_line.parquet") if (row.get("wait_line") or {}).get("is_implicit") is not True]
+    for row in _rows(archive, folder, "road_boundary"):
+        edges.setdefault(str(row.map_id), _line(archive, row))  # the first of an id counts
+    stops = [row for row in _rows(archive, folder, "wait_line") if row.own.get("is_implicit") is not True]
     return LaneMap(
         {key: _known(lane, lanes) for key, lane in lanes.items()},
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
-        stop_lines=tuple(line for line in (_line(archive, folder, "wait_line", row) for row in stops) if len(line) > 1),
-        signs=tuple(sign for row in archive.table(f"{folder}/traffic_sign.parquet") if (sign := _sign(row)) is not None),
+        stop_lines=tuple(line for line in (_line(archive, row) for row in stops) if len(line) > 1),
+        signs=tuple(sign for row in _rows(archive, folder, "traffic_sign") if (sign := _sign(archive, row)) is not None),
     )  # fmt: skip
 
 
@@ -92,24 +116,24 @@ def points(archive: Archive, where: str, raw: Any) -> F64:
             xyz = np.array([[p["x"], p["y"], p["z"]] for p in raw], dtype=np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError) as error:
         raise archive.files.fail(where, f"points that are no x, y, z: {error}", "write the table again") from error
-    if not np.isfinite(xyz).all():
-        raise archive.files.fail(where, "a coordinate that is not finite", "repair the coordinates of this table")
+    if len(xyz) and not np.abs(xyz - xyz[0]).max() <= MAX_REACH_M:
+        raise archive.files.fail(where, "points that are not finite or kilometres apart", "repair the coordinates of this table")
     return xyz
 
 
-def _line(archive: Archive, folder: str, table: str, row: dict[str, Any]) -> F64:
-    where = f"{archive.path}, {folder}/{table}.parquet, {(row.get('key') or {}).get('map_id')}"
-    return points(archive, where, (row.get(table) or {}).get("location") or [])
+def _line(archive: Archive, row: _Row) -> F64:
+    return points(archive, row.where, row.own.get("location") or [])
 
 
 def _links(archive: Archive, folder: str) -> dict[tuple[str, str], tuple[str, ...]]:
     """Return (kind, lane) -> lanes; of several rows for a lane and kind the first counts."""
     out: dict[tuple[str, str], tuple[str, ...]] = {}
-    for row in archive.table(f"{folder}/association.parquet"):
-        what = row.get("association") or {}
-        kind, subject = (row.get("key") or {}).get("kind"), what.get("subjects")
+    for row in _rows(archive, folder, "association"):
+        kind, subject, objects = row.key.get("kind"), row.own.get("subjects"), row.own.get("objects") or []
+        if not isinstance(objects, list):
+            raise archive.files.fail(row.where, f"objects {objects!r}", "give a list of ids")
         if kind and subject is not None:
-            out.setdefault((str(kind), str(subject)), tuple(str(one) for one in what.get("objects") or ()))
+            out.setdefault((str(kind), str(subject)), tuple(str(one) for one in objects))
     return out
 
 
@@ -118,10 +142,10 @@ def _known(lane: Lane, lanes: dict[str, Lane]) -> Lane:
     return replace(lane, successors=tuple(s for s in lane.successors if s in lanes), left_neighbour=left, right_neighbour=right)
 
 
-def _sign(row: dict[str, Any]) -> tuple[F64, Box] | None:
-    centre = (row.get("traffic_sign") or {}).get("center")
-    if not centre or any(centre.get(axis) is None for axis in "xyz"):
+def _sign(archive: Archive, row: _Row) -> tuple[F64, Box] | None:
+    centre = row.own.get("center")
+    if not centre or not isinstance(centre, dict) or any(centre.get(axis) is None for axis in "xyz"):
         return None
     pose = np.eye(4)
-    pose[:3, 3] = [centre[axis] for axis in "xyz"]
+    pose[:3, 3] = points(archive, row.where, [centre])[0]
     return pose, SIGN

@@ -100,6 +100,15 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
             "rails of 4 and 5 points",
         ),
         (changed(clipgt__lane_dot_parquet=b"PAR1 no"), "no readable parquet"),
+        (changed(clipgt__road_boundary_dot_parquet=parquet([{"key": 3.0, "road_boundary": None}])), "that are no structs"),
+        (
+            changed(
+                clipgt__road_boundary_dot_parquet=parquet(
+                    [{"key": key("E"), "road_boundary": {"location": [{"x": 0, "y": 0, "z": 1e300}, {"x": 1, "y": 0, "z": 0}]}}]
+                )
+            ),
+            "kilometres apart",
+        ),
         (changed(metadata_dot_yaml=b"scene_id: [1"), "broken YAML"),
         (changed(metadata_dot_yaml=b"version: 1"), "scene_id None"),
         (changed(metadata_dot_yaml=b"!!python/object/apply:os.system ['true']"), "broken YAML"),
