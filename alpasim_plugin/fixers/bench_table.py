@@ -20,6 +20,7 @@ HEAD = (
     "rounding: mean, max, PSNR", "model: mean, max, PSNR", "hits",
 )  # fmt: skip
 NEAR = 0.15  # decades between points that share a label
+FEW = 3  # names that stand to the right of their points; a longer list stands to the left
 FLOOR = 1e-4  # grey levels; where the plot puts errors that are zero
 MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P"}
 MARK = "<!-- bench fixer: {} -->"
@@ -94,15 +95,16 @@ def _panel(ax: Any, errors: Sequence[tuple[Row, float]]) -> None:
     points = [(row, row.ms["all-in"][0], max(error, FLOOR)) for row, error in errors]
     for row, x, y in points:
         ax.plot(x, y, MARKERS[row.group], color=f"C{list(MARKERS).index(row.group)}", markersize=7)
-    for x, y, names in _clusters(points):
+    for (left, right), y, names in _clusters(points):
         side = "bottom" if y <= FLOOR else "top"
-        ax.annotate("\n".join(names), (x, y), xytext=(7, 4), textcoords="offset points", fontsize=7, va=side)
+        at, shift, align = (left, -7, "right") if len(names) > FEW else (right, 7, "left")
+        ax.annotate("\n".join(names), (at, y), xytext=(shift, 4), textcoords="offset points", fontsize=7, va=side, ha=align)
     for group, marker in MARKERS.items():
         ax.plot([], [], marker, color=f"C{list(MARKERS).index(group)}", label=group)
-    ax.legend(fontsize=8, loc="center left")
+    ax.legend(fontsize=8, loc="upper right")
     ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.margins(x=0.3, y=0.12)
+    ax.margins(x=0.38, y=0.12)
     ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.xaxis.set_major_formatter(ScalarFormatter())
     ax.xaxis.set_minor_formatter(NullFormatter())
@@ -111,16 +113,16 @@ def _panel(ax: Any, errors: Sequence[tuple[Row, float]]) -> None:
     ax.grid(visible=True, which="both", alpha=0.25)
 
 
-def _clusters(points: Sequence[tuple[Row, float, float]]) -> list[tuple[float, float, list[str]]]:
-    """Join the names of points whose labels would lie on each other; the label stands at the rightmost of them."""
-    out: list[tuple[float, float, list[str]]] = []
+def _clusters(points: Sequence[tuple[Row, float, float]]) -> list[tuple[tuple[float, float], float, list[str]]]:
+    """Join the names of points whose labels would lie on each other: leftmost and rightmost of them, their height, names."""
+    out: list[tuple[tuple[float, float], float, list[str]]] = []
     for row, x, y in sorted(points, key=lambda point: (point[2], point[1])):
-        for i, (right, height, names) in enumerate(out):
+        for i, ((left, right), height, names) in enumerate(out):
             if abs(math.log10(x / right)) < NEAR and abs(math.log10(y / height)) < NEAR:
-                out[i] = (max(x, right), height, [*names, row.name])
+                out[i] = ((min(x, left), max(x, right)), height, [*names, row.name])
                 break
         else:
-            out.append((x, y, [row.name]))
+            out.append(((x, x), y, [row.name]))
     return out
 
 
