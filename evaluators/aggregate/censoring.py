@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from evaluators.aggregate.rows import Row, failure_of, is_ok, metric_names, reason_of, renderers, value_of
+import numpy as np
+
+from alpasim_plugin.types import F64
+from evaluators.aggregate.rows import Row, Side, failure_of, metric_names, reason_of, sides
 from evaluators.metrics import info
 
 STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")
@@ -30,18 +33,18 @@ def censoring(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         before the event was seen).
     """
     names = metric_names(rows)
-    return {name: _of_renderer([row for row in rows if row["renderer"] == name], names) for name in renderers(rows)}
+    return {name: _of_renderer(side, names) for name, side in sides(rows).items()}
 
 
-def _of_renderer(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
-    done = [row for row in rows if is_ok(row)]
+def _of_renderer(side: Side, names: Sequence[str]) -> dict[str, Any]:
+    done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
     ledgers = [row["censored"] for row in done if row.get("censored")]
     events: Counter[str] = Counter()
     for row in done:
         events.update(row.get("frame_events") or {})
     out: dict[str, Any] = {
-        "rollouts": len(rows),
-        "failed": dict(Counter(failure_of(row) for row in rows if not is_ok(row))),
+        "rollouts": len(side.rows),
+        "failed": dict(Counter(failure_of(row) for row, ok in zip(side.rows, side.ok, strict=True) if not ok)),
         "dropped": dict(Counter(ledger["dropped"] for ledger in ledgers if ledger["dropped"])),
         **{rule: sum(int(ledger[rule]) for ledger in ledgers) for rule in STEP_RULES},
         "frames": sum(int(row.get("frames") or 0) for row in done),
@@ -52,46 +55,42 @@ def _of_renderer(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
         "bounds_rollouts": {},
         "cut": {},
     }
+    cut, scored = (np.array([_steps(row, rules) for row in side.rows], dtype=np.float64) for rules in (CUT_RULES, ("steps_scored",)))
     for name in names:
-        absent = [row for row in done if value_of(row, name) is None]
-        if absent:
-            out["invalid"][name] = {"rollouts": len(absent), "reasons": dict(Counter(reason_of(row, name) for row in absent))}
+        values = side.raw(name)
+        absent = np.flatnonzero(side.ok & ~np.isfinite(values))
+        if len(absent):
+            reasons = Counter(reason_of(side.rows[i], name) for i in absent)
+            out["invalid"][name] = {"rollouts": len(absent), "reasons": dict(reasons)}
         if info(name).is_flag:
-            out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(rows, name)
+            is_share = info(name).aggregation == "mean"
+            out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(values, cut, scored, is_share)
     return out
 
 
-def rate_bounds(rows: Sequence[Row], metric: str) -> tuple[list[float], list[float], int]:
+def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[list[float], list[float], int]:
     """Return the least and greatest that a rate could be, given what is missing.
 
     Args:
-        rows: All planned rollouts of one renderer, at least one.
-        metric: A flag.
+        values: ``(R,)`` the flag of each planned rollout, NaN where missing; at least one.
+        cut: ``(R,)`` steps that a rule cut from each rollout after the policy took over.
+        scored: ``(R,)`` steps that were scored.
+        is_share: The flag of a rollout is the share of its steps that fired, not whether any did.
 
     Returns:
         Bounds over missing rollouts; bounds over missing rollouts and cut steps; how many rollouts were cut before the event was seen.
     """
-    least = greatest = missing = 0.0
-    seen: list[float] = []
-    n_cut = 0
-    for row in rows:
-        value = value_of(row, metric) if is_ok(row) else None
-        if value is None:
-            missing += 1
-            continue
-        low, high = _with_cut_steps(value, row.get("censored") or {}, info(metric).aggregation == "mean")
-        seen.append(value)
-        least, greatest = least + low, greatest + high
-        n_cut += high > value
-    n, total = len(rows), sum(seen)
-    return [total / n, (total + missing) / n], [least / n, (greatest + missing) / n], n_cut
-
-
-def _with_cut_steps(value: float, ledger: Mapping[str, Any], is_share: bool) -> tuple[float, float]:
-    """Return the least and greatest value of a rollout had its cut steps counted: a share of steps, or whether any step fired."""
-    cut, scored = sum(int(ledger.get(rule) or 0) for rule in CUT_RULES), int(ledger.get("steps_scored") or 0)
-    if not cut:
-        return value, value
+    known = np.isfinite(values)
+    seen, n, missing = values[known], len(values), int(np.sum(~known))
+    cut, scored = cut[known], scored[known]
+    least, greatest = seen, np.where(cut > 0, 1.0, seen)
     if is_share:
-        return value * scored / (scored + cut), (value * scored + cut) / (scored + cut)
-    return value, 1.0
+        steps = np.maximum(scored + cut, 1.0)
+        least, greatest = np.where(cut > 0, seen * scored / steps, seen), np.where(cut > 0, (seen * scored + cut) / steps, seen)
+    over_rollouts = [float(seen.sum()) / n, (float(seen.sum()) + missing) / n]
+    return over_rollouts, [float(least.sum()) / n, (float(greatest.sum()) + missing) / n], int(np.sum(greatest > seen))
+
+
+def _steps(row: Row, rules: Sequence[str]) -> int:
+    ledger = row.get("censored") or {}
+    return sum(int(ledger.get(rule) or 0) for rule in rules)

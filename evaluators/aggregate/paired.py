@@ -71,8 +71,7 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
         ``reason`` where numbers are None, ``note`` where they need care.
     """
     facts = info(metric)
-    mine, base, lost = _pair(here, there, metric, listed)
-    n_missing = lost.pop("count")
+    pairs = _Pairs(here, there, metric)
     entry: dict[str, Any] = {
         "baseline": baseline,
         "diff": None,
@@ -84,23 +83,23 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
         "verdict": "undecided",
         "difference": "none shown",
         "more_scenes": None,
-        "n_cells": len(mine.cells),
-        "n_scenes": len({cell[1] for cell in mine.cells}),
-        "n_missing": n_missing,
-        "missing": lost["cells"],
+        "n_cells": len(pairs.mine),
+        "n_scenes": len(np.unique(pairs.scenes)),
+        "n_missing": len(pairs.lone),
+        "missing": pairs.missing(metric, listed),
         "unit": facts.unit,
         "direction": facts.direction,
     }
-    if not mine.cells:
+    if not len(pairs.mine):
         return entry | {"reason": NO_PAIR}
-    delta = mine.values - base
-    means, _ = cluster_means(delta, [cell[1] for cell in mine.cells])
+    delta = pairs.mine - pairs.base
+    means, _ = cluster_means(delta, pairs.scenes)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
     entry["scenes"] = {"up": up, "down": down, "same": len(means) - up - down, "p_value": sign_test(up, down)}
     if facts.is_flag:
-        gained, lost_events = int(np.sum((mine.values > 0) & (base == 0))), int(np.sum((mine.values == 0) & (base > 0)))
-        entry["cells"] = {"only_here": gained, "only_baseline": lost_events, "p_value": sign_test(gained, lost_events)}
-    interval = flag_interval(delta, [c[1] for c in mine.cells]) if facts.is_flag else t_interval(means, "scenes")
+        gained, lost = int(np.sum((pairs.mine > 0) & (pairs.base == 0))), int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
+        entry["cells"] = {"only_here": gained, "only_baseline": lost, "p_value": sign_test(gained, lost)}
+    interval = flag_interval(delta, pairs.scenes) if facts.is_flag else t_interval(means, "scenes")
     entry["diff"], entry["ci95"], entry["method"] = interval.centre, interval.bounds, interval.method or None
     if interval.reason:
         return entry | {"reason": interval.reason}
@@ -159,25 +158,22 @@ def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
     return np.asarray(np.where(few, joined_low, low)), np.asarray(np.where(few, joined_high, high))
 
 
-class _Shared:
-    """Cells with a value on both sides, and the values of one side."""
+class _Pairs:
+    """Cells with a value on both sides, and those without."""
 
-    def __init__(self, cells: list[Cell], values: F64) -> None:
-        self.cells, self.values = cells, values
+    def __init__(self, here: Side, there: Side, metric: str) -> None:
+        self.sides = (here, here.values(metric)), (there, there.values(metric))
+        mine, base = self.sides[0][1], self.sides[1][1]
+        index = here.place_in(there)
+        partner = np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(mine), np.nan)
+        both: Bool = np.isfinite(mine) & np.isfinite(partner)
+        self.mine, self.base, self.scenes = mine[both], partner[both], here.scene[both]
+        only_there = np.flatnonzero(there.place_in(here) < 0)
+        self.lone = sorted([here.cells[i] for i in np.flatnonzero(~both)] + [there.cells[i] for i in only_there])
 
-
-def _pair(here: Side, there: Side, metric: str, listed: int) -> tuple[_Shared, F64, dict[str, Any]]:
-    """Return the shared cells with both values, and the planned cells that have none."""
-    mine, base = here.values(metric), there.values(metric)
-    place = {cell: i for i, cell in enumerate(there.cells)}
-    index = np.array([place.get(cell, -1) for cell in here.cells], dtype=np.int64)
-    partner = np.where(index >= 0, base[index], np.nan) if len(base) else np.full(len(mine), np.nan)
-    both: Bool = np.isfinite(mine) & np.isfinite(partner)
-    known = set(here.cells)
-    lone = [here.cells[i] for i in np.flatnonzero(~both)] + [cell for cell in there.cells if cell not in known]
-    cells = [_lost(cell, (here, mine), (there, base), metric) for cell in sorted(lone)[:listed]]
-    shared = [here.cells[i] for i in np.flatnonzero(both)]
-    return _Shared(shared, mine[both]), partner[both], {"count": len(lone), "cells": cells}
+    def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
+        """Name cells without a pair, with side and cause."""
+        return [_lost(cell, *self.sides, metric) for cell in self.lone[:listed]]
 
 
 def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str) -> dict[str, Any]:

@@ -118,6 +118,17 @@ class Side:
         total = np.bincount(self.cell[known], weights=found[known], minlength=len(self.cells))
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
+    def place_in(self, other: Side) -> I64:
+        """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
+        if id(other) not in self._places:
+            place = {cell: i for i, cell in enumerate(other.cells)}
+            self._places[id(other)] = np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
+        return self._places[id(other)]
+
+    @cached_property
+    def _places(self) -> dict[int, I64]:
+        return {}
+
     @cached_property
     def rows_of(self) -> Mapping[Cell, Sequence[int]]:
         """Which rows belong to each cell."""
