@@ -101,7 +101,7 @@ def test_widths_of_an_untrained_tiny_autoencoder() -> None:
     vae = load_networks(small_settings("vae.widths=[8,16,12,10,6]")).vae
     assert isinstance(vae, TinyVAE)
     assert vae.sizes == TinySizes(8, 16, 12, 10, 6)
-    assert load_networks(small_settings()).vae.sizes == TinySizes()
+    assert load_networks(small_settings()).vae.sizes == TinySizes(32, 48, 48, 32, 16)
     assert "vae.widths" in refusal("vae.widths=[8,16]")
 
 
