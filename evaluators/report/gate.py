@@ -10,7 +10,7 @@ from evaluators.gate.judge import Check, GateVerdict
 from evaluators.report.files import write_whole
 from evaluators.report.junit import clean, junit
 from evaluators.report.run_folder import Run
-from evaluators.report.summary import MAX_BYTES, cut, escape, table
+from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, escape, table
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "infrastructure": "error", "evaluator": "error"}
@@ -61,9 +61,10 @@ def append_job_summary(text: str) -> Path | None:
         return None
     path = Path(named)
     before = path.read_text(encoding="utf-8") if path.exists() else ""
-    room = MAX_BYTES - len(before.encode()) - 1
-    if room > 0:
-        write_whole(path, before + ("\n" if before and not before.endswith("\n") else "") + cut(text, room))
+    before = before.rstrip("\n") + "\n\n" if before else ""
+    room = MAX_BYTES - len(before.encode())
+    if room > len(CUT_NOTE):
+        write_whole(path, before + cut(text, room))
     return path
 
 

@@ -113,7 +113,7 @@ def test_the_ci_summary_file_is_appended_to_and_stays_below_one_mebibyte(runs, g
     page.write_text("earlier step")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(page))
     run_command(["gate", str(runs["good"]), "--gate", gate_file])
-    assert page.read_text().startswith("earlier step\n## Gate: PASS\n")
+    assert page.read_text().startswith("earlier step\n\n## Gate: PASS\n")
     page.write_text("x" * (2**20 - 48_700))  # nearly full: room for 120 bytes
     run_command(["gate", str(runs["good"]), "--gate", gate_file])
     assert page.stat().st_size < 2**20
