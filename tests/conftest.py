@@ -17,6 +17,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a core: threads of several
 REPO = Path(__file__).resolve().parents[1]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: item.path.parent.name != "runtime")
+
+
 def find_shared_data() -> Path | None:
     """Return the folder of third-party data sets, or None where this machine has none.
 
