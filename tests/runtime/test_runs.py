@@ -43,7 +43,7 @@ def plan_of(policies: tuple[str, ...] = ("lane-camera",), preset: str = "paper",
 
 def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Heard]:
     heard = Heard()
-    return execute_run(plan, root, workers, ["simrun"], heard, resume), heard
+    return execute_run(plan, root, workers, ["simrun"], heard, resume, certificate="none"), heard
 
 
 def comparable(root: Path) -> dict[str, object]:
@@ -107,7 +107,7 @@ def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path) -> None:
 
 def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", "clean", "--policy", "lane-camera", "--seeds", "6"]
-    command += ["--set", SHORT[0], "--workers", "1", "--out", str(tmp_path), "smoke/straight"]
+    command += ["--set", SHORT[0], "--workers", "1", "--certify", "none", "--out", str(tmp_path), "smoke/straight"]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     give_up = time.monotonic() + 90
     while len(list(tmp_path.rglob(MANIFEST))) < 2 and time.monotonic() < give_up and process.poll() is None:
@@ -131,7 +131,8 @@ def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Pat
         "resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))\n"
         "sys.exit(run_command(sys.argv[2:]))\n"
     )
-    common = ["--renderer", "clean", "--policy", "lane-camera", "--workers", "1", "--set", SHORT[0], "--resume", "--out", str(tmp_path)]
+    common = ["--renderer", "clean", "--policy", "lane-camera", "--workers", "1", "--set", SHORT[0], "--certify", "none", "--resume"]
+    common += ["--out", str(tmp_path)]
     base = [sys.executable, "-c", code]
     fine = subprocess.run([*base, str(10**9), "--seeds", "0,1", *common, "smoke/straight"], capture_output=True, text=True)
     assert fine.returncode == 0, fine.stderr
