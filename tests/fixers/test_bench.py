@@ -34,6 +34,7 @@ def mean_error(error: tuple[float, int, float | None] | None) -> float:
     return error[0]
 
 
+@pytest.mark.slow
 def test_every_setting_of_the_groups_is_measured_at_every_stage(rows: dict[str, Row]) -> None:
     assert list(rows) == [f"{case.group}: {case.name}" for case in cases(8) if case.group in GROUPS]
     for row in rows.values():
@@ -43,6 +44,7 @@ def test_every_setting_of_the_groups_is_measured_at_every_stage(rows: dict[str, 
         assert all(0 < p50 <= p95 for p50, p95 in row.ms.values())
 
 
+@pytest.mark.slow
 def test_streaming_in_float32_is_the_whole_clip_up_to_rounding(rows: dict[str, Row]) -> None:
     for name, row in rows.items():
         if "float16" not in name and "int8" not in name:
@@ -51,16 +53,19 @@ def test_streaming_in_float32_is_the_whole_clip_up_to_rounding(rows: dict[str, R
             assert row.rounding[1] <= 1, name  # a value that lies between two grey levels
 
 
+@pytest.mark.slow
 def test_less_precision_is_more_error_and_still_small(rows: dict[str, Row]) -> None:
     error = {name: mean_error(rows[f"precision: {name}"].rounding) for name in ("float32", "float16", "bfloat16", "int8 transformer")}
     assert error["float32"] < error["float16"] < error["bfloat16"] < 2
     assert 0.005 < error["int8 transformer"] < 2
 
 
+@pytest.mark.slow
 def test_an_identity_hides_what_precision_costs(rows: dict[str, Row]) -> None:
     assert mean_error(rows["precision: bfloat16, identity"].rounding) < mean_error(rows["precision: bfloat16"].rounding)
 
 
+@pytest.mark.slow
 def test_a_narrow_window_is_another_model_but_the_whole_one_is_the_base(rows: dict[str, Row]) -> None:
     error = {name: mean_error(rows[f"window: {name}"].model) for name in ("4 latents", "6 latents", "all")}
     assert error["all"] < 1e-3
@@ -68,6 +73,7 @@ def test_a_narrow_window_is_another_model_but_the_whole_one_is_the_base(rows: di
     assert error["4 latents"] >= error["6 latents"] > error["all"]
 
 
+@pytest.mark.slow
 def test_other_weights_are_not_compared_with_the_base(rows: dict[str, Row]) -> None:
     assert rows["precision: float32, identity"].model is None
     assert rows["precision: float32, identity"].weights == "identity"
@@ -114,6 +120,7 @@ def test_difference_names_the_largest_and_the_mean() -> None:
     assert difference(a[:0], a[:0]) is None
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_per_row_and_the_plot_is_a_picture(rows: dict[str, Row], tmp_path: Path) -> None:
     lines = [line for line in markdown(list(rows.values())).splitlines() if line.startswith("| ")]
     assert len(lines) == len(rows) + 1
