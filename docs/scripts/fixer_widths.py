@@ -1,0 +1,41 @@
+"""Time blocks of ``onefixer-tiny`` for several widths of its autoencoder: ``python docs/scripts/fixer_widths.py [THREADS]``.
+
+Random frames of 256x144 with holes and semantic maps, random weights, chunk by chunk. Prints milliseconds a frame, the median of blocks 3 to
+10, in two rounds. Needs free cores: with two threads on busy ones it measures how long they wait for each other.
+"""
+
+import sys
+import time
+
+import numpy as np
+import torch
+
+from alpasim_plugin.fixers.base import fixer_settings, make_fixer
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import Frame
+
+WIDTHS = ("64,96,96,64,48", "48,64,64,48,32", "32,64,64,32,32", "32,48,48,32,16")
+BLOCKS, SIZE = 10, (144, 256)
+
+
+def ms_a_frame(widths: str, threads: int) -> float:
+    """Return the median time a frame of one fixer's blocks after the second."""
+    settings = fixer_settings("onefixer-tiny", [f"vae.widths=[{widths}]", "untrained=random"])
+    fixer = make_fixer("onefixer-tiny", settings, scene_id="widths", threads=threads)
+    rng, t_us, spent = stream("widths", 0, "frames"), 0, []
+    for block in range(BLOCKS):
+        n = fixer.blocks.frames(block)
+        images = rng.integers(0, 256, (2, n, *SIZE, 3), dtype=np.uint8)
+        alpha = rng.random((n, *SIZE), dtype=np.float32)
+        frames = [Frame(t_us + i, "front", images[0, i], alpha[i]) for i in range(n)]
+        t_us += n
+        began = time.perf_counter()
+        fixer.step(frames, list(images[1]))
+        spent.append(1e3 * (time.perf_counter() - began) / n)
+    return float(np.median(spent[2:]))
+
+
+if __name__ == "__main__":
+    threads = int(sys.argv[1]) if len(sys.argv) > 1 else torch.get_num_threads()
+    for widths in WIDTHS * 2:
+        print(f"{widths:>16}  {ms_a_frame(widths, threads):6.1f} ms a frame", flush=True)
