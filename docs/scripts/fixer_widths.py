@@ -1,7 +1,7 @@
 """Time blocks of ``onefixer-tiny`` for several widths of its autoencoder: ``python docs/scripts/fixer_widths.py [THREADS]``.
 
-Random frames of 256x144 with holes and semantic maps, random weights, chunk by chunk. Prints milliseconds a frame, the median of blocks 3 to
-10, in two rounds. Needs free cores: with two threads on busy ones it measures how long they wait for each other.
+Random frames of 256x144 with holes and semantic maps, random weights, chunk by chunk. Prints milliseconds a frame: the median of blocks 3
+to 10, in two rounds. Needs free cores: with two threads on busy ones it measures how long they wait for each other.
 """
 
 import sys
