@@ -1,0 +1,21 @@
+"""One rollout log written by us, as a file and as read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.types import RolloutLog
+from tests.log.make_rollout import write_rollout
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return write_rollout(tmp_path / "rollout.asl")
+
+
+@pytest.fixture
+def log(path: Path) -> RolloutLog:
+    return read_asl(path)

@@ -1,0 +1,141 @@
+"""Damaged and foreign logs: what is read, what is refused, and in which words."""
+
+from __future__ import annotations
+
+import pickle
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.alpasim.asl import AslFile, AslReader
+from alpasim_plugin.alpasim.wire import logging_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.types import RolloutLog
+from tests.log.make_rollout import T0_US
+
+
+def test_cut_log_gives_what_is_whole_and_a_warning(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+    log = read_asl(path)
+    assert len(log.images) == 4
+    assert len(log.warnings) == 1
+    assert "last entry cut" in log.warnings[0]
+
+
+def test_cut_inside_the_first_entry_is_an_error(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(InputError, match="no rollout_metadata"):
+        read_asl(path)
+
+
+def test_damage_in_the_middle_is_an_error_with_its_place(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    first = 4 + struct.unpack(">I", data[:4])[0]
+    data[first + 4 : first + 12] = b"\xff" * 8
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError) as caught:
+        read_asl(path)
+    assert "entry 1 at byte" in caught.value.with_what
+
+
+def edited(path: Path, change: object) -> Path:
+    """Rewrite a log entry by entry through `change`, which may return None to leave one out."""
+    entries = [change(i, e) for i, e in enumerate(AslReader(path))]  # type: ignore[operator]
+    with AslFile(path) as file:
+        for e in entries:
+            if e is not None:
+                file.write(e)
+    return path
+
+
+def test_log_of_the_five_scored_kinds_is_enough(path: Path, log: RolloutLog) -> None:
+    needed = {"rollout_metadata", "actor_poses", "driver_request", "driver_return", "driver_camera_image"}
+    bare = read_asl(edited(path, lambda i, e: e if e.WhichOneof("log_entry") in needed else None))
+    np.testing.assert_array_equal(bare.ego.xyz, log.ego.xyz)
+    assert len(bare.plans) == len(log.plans)
+    assert len(bare.images) == len(log.images)
+
+
+def test_metadata_must_come_first(path: Path) -> None:
+    with pytest.raises(InputError, match="first entry is available_cameras_request"):
+        read_asl(edited(path, lambda i, e: None if i == 0 else e))
+
+
+def test_ego_must_be_defined_first(path: Path) -> None:
+    def swap(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+        if i == 0:
+            boxes = e.rollout_metadata.actor_definitions.actor_aabb
+            boxes[0].actor_id, boxes[1].actor_id = boxes[1].actor_id, boxes[0].actor_id
+        return e
+
+    with pytest.raises(InputError, match="actor definitions begin with 7"):
+        read_asl(edited(path, swap))
+
+
+def test_log_without_ego_poses_is_refused(path: Path) -> None:
+    with pytest.raises(InputError, match="no actor_poses of EGO"):
+        read_asl(edited(path, lambda i, e: None if e.HasField("actor_poses") else e))
+
+
+def test_time_running_backwards_is_refused(path: Path) -> None:
+    def stop(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+        if e.HasField("actor_poses"):
+            e.actor_poses.timestamp_us = T0_US
+        return e
+
+    with pytest.raises(InputError, match=f"time {T0_US} us at index 1 after {T0_US} us"):
+        read_asl(edited(path, stop))
+
+
+def test_unset_quaternion_is_refused(path: Path) -> None:
+    def unset(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+        if e.HasField("actor_poses"):
+            e.actor_poses.actor_poses[-1].actor_pose.ClearField("quat")
+        return e
+
+    with pytest.raises(InputError, match=r"\|q\|\^2 = 0"):
+        read_asl(edited(path, unset))
+
+
+def test_answer_without_a_question_is_refused(path: Path) -> None:
+    with pytest.raises(InputError, match="driver_return without a driver_request"):
+        read_asl(edited(path, lambda i, e: None if e.HasField("driver_request") else e))
+
+
+def test_poses_of_undefined_actors_are_left_out_and_named(path: Path) -> None:
+    def rename(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+        for pose in e.actor_poses.actor_poses:
+            if pose.actor_id == "7":
+                pose.actor_id = "hidden"
+        return e
+
+    log = read_asl(edited(path, rename))
+    assert set(log.actors) == {"late", "wall"}
+    assert log.info["undefined_actors"] == ("hidden",)
+
+
+def test_entry_of_a_future_kind_is_skipped_with_a_warning(path: Path) -> None:
+    body = b"\xfa\x01\x02\x08\x01"
+    path.write_bytes(path.read_bytes() + struct.pack(">I", len(body)) + body)
+    log = read_asl(path)
+    assert "1 entries of a kind that this version does not know" in log.warnings[0]
+    assert len(log.images) == 5
+
+
+class Bomb:
+    """Raises when unpickled."""
+
+    def __reduce__(self) -> tuple[object, tuple[str, ...]]:
+        return (pytest.fail, ("debug bytes were unpickled",))
+
+
+def test_debug_bytes_are_never_unpickled(path: Path) -> None:
+    def arm(i: int, e: logging_pb2.LogEntry) -> logging_pb2.LogEntry:
+        if e.HasField("driver_return"):
+            e.driver_return.debug_info.unstructured_debug_info = pickle.dumps(Bomb())
+        return e
+
+    assert len(read_asl(edited(path, arm)).plans) == 3

@@ -1,0 +1,88 @@
+"""Numbers on the wire: float32 poses, quaternion norms, and what is refused at writing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from alpasim_plugin.alpasim.wire import common_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_from_quat
+from alpasim_plugin.log import AslWriter
+from alpasim_plugin.log.schema import read_poses, wire_poses, wire_trajectory
+from alpasim_plugin.types import Actor, Box, Trajectory
+from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    xyz=st.lists(st.floats(-9e4, 9e4), min_size=3, max_size=3),
+    quat=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3),
+)
+def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -> None:
+    messages = wire_poses(np.array([xyz]), np.array([quat]), "a test")
+    back_xyz, back_quat = read_poses(messages, "a test")
+    assert np.abs(back_xyz[0] - xyz).max() <= np.spacing(np.float32(max(*np.abs(xyz), 1e-30))) / 2
+    unit = np.array(quat) / np.linalg.norm(quat)
+    assert 2 * np.arccos(min(1.0, abs(float(back_quat[0] @ unit)))) < 1e-6
+    assert abs(np.linalg.norm(back_quat[0]) - 1) < 1e-12
+
+
+@settings(max_examples=50, deadline=None)
+@given(n=st.integers(0, 6), seed=st.integers(0, 1000), zeros=st.booleans())
+def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(n: int, seed: int, zeros: bool) -> None:
+    rng = np.random.default_rng(seed)
+    xyz = np.zeros((n, 3)) if zeros else rng.normal(size=(n, 3)) * 1000
+    trajectory = Trajectory(T0_US + np.arange(n, dtype=np.int64), xyz, rng.normal(size=(n, 4)))
+    poses = wire_poses(trajectory.xyz, trajectory.quat, "a test")
+    slow = common_pb2.Trajectory(
+        poses=[common_pb2.PoseAtTime(pose=p, timestamp_us=t) for p, t in zip(poses, trajectory.t_us.tolist(), strict=True)]
+    )
+    fast = wire_trajectory(trajectory, "a test")
+    assert fast == slow
+    assert fast.SerializeToString() == slow.SerializeToString()
+
+
+def test_coordinates_too_large_for_float32_are_refused_at_writing(tmp_path: Path) -> None:
+    with AslWriter(tmp_path / "a.asl", HEADER) as log, pytest.raises(InputError, match=r"position .*500001\.4") as caught:
+        log.actor_poses(T0_US, se2(500_000, 0, 0), {})
+    assert "local origin" in caught.value.do_this
+
+
+def test_nan_pose_is_refused_at_writing(tmp_path: Path) -> None:
+    with AslWriter(tmp_path / "a.asl", HEADER) as log, pytest.raises(InputError, match="nan"):
+        log.actor_poses(T0_US, se2(0, 0, 0), {"7": se2(float("nan"), 0, 0)})
+
+
+def test_heading_of_half_a_turn_survives() -> None:
+    quat = quat_from_yaw(np.array([np.pi, -np.pi, np.pi - 1e-9]))
+    _, back = read_poses(wire_poses(np.zeros((3, 3)), quat, "a test"), "a test")
+    np.testing.assert_allclose(np.abs(yaw_from_quat(back)), np.pi, atol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "fine"), [(1.0, True), (1 + 4.9e-5, True), (1 - 4.9e-5, True), (1 + 6e-5, False), (0.0, False)])
+def test_quaternion_norm_rule(scale: float, fine: bool) -> None:
+    pose = common_pb2.Pose(vec=common_pb2.Vec3(), quat=common_pb2.Quat(w=0.6 * scale, z=0.8 * scale))
+    if fine:
+        np.testing.assert_allclose(read_poses([pose], "a test")[1], [[0.6, 0, 0, 0.8]], atol=1e-7)
+    else:
+        with pytest.raises(InputError, match=r"\|q\|\^2"):
+            read_poses([pose], "a test")
+
+
+def test_actor_outside_the_header_is_refused(tmp_path: Path) -> None:
+    with AslWriter(tmp_path / "a.asl", HEADER) as log, pytest.raises(InputError, match="'ghost'"):
+        log.actor_poses(T0_US, se2(0, 0, 0), {"ghost": se2(1, 0, 0)})
+
+
+def test_ids_of_actors_must_be_their_own(tmp_path: Path) -> None:
+    twin = Actor("7", "automobile", Box(1, 1, 1), straight(2))
+    with pytest.raises(InputError, match=r"\['7'\] are taken or repeated"):
+        AslWriter(tmp_path / "a.asl", replace(HEADER, actors=(*ACTORS, twin)))
+    with pytest.raises(InputError, match=r"\['EGO'\]"):
+        AslWriter(tmp_path / "a.asl", replace(HEADER, actors=(replace(twin, actor_id="EGO"),)))
