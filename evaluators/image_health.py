@@ -10,17 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.pixels import is_black
 from alpasim_plugin.types import U8, LoggedImage, MetricSeries, RolloutLog, Scene
 from evaluators.base import register, series
 from evaluators.presets import Preset
 
-BLACK_MAX = 10  # an image is black when no byte is above this
 FROZEN_MOVE_M = 0.1  # the ego's way between two images after which they cannot be equal
-
-
-def is_black(pixels: U8) -> bool:
-    """Return whether every byte of ``(H, W, 3)`` pixels is at most 10."""
-    return bool(pixels.max(initial=0) <= BLACK_MAX)
 
 
 def decode(image: LoggedImage) -> U8:

@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass, replace
 
 from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.pixels import BLACK_MAX
 from alpasim_plugin.types import Aggregation, Direction
 
 
@@ -68,7 +69,7 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
         )
         for horizon in (0.5, 1.0, 2.5, 5.0)
     },
-    "img_is_black": _flag("a camera image is black (no byte above 10)"),
+    "img_is_black": _flag(f"a camera image is black (no byte above {BLACK_MAX})"),
     "img_is_frozen": _flag("a camera image equals the one before although the ego moved"),
     "safety_monitor_triggered": _flag("the policy's own safety monitor fired", direction="none"),
     "eval_relevant": _flag("the policy drives: the warm-up is over", direction="none"),

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
+from alpasim_plugin.pixels import is_black
 from alpasim_plugin.types import U8
 
 NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"
 LIMIT = 1.5  # a quarter of the range from black to white beyond either end
 SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
-BLACK_LEVEL = 10  # every byte at or below this is a black frame, as the raw frames' guard has it
 MOVED = 0.5  # grey levels of mean change in the raw frames that an unchanged output cannot answer
 
 
@@ -37,7 +37,7 @@ def failures(video: Tensor) -> list[str]:
 
 def black(fixed: U8, raw: U8) -> bool:
     """Say whether an image went black that was not."""
-    return int(fixed.max()) <= BLACK_LEVEL < int(raw.max())
+    return is_black(fixed) and not is_black(raw)
 
 
 def frozen(fixed: U8, before: U8, raw: U8, raw_before: U8) -> bool:

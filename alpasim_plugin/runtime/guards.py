@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
+from alpasim_plugin.pixels import is_black
 from alpasim_plugin.runtime.offers import batch_of
 from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest
-
-BLACK_LEVEL = 10  # AlpaSim's img_is_black: every byte at or below this
 
 
 def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
@@ -51,7 +50,7 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
     if problems:
         name = f"{renderer}, camera {request.camera.name!r} at {request.t_us} us"
         raise RendererError("rendering a frame", name, "; ".join(problems), "fix the renderer; its contract is types.Frame")
-    if int(frame.rgb.max()) <= BLACK_LEVEL and "black" not in frame.events:
+    if "black" not in frame.events and is_black(frame.rgb):
         return replace(frame, events=(*frame.events, "black"))
     return frame
 
