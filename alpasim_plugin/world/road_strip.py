@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -85,9 +86,9 @@ def build_strip(draft: MapDraft, name: str, curve: F64, profile: Profile, joint:
         for key, line in lines.items():
             if key in joint:
                 line[0] = joint[key]
-    forward = tuple(draft.add(_forward_lane(name, k, lines, profile)) for k in range(profile.forward))
+    forward = tuple(draft.add(_lane(name, "f", k, lines, profile)) for k in range(profile.forward))
     turned = reverse(lines)
-    backward = tuple(draft.add(_backward_lane(name, k, turned, profile)) for k in range(profile.backward))
+    backward = tuple(draft.add(_lane(name, "b", k, turned, profile)) for k in range(profile.backward))
     add_sides(draft, name, lines, profile)
     return Strip(forward, backward, lines)
 
@@ -140,30 +141,18 @@ def inner_paint(profile: Profile) -> Paint:
     return "solid_yellow" if profile.backward == 0 or profile.median_m > 0 else profile.centre_paint
 
 
-def _forward_lane(name: str, k: int, lines: dict[str, F64], profile: Profile) -> Lane:
+def _lane(name: str, side: Literal["f", "b"], k: int, lines: dict[str, F64], profile: Profile) -> Lane:
+    """Make the k-th lane from the centre of one direction; ``lines`` run in its driving direction."""
+    outermost = k + 1 == (profile.forward if side == "f" else profile.backward)
     return Lane(
-        f"{name}_f{k}",
-        lines[f"fc{k}"],
-        lines[f"f{k}"],
-        lines[f"f{k + 1}"],
-        left_neighbour=f"{name}_f{k - 1}" if k > 0 else None,
-        right_neighbour=f"{name}_f{k + 1}" if k + 1 < profile.forward else None,
+        f"{name}_{side}{k}",
+        lines[f"{side}c{k}"],
+        lines[f"{side}{k}"],
+        lines[f"{side}{k + 1}"],
+        left_neighbour=f"{name}_{side}{k - 1}" if k > 0 else None,
+        right_neighbour=None if outermost else f"{name}_{side}{k + 1}",
         left_paint=inner_paint(profile) if k == 0 else profile.lane_paint,
-        right_paint=profile.lane_paint if k + 1 < profile.forward else profile.edge_paint,
-        speed_limit_mps=profile.speed_limit_mps,
-    )
-
-
-def _backward_lane(name: str, k: int, turned: dict[str, F64], profile: Profile) -> Lane:
-    return Lane(
-        f"{name}_b{k}",
-        turned[f"bc{k}"],
-        turned[f"b{k}"],
-        turned[f"b{k + 1}"],
-        left_neighbour=f"{name}_b{k - 1}" if k > 0 else None,
-        right_neighbour=f"{name}_b{k + 1}" if k + 1 < profile.backward else None,
-        left_paint=inner_paint(profile) if k == 0 else profile.lane_paint,
-        right_paint=profile.lane_paint if k + 1 < profile.backward else profile.edge_paint,
+        right_paint=profile.edge_paint if outermost else profile.lane_paint,
         speed_limit_mps=profile.speed_limit_mps,
     )
 
