@@ -11,8 +11,10 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
+from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clips import read_video, to_tensor
 from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.pairs import PairRecipe, make_sequence
@@ -25,6 +27,10 @@ from scenarios.load import load_scenario
 app = typer.Typer(no_args_is_help=True, help="Make training data and train networks.")
 Out = Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")]
 WIDTH, HEIGHT = 256, 144
+
+EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
+app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
+app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 
 
 @app.callback()
@@ -72,9 +78,10 @@ def vae(
     steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 4000,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
     init: Annotated[Path | None, typer.Option("--init", help="Weights to start from.")] = None,
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose autoencoder sizes are trained.")] = "onefixer-tiny",
 ) -> None:
     """Train the tiny video autoencoder; writes OUT/vae.safetensors with averaged weights and measured latent statistics."""
-    model = TinyVAE.load(init).requires_grad_(True) if init else TinyVAE.random(seed=seed)
+    model = TinyVAE.load(init).requires_grad_(True) if init else TinyVAE.random(TinySizes(*onefixer_settings(fixer).vae.widths), seed)
     dataset = PairDataset(data, "train")
     videos = [read_video(path, WIDTH, HEIGHT, 0.0, video_share) for path in video or ()]
     task = VaeTask(model, dataset.sequences, videos, VaeRecipe(seed=seed, video_clips=1 if videos else 0))

@@ -114,8 +114,10 @@ class OneFixerSettings(FixerSettings):
     window: Positive = Field(default=6, description="Latents that a block sees, itself and the sink included.")
     sink: int = Field(default=0, ge=0, description="First latents of the rollout that stay in sight.")
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
-    history: Literal["finalise", "last-forward"] = Field(
-        default="last-forward", description="What the history keeps of a block: keys and values of an extra forward, or of the last step."
+    history: Literal["finalise", "last-forward", "none"] = Field(
+        default="last-forward",
+        description="What the history keeps of a block: keys and values of an extra forward, or of the last step. none: there is no history, "
+        "every frame is fixed by itself.",
     )
     holes: Literal["noise", "render"] = Field(
         default="noise", description="What a block starts from where the render is transparent: noise (Eq. 1), or the render all the same."
@@ -131,6 +133,8 @@ class OneFixerSettings(FixerSettings):
             raise ValueError(f"steps = {list(self.steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
         if self.sink > self.window:
             raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
+        if self.history == "none" and self.block_latents != 1:
+            raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
         if self.decoder.kind == "render" and self.vae.kind != "tiny":
             raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
         if self.decoder.kind == "taehv" and self.vae.kind != "wan":

@@ -17,7 +17,7 @@ from alpasim_plugin.nets.dit import TextContext
 from alpasim_plugin.nets.kv_cache import BlockCache
 from alpasim_plugin.nets.schedule import NoiseLevel, context_level
 
-History = Literal["finalise", "last-forward"]
+History = Literal["finalise", "last-forward", "none"]
 POOL = (4, 8, 8)  # frames, rows, columns of one latent
 RANGE_SLACK = 1e-3  # opacity beyond [0, 1] by rounding in a renderer is clipped; more is an error
 
@@ -131,7 +131,8 @@ def sample_block(
 
     Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not
     Euler). What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents,
-    slightly noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less).
+    slightly noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less). With ``none``
+    nothing is kept.
 
     Args:
         net: The network; folded copies serve when ``schedule`` has their one step.

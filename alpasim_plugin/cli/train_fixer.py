@@ -1,0 +1,100 @@
+"""``simrun train fixer``: train any variant of OneFixer from pairs; ``simrun train memory``: what it takes."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import typer
+from rich.console import Console
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
+from alpasim_plugin.training.generator import GeneratorRecipe
+from alpasim_plugin.training.latent_clips import ClipForm
+from alpasim_plugin.training.memory import measure_memory, memory_table
+from alpasim_plugin.training.perceptual_term import Distance
+from alpasim_plugin.training.trainer import Schedule
+from alpasim_plugin.training.variants import VARIANTS, variant_of
+
+PRECISIONS: Mapping[str, torch.dtype | None] = {"fp32": None, "bf16": torch.bfloat16}
+Updates = Annotated[int, typer.Option("--steps", min=1, help="Updates in all: the budget.")]
+
+
+def onefixer_settings(name: str) -> OneFixerSettings:
+    """Return the settings of a shipped fixer that can be trained.
+
+    Raises:
+        InputError: Unknown, or a fixer without networks.
+    """
+    settings = fixer_settings(name)
+    if not isinstance(settings, OneFixerSettings):
+        raise InputError("choosing a fixer to train", f"--fixer {name}", "it has no networks", "name a onefixer, for example onefixer-tiny")
+    return settings
+
+
+def train_fixer_command(
+    data: Annotated[Path, typer.Argument(help="Folder of pairs; its split 'train' is learned from.")],
+    vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae').")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command continues there.")],
+    variant: Annotated[str, typer.Option("--variant", help=f"One of {', '.join(VARIANTS)}.")] = "V9",
+    init: Annotated[Path | None, typer.Option("--init", help="Weights to start from: a run's fixer.safetensors, or a transformer.")] = None,
+    steps: Updates = 400,
+    clips: Annotated[int, typer.Option("--clips", min=1, help="Clips side by side.")] = 4,
+    accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches an update.")] = 2,
+    latents: Annotated[int, typer.Option("--latents", min=2, help="Latents of a clip: 12 are 45 frames, 24 are 93.")] = 12,
+    columns: Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")] = None,
+    stride: Annotated[int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")] = 24,
+    lr: Annotated[float, typer.Option("--lr", min=1e-7, help="Highest learning rate.")] = 2e-4,
+    ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged weights.")] = 0.99,
+    precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are trained.")] = "onefixer-tiny",
+) -> None:
+    """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
+    if threads is not None:
+        torch.set_num_threads(threads)
+    chosen, console, began = variant_of(variant), Console(stderr=True), time.time()
+    recipe = GeneratorRecipe(clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed)
+    settings = onefixer_settings(fixer).model_copy(update={"window": recipe.window, "history": "finalise"})
+    schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
+    run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])
+    distance: tuple[str, Distance] | None = None
+    if any(stage.horizon for stage in chosen.stages):
+        from alpasim_plugin.nets.perceptual import NAME, load_perceptual
+
+        distance = NAME, load_perceptual().distance
+
+    def encoded(done: int, count: int) -> None:
+        if done == count or done % 10 == 0:
+            console.print(f"clips as latents: {done}/{count} sequences, {time.time() - began:.0f} s")
+
+    def report(step: int, numbers: Mapping[str, float]) -> None:
+        if step % max(steps // 100, 1) == 0:
+            values = ", ".join(f"{key} {value:.4g}" for key, value in numbers.items())
+            left = (steps - step) * numbers["s"]
+            console.print(f"{step}/{steps} {values}; about {left / 60:.0f} min left", highlight=False)
+
+    console.print(f"wrote {train_fixer(run, out, distance, encoded, report)}")
+
+
+def memory_command(
+    latents: Annotated[str, typer.Option("--latents", help="Latents of a clip, comma-separated.")] = "6,12,24",
+    horizon: Annotated[str, typer.Option("--horizon", help="k, comma-separated.")] = "0,1,2,4,8",
+    clips: Annotated[int, typer.Option("--clips", min=1, help="Clips side by side.")] = 1,
+    columns: Annotated[int, typer.Option("--columns", min=2, help="Width in latents.")] = 32,
+    rows: Annotated[int, typer.Option("--rows", min=2, help="Height in latents.")] = 18,
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are measured.")] = "onefixer-tiny",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+) -> None:
+    """Measure the peak memory and the time of one training sample over clip length and horizon, each in a process of its own."""
+    counts, horizons = ([int(x) for x in text.split(",")] for text in (latents, horizon))
+    cells = measure_memory(onefixer_settings(fixer), counts, horizons, clips, rows, columns)
+    print(json.dumps([cell._asdict() for cell in cells], indent=1) if as_json else memory_table(cells))

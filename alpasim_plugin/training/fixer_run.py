@@ -1,0 +1,135 @@
+"""Train a variant of the fixer in one folder, from pairs and a trained autoencoder to a bundle with its card."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.bundle import save_bundle
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
+from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
+from alpasim_plugin.nets.init import initial_weights
+from alpasim_plugin.seeding import derive_seed
+from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
+from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
+from alpasim_plugin.training.model_card import ModelCard, curves
+from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.perceptual_term import Distance
+from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
+from alpasim_plugin.training.variants import Variant
+
+BUNDLE_FILE = "fixer.safetensors"
+DIT_PREFIX = "dit."
+
+
+@dataclass(frozen=True)
+class FixerRun:
+    """All that a training run is; equal runs give equal weights.
+
+    Args:
+        settings: The fixer that is trained: sizes, block, window.
+        variant: Objectives.
+        data: Folder of pairs; its ``train`` split is used.
+        vae: Trained autoencoder's weights.
+        init: Weights of a transformer or bundle to start from; None starts from a network that changes nothing.
+        form: Clips.
+        recipe: Batches.
+        schedule: Optimisation.
+        precision: Of the forward passes: None is float32.
+    """
+
+    settings: OneFixerSettings
+    variant: Variant
+    data: Path
+    vae: Path
+    init: Path | None
+    form: ClipForm
+    recipe: GeneratorRecipe
+    schedule: Schedule
+    precision: torch.dtype | None = None
+
+
+def train_fixer(
+    run: FixerRun,
+    out: Path,
+    distance: tuple[str, Distance] | None = None,
+    encoded: Callable[[int, int], None] | None = None,
+    report: Callable[[int, Mapping[str, float]], None] | None = None,
+) -> Path:
+    """Train to the schedule's end, from the last checkpoint if there is one, and write OUT/fixer.safetensors and its card.
+
+    Args:
+        run: What is trained.
+        out: Folder of the run; the latents of the clips are kept beside it, in ``latents``.
+        distance: Name and function of the perceptual term.
+        encoded: Called with sequences encoded and in all.
+        report: Called after every update with its number and the log's numbers.
+
+    Raises:
+        InputError: Data, weights or recipe that do not fit.
+        InfrastructureError: A loss that is not finite.
+    """
+    if run.recipe.steps != run.schedule.steps or run.recipe.accumulate != run.schedule.accumulate:
+        found = f"recipe {run.recipe.steps} x {run.recipe.accumulate}, schedule {run.schedule.steps} x {run.schedule.accumulate}"
+        raise InputError("training a fixer", str(out), found, "give both the same updates and batches an update")
+    vae = TinyVAE.load(run.vae)
+    dataset = PairDataset(run.data, "train")
+    clips = LatentClips(dataset.sequences, vae, run.form, out.parent / "latents", encoded)
+    net = CosmosCausalDiT.from_state_dict(start_weights(run), run.settings.rope_ratios, source=str(run.init or "initial weights"))
+    task = GeneratorTask(net, vae, clips, run.variant, run.recipe, distance)
+    facts = {**task.facts, "init": file_sha256(run.init) if run.init else None, "precision": str(run.precision)}
+    trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision)
+    trainer.run(report)
+    return write_bundle(run, out, trainer.averaged(), vae, facts)
+
+
+def start_weights(run: FixerRun) -> dict[str, Tensor]:
+    """Return the transformer's first weights; a variant that is also conditioned on the render gets zero weights for it."""
+    settings = run.settings
+    if run.init is None:
+        sizes = DiTSizes(**settings.dit.model_dump())
+        weights = initial_weights(sizes, derive_seed("training", run.recipe.seed, "generator"), zero_velocity=True)
+    else:
+        tensors = load_weights(run.init, dtype=torch.float32)
+        weights = {key.removeprefix(DIT_PREFIX): t for key, t in tensors.items() if key.startswith(DIT_PREFIX)} or dict(tensors)
+    return weights if run.variant.mixed else widen_map(weights, 32)
+
+
+def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyVAE, facts: Mapping[str, Any]) -> Path:
+    """Write what was trained as one float16 file, with its card."""
+    path = out / BUNDLE_FILE
+    parts = {"dit": {k: half(v) for k, v in dit.items()}, "vae": {k: half(v) for k, v in vae.state_dict().items()}}
+    history = run.settings.history if run.variant.history else "none"
+    block = run.settings.block_latents if run.variant.history else 1
+    settings = run.settings.model_copy(
+        update={"holes": "noise", "history": history, "block_latents": block, "uses_map": run.variant.use_map}
+    )  # fmt: skip
+    note = f"{run.variant.name}, {run.schedule.steps} updates"
+    save_bundle(path, parts, settings, trained=True, note=note)
+    rows, hours = curves(out / LOG_FILE)
+    training = {"variant": run.variant.name, "about": run.variant.about, "schedule": asdict(run.schedule), **facts}
+    data = {"pairs": "rendered scenes, split train", "sequences": len(PairDataset(run.data, "train").sequences), "form": asdict(run.form)}
+    ModelCard(f"OneFixer weights, variant {run.variant.name}: {run.variant.about}", data, training, rows, hours).write(path)
+    return path
+
+
+def half(tensor: Tensor) -> Tensor:
+    """Round a floating tensor to float16, for shipping.
+
+    Raises:
+        InputError: A value that float16 cannot hold.
+    """
+    if not tensor.is_floating_point():
+        return tensor
+    rounded = tensor.detach().half()
+    if not torch.isfinite(rounded).all():
+        found = f"values up to {float(tensor.abs().max()):.3g}"
+        raise InputError("rounding weights to float16", f"shape {list(tensor.shape)}", found, "train with a smaller learning rate")
+    return rounded

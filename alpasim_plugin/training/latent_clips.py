@@ -1,0 +1,155 @@
+"""Training clips as latents, encoded once and kept on disk: the autoencoder is frozen.
+
+    FOLDER/DIGEST/SEQUENCE-INFO.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
+
+Clips of a sequence start ``stride`` frames apart, once as they are and once mirrored. Each is encoded from its own first frame on, as a
+rollout that starts there would be. DIGEST covers the autoencoder's weights and the form of the clips, INFO what
+the sequence says of itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.clips import GROUP
+from alpasim_plugin.nets.sampling import opacity_mask
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.training.clips import to_tensor
+from alpasim_plugin.training.pair_store import PairSequence
+
+F16 = npt.NDArray[np.float16]
+DOING = "encoding training clips"
+CHANNELS = 16
+
+
+@dataclass(frozen=True)
+class ClipForm:
+    """How sequences are cut into clips.
+
+    Args:
+        latents: N, latents of a clip: ``1 + 4 (N - 1)`` frames.
+        stride: Frames between starts.
+    """
+
+    latents: int = 12
+    stride: int = 24
+
+    @property
+    def frames(self) -> int:
+        """Frames of a clip."""
+        return 1 + GROUP * (self.latents - 1)
+
+
+class LatentClip(NamedTuple):
+    """A clip's latents ``(C, N, H/8, W/8)`` float32, and where its frames are."""
+
+    z_r: Tensor
+    z_0: Tensor
+    z_map: Tensor
+    m: Tensor
+    sequence: PairSequence
+    start: int
+    mirrored: bool
+
+    @property
+    def latents(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Render, clean frames, map and mask."""
+        return self.z_r, self.z_0, self.z_map, self.m
+
+    def frames(self, end: int) -> tuple[Tensor, Tensor]:
+        """Return the render ``(3, end, H, W)`` in [-1, 1] and its opacity ``(1, end, H, W)`` of the clip's first frames."""
+        cut = self.sequence.clip.cut(self.start, end)
+        return to_tensor(cut.rgb_input, self.mirrored), (to_tensor(cut.opacity[..., None], self.mirrored) + 1) / 2
+
+
+class LatentClips:
+    """All clips of some sequences, as latents.
+
+    Args:
+        sequences: Pairs on disk.
+        vae: Frozen autoencoder.
+        form: How they are cut.
+        folder: Keeps the latents; what is there already is read.
+        report: Called with the number of sequences done and in all.
+
+    Raises:
+        InputError: No sequence, or one that is too short for a clip.
+    """
+
+    def __init__(
+        self,
+        sequences: Sequence[PairSequence],
+        vae: TinyVAE,
+        form: ClipForm,
+        folder: Path,
+        report: Callable[[int, int], None] | None = None,
+    ) -> None:
+        if not sequences:
+            raise InputError(DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first")
+        self.form, self.digest = form, digest(vae, form)
+        self._folder = folder / self.digest
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._where: list[tuple[PairSequence, F16, int]] = []
+        for done, sequence in enumerate(sequences):
+            array = self._latents(sequence, vae)
+            self._where += [(sequence, array, i) for i in range(len(array))]
+            if report is not None:
+                report(done + 1, len(sequences))
+
+    def __len__(self) -> int:
+        return len(self._where)
+
+    def __getitem__(self, index: int) -> LatentClip:
+        sequence, array, i = self._where[index]
+        z = torch.from_numpy(np.asarray(array[i], dtype=np.float32))
+        z_r, z_0, z_map = z[: 3 * CHANNELS].view(3, CHANNELS, *z.shape[1:])
+        return LatentClip(z_r, z_0, z_map, z[3 * CHANNELS :], sequence, i // 2 * self.form.stride, bool(i % 2))
+
+    def _latents(self, sequence: PairSequence, vae: TinyVAE) -> F16:
+        info = hashlib.blake2b(json.dumps(sequence.info, sort_keys=True).encode(), digest_size=4).hexdigest()
+        path = self._folder / f"{sequence.name}-{info}.npy"
+        if not path.exists():
+            encoded = encode_sequence(sequence, vae, self.form)
+            partial = path.with_name(f"{path.name}.{os.getpid()}.part")
+            with partial.open("wb") as file:
+                np.save(file, encoded)
+            partial.replace(path)
+        return np.asarray(np.load(path, mmap_mode="r"))
+
+
+def encode_sequence(sequence: PairSequence, vae: TinyVAE, form: ClipForm) -> F16:
+    """Encode all clips of a sequence ``(clips, 49, N, H/8, W/8)``: every start, first as it is, then mirrored."""
+    starts = range(0, len(sequence.clip) - form.frames + 1, form.stride)
+    if not starts:
+        found = f"{len(sequence.clip)} frames, a clip has {form.frames}"
+        raise InputError(DOING, str(sequence.folder), found, "make longer sequences, or train on fewer latents")
+    return np.stack([_encode(sequence, vae, start, form.frames, mirrored) for start in starts for mirrored in (False, True)])
+
+
+@torch.inference_mode()
+def _encode(sequence: PairSequence, vae: TinyVAE, start: int, frames: int, mirrored: bool) -> F16:
+    cut = sequence.clip.cut(start, frames)
+    videos = torch.stack([to_tensor(x, mirrored) for x in (cut.rgb_input, cut.rgb_gt, cut.sdmap)])
+    mask = opacity_mask((to_tensor(cut.opacity[..., None], mirrored)[None] + 1) / 2)
+    z = vae.encode(videos)
+    return np.asarray(torch.cat([z.flatten(0, 1), mask[0]]).half().numpy())
+
+
+def digest(vae: TinyVAE, form: ClipForm) -> str:
+    """Return what the latents depend on, besides the pairs, as a short digest."""
+    out = hashlib.blake2b(json.dumps(asdict(form)).encode(), digest_size=8)
+    for key, value in sorted(vae.state_dict().items()):
+        out.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return out.hexdigest()

@@ -1,0 +1,74 @@
+"""A model card: what a file of weights is, what it learned from, and the command and machine that made it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """What ``NAME.card.json`` beside ``NAME.safetensors`` says.
+
+    Args:
+        what: One sentence.
+        data: What it learned from.
+        training: Steps, batch, schedule, seed, starting point.
+        curves: Numbers of the log at some updates, first and last included.
+        hours: Wall-clock time of the training.
+    """
+
+    what: str
+    data: Mapping[str, Any]
+    training: Mapping[str, Any]
+    curves: list[Mapping[str, float]]
+    hours: float
+
+    def write(self, weights: Path) -> Path:
+        """Write the card of a file of weights beside it, with the file's digest, this machine and the command that runs."""
+        path = weights.with_suffix(".card.json")
+        card = {
+            **asdict(self), "weights": weights.name, "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
+            "bytes": weights.stat().st_size, "command": command(), "machine": machine(),
+        }  # fmt: skip
+        path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        return path
+
+
+def command() -> str:
+    """Return the command line of this process, as one would type it."""
+    return shlex.join(["simrun", *sys.argv[1:]])
+
+
+def machine() -> dict[str, Any]:
+    """Return what the machine is, for judging times."""
+    flags = torch.backends.cpu.get_cpu_capability()
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    return {"cpu": platform.processor() or platform.machine(), "cores": os.cpu_count(), "vectors": flags, "gpu": gpu,
+            "torch": torch.__version__}  # fmt: skip
+
+
+def curves(log: Path, points: int = 25) -> tuple[list[Mapping[str, float]], float]:
+    """Return the averages of a `Trainer` log over ``points`` equal parts, and the hours its updates took.
+
+    Returns:
+        Rows with ``step`` (the last of its part) and the means of all numbers; hours.
+    """
+    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    size = max(len(rows) // points, 1)
+    parts = [rows[i : i + size] for i in range(0, len(rows), size)]
+    out: list[Mapping[str, float]] = []
+    for part in parts:
+        keys = [key for key in part[-1] if key not in ("step", "s") and all(key in row for row in part)]
+        out.append({"step": part[-1]["step"], **{key: float(f"{sum(row[key] for row in part) / len(part):.5g}") for key in keys}})
+    return out, sum(row.get("s", 0.0) for row in rows) / 3600

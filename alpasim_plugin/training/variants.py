@@ -1,0 +1,74 @@
+"""What a generator may be trained as: the variants of the paper's ablation, its starting point, and a fixer without a past.
+
+The paper starts all of them from one causal video model that was trained for other work. Here ``base`` is that starting point: diffusion
+forcing on the same clips, with histories of every noise level. ``image`` sees one frame at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.training.shared_rollout import Objectives
+
+BASE, IMAGE = "base", "image"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of the ablation.
+
+    Args:
+        name: As in the paper.
+        stages: Objectives, one after the other, each for an equal share of the updates.
+        history: Whether the network sees latents before its block.
+        about: A few words for tables.
+    """
+
+    name: str
+    stages: tuple[Objectives, ...]
+    about: str
+    history: bool = True
+
+    def objectives(self, step: int, steps: int) -> Objectives:
+        """Return what update ``step`` of ``steps`` minimises."""
+        return self.stages[min(step * len(self.stages) // steps, len(self.stages) - 1)]
+
+    @property
+    def use_map(self) -> bool:
+        """Whether the network sees the semantic map."""
+        return self.stages[0].use_map
+
+    @property
+    def mixed(self) -> bool:
+        """Whether a block starts from Eq. 1; otherwise from noise, with the render among the conditions."""
+        return self.stages[0].mixed
+
+
+_ALL = (
+    Variant(BASE, (Objectives("clean", 0),), "diffusion forcing on noisy histories: where all others start"),
+    Variant(IMAGE, (Objectives("clean", 1),), "one frame at a time, no history", history=False),
+    Variant("V1", (Objectives("clean", 0),), "diffusion forcing: clean history"),
+    Variant("V2", (Objectives("own", 0),), "flow matching on own history"),
+    Variant("V3", (Objectives(None, 4),), "perceptual alone"),
+    Variant("V4", (Objectives("own", 1),), "k = 1"),
+    Variant("V5", (Objectives("own", 4, use_map=False),), "no map"),
+    Variant("V6", (Objectives("own", 4, mixed=False),), "from noise, render as a condition"),
+    Variant("V7", (Objectives("own", 0), Objectives(None, 4)), "one after the other"),
+    Variant("V8", (Objectives("redenoised", 4),), "history noised and denoised again"),
+    Variant("V9", (Objectives("own", 4),), "OneFixer"),
+)
+VARIANTS: Mapping[str, Variant] = MappingProxyType({variant.name: variant for variant in _ALL})
+
+
+def variant_of(name: str) -> Variant:
+    """Return a variant by its name.
+
+    Raises:
+        InputError: No such variant.
+    """
+    if name not in VARIANTS:
+        raise InputError("choosing what to train", f"variant {name!r}", "no such variant", f"choose one of {', '.join(VARIANTS)}")
+    return VARIANTS[name]

@@ -1,0 +1,193 @@
+"""Training a fixer of any variant: latents on disk, equal draws, budgets, and a bundle that drives."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.networks import load_networks
+from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
+from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from alpasim_plugin.training.fixer_run import FixerRun, start_weights, train_fixer
+from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
+from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
+from alpasim_plugin.training.memory import measure_memory, memory_table
+from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.trainer import Schedule
+from alpasim_plugin.training.variants import VARIANTS, variant_of
+from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
+
+from .pair_files import make
+
+FORM = ClipForm(latents=4, stride=7)
+
+
+def brightness(a: Tensor, b: Tensor) -> Tensor:
+    """Stand for a perceptual network."""
+    return (a.mean(dim=(1, 2, 3)) - b.mean(dim=(1, 2, 3))).abs()
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("pairs")
+    make(root, name="a", frames=21)
+    make(root, name="b", frames=14)
+    TinyVAE.random(TinySizes(16, 16, 16, 16, 16)).save(root / "vae.safetensors")
+    return root
+
+
+def run_of(data: Path, variant: str, *, steps: int = 2, init: Path | None = None) -> FixerRun:
+    recipe = GeneratorRecipe(clips=2, columns=4, block_latents=2, window=4, steps=steps, accumulate=1)
+    schedule = Schedule(steps, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
+    return FixerRun(small_settings("window=4"), variant_of(variant), data, data / "vae.safetensors", init, FORM, recipe, schedule)
+
+
+def clips_of(data: Path, folder: Path) -> LatentClips:
+    return LatentClips(PairDataset(data, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, folder)
+
+
+def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(data: Path, tmp_path: Path) -> None:
+    clips = clips_of(data, tmp_path)
+    assert len(clips) == 2 * (2 + 1)  # starts 0 and 7 of 21 frames, 0 of 14; each mirrored as well
+    clip = clips[3]
+    assert (clip.start, clip.mirrored) == (7, True)
+    frames = np.array(clip.sequence.clip.rgb_gt[7:20, :, ::-1])
+    video = torch.from_numpy(frames).permute(3, 0, 1, 2)[None].float() / 127.5 - 1
+    with torch.inference_mode():
+        wanted = TinyVAE.load(data / "vae.safetensors").encode(video)[0]
+    torch.testing.assert_close(clip.z_0, wanted, atol=4e-3, rtol=2e-3)  # float16 on disk
+    assert clip.m.shape == (1, 4, 4, 6)
+    render, opacity = clip.frames(5)
+    np.testing.assert_allclose((render.permute(1, 2, 3, 0) + 1) * 127.5, clip.sequence.clip.rgb_input[7:12, :, ::-1], atol=1e-3)
+    assert set(opacity.unique().tolist()) == {0.0, 1.0}
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")}
+    clips_of(data, tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npy")} == times
+
+
+def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: Path) -> None:
+    make(tmp_path, name="a", frames=21)
+    clips_of_this = LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+    info = tmp_path / "train" / "a" / "sequence.json"
+    info.write_text(json.dumps({**json.loads(info.read_text()), "scene_id": "another"}))
+    LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+    assert len(clips_of_this) == 4
+    assert len(list((tmp_path / "z").rglob("*.npy"))) == 2
+
+
+def test_too_short_sequences_and_no_sequences_are_refused(data: Path, tmp_path: Path) -> None:
+    make(tmp_path, name="short", frames=9)
+    with pytest.raises(InputError, match="a clip has 13"):
+        LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+    with pytest.raises(InputError, match="no finished sequence"):
+        LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+
+
+@pytest.mark.parametrize("name", list(VARIANTS))
+def test_every_variant_trains_by_one_function(data: Path, tmp_path: Path, name: str) -> None:
+    run = run_of(data, name)
+    path = train_fixer(run, tmp_path / "run", ("brightness", brightness))
+    card = json.loads(path.with_suffix(".card.json").read_text())
+    assert card["training"]["variant"] == name
+    assert card["training"]["schedule"]["steps"] == 2
+    assert card["curves"][-1]["step"] == 2
+    start, rows = start_weights(run), [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert len(rows) == 2
+    has_flow = any(stage.flow is not None for stage in run.variant.stages)
+    assert any("flow" in row for row in rows) == has_flow
+    assert any("perceptual" in row for row in rows) == any(stage.horizon for stage in run.variant.stages)
+    assert start["additional_patch_embedding.proj.1.weight"].shape[1] == (64 if run.variant.mixed else 128)
+
+
+def test_v7_divides_its_updates_between_its_two_terms() -> None:
+    kinds = [variant_of("V7").objectives(step, 5) for step in range(5)]
+    assert [k.flow for k in kinds] == ["own", "own", "own", None, None]
+    assert [k.horizon for k in kinds] == [0, 0, 0, 4, 4]
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(data: Path, tmp_path: Path) -> None:
+    whole = train_fixer(run_of(data, "V9", steps=3), tmp_path / "whole", ("brightness", brightness))
+
+    def stop(step: int, numbers: object) -> None:
+        if step == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_fixer(run_of(data, "V9", steps=3), tmp_path / "cut", ("brightness", brightness), report=stop)
+    cut = train_fixer(run_of(data, "V9", steps=3), tmp_path / "cut", ("brightness", brightness))
+    one, other = load_weights(cut), load_weights(whole)
+    assert one.keys() == other.keys()
+    assert all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+@pytest.mark.parametrize(("variant", "extra"), [("V9", "history=finalise"), ("image", "history=none")])
+def test_trained_weights_serve_the_streaming_fixer(data: Path, tmp_path: Path, variant: str, extra: str) -> None:
+    path = train_fixer(run_of(data, variant), tmp_path / "run", ("brightness", brightness))
+    blocks = "block_latents=1" if variant == "image" else "block_latents=2"
+    settings = small_settings("window=4", "holes=noise", extra, blocks, f"weights.bundle={path}")
+    assert load_networks(settings).note.startswith(f"{variant}, 2 updates")
+    frames = moving_picture(13)
+    session = fixer(settings)
+    assert session.trained
+    fixed = pixels(run_blocks(session, frames, maps_of(frames)))
+    assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
+
+
+def test_without_history_a_frame_does_not_depend_on_those_before(data: Path, tmp_path: Path) -> None:
+    path = train_fixer(run_of(data, "image"), tmp_path / "run", ("brightness", brightness))
+    settings = small_settings("window=4", "holes=noise", "history=none", "block_latents=1", f"weights.bundle={path}")
+    frames = moving_picture(6)
+    changed = [replace(frames[0], rgb=255 - frames[0].rgb), *frames[1:]]
+    one, other = (pixels(run_blocks(fixer(settings), clip, maps_of(clip))) for clip in (frames, changed))
+    np.testing.assert_array_equal(one[1:], other[1:])
+    assert (one[0] != other[0]).any()
+    with pytest.raises(InputError, match="block_latents"):
+        small_settings("history=none")
+
+
+def test_draws_are_functions_of_their_number(data: Path, tmp_path: Path) -> None:
+    run, clips = run_of(data, "V9"), clips_of(data, tmp_path)
+    net = CosmosCausalDiT.from_state_dict(start_weights(run), run.settings.rope_ratios)
+    vae = TinyVAE.load(data / "vae.safetensors")
+    one, two = (GeneratorTask(net, vae, clips, run.variant, run.recipe, ("b", brightness)) for _ in range(2))
+    two.batch(0)
+    a, b = one.batch(5), two.batch(5)
+    assert all(torch.equal(getattr(a.sample, key), getattr(b.sample, key)) for key in ("z_0", "z_r", "m", "eps", "t"))
+    assert a.sample.w == b.sample.w
+    assert a.sample.z_0.shape == (2, 16, 4, 4, 4)  # cropped to 4 of 6 columns
+    assert not torch.equal(a.sample.eps, one.batch(6).sample.eps)
+    with pytest.raises(InputError, match="half a token"):
+        GeneratorTask(net, vae, clips, run.variant, replace(run.recipe, columns=3), ("b", brightness))
+    with pytest.raises(InputError, match="without a distance"):
+        GeneratorTask(net, vae, clips, run.variant, run.recipe)
+
+
+def test_a_widened_map_input_changes_nothing_at_first(data: Path) -> None:
+    weights = start_weights(run_of(data, "V9"))
+    wide = widen_map(weights, 32)
+    narrow_net, wide_net = (CosmosCausalDiT.from_state_dict(w) for w in (weights, wide))
+    generator = torch.Generator().manual_seed(0)
+    x, z_map, z_r = (torch.randn(1, 16, 2, 4, 4, generator=generator) for _ in range(3))
+    text = torch.zeros(1, 1, 7)
+    for net in (narrow_net, wide_net):
+        torch.nn.init.normal_(net.final_layer.linear.weight, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        torch.testing.assert_close(wide_net(x, 500.0, text, torch.cat([z_map, z_r], 1)), narrow_net(x, 500.0, text, z_map))
+    with pytest.raises(InputError, match="they take 32"):
+        widen_map(wide, 16)
+
+
+@pytest.mark.slow
+def test_memory_grows_with_the_clip_and_the_horizon() -> None:
+    cells = measure_memory(small_settings(), [4, 12], [1, 4], 1, 8, 16)
+    by = {(c.latents, c.horizon): c.extra_mib for c in cells}
+    assert by[12, 4] > by[4, 4] > 0
+    assert "| 12 |" in memory_table(cells)
