@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from alpasim_plugin.fixers.bench import Row
-from alpasim_plugin.fixers.measure import STAGES
+from alpasim_plugin.fixers.stage_clock import TIMED
 
 HEAD = (
-    "setting", "weights", *(f"{stage} ms" for stage in STAGES), "all-in ms", "CPU ms", "first block ms", "peak MB",
+    "setting", "weights", *(f"{stage} ms" for stage in TIMED), "all-in ms", "CPU ms", "first block ms", "peak MB",
     "rounding: mean, max, PSNR", "model: mean, max, PSNR", "hits",
 )  # fmt: skip
 NEAR = 0.15  # decades between points that share a label
@@ -48,7 +48,7 @@ def cells(row: Row) -> list[str]:
     return [
         name,
         row.weights,
-        *(_times(row, stage) for stage in (*STAGES, "all-in", "cpu")),
+        *(_times(row, stage) for stage in (*TIMED, "all-in", "cpu")),
         _number(row.first_ms, ".0f"),
         _number(row.peak_mb, ".0f"),
         _error(row.rounding) + (f" (guard: {row.guarded} of {row.frames} frames unfixed)" if row.guarded else ""),

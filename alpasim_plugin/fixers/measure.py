@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,10 +14,11 @@ import numpy as np
 import torch
 
 from alpasim_plugin.fixers.onefixer import OneFixer
+from alpasim_plugin.fixers.pipeline import no_clock
 from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.types import F32, I64, U8, Bool, Frame
 
-STAGES = ("encode", "dit", "decode", "cache write")
 MB = 1e6
 
 
@@ -65,36 +65,6 @@ class Clip:
             start, index = end, index + 1
 
 
-class StageClock:
-    """Add up the wall time of named stages; what `BlockPipeline` takes as its ``stage``.
-
-    Args:
-        device: On an accelerator, queued work is waited for at both ends of a stage.
-    """
-
-    def __init__(self, device: torch.device | str = "cpu") -> None:
-        self._device = torch.device(device)
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Time one pass through a stage."""
-        begin = self.now()
-        yield
-        self.ms[name] = self.ms.get(name, 0.0) + (self.now() - begin) * 1e3
-
-    def now(self) -> float:
-        """Return seconds, with the device's queue empty."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
-
-    def take(self) -> dict[str, float]:
-        """Return the milliseconds by stage since the last call."""
-        ms, self.ms = self.ms, {}
-        return ms
-
-
 @dataclass
 class Timing:
     """What one setting cost; milliseconds per frame, one entry per block of steady state.
@@ -115,7 +85,7 @@ class Timing:
     first_ms: float
     all_in: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
-    stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in STAGES})
+    stages: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in TIMED})
     peak_mb: float | None = None
     images: U8 = field(default_factory=lambda: np.zeros((0, 0, 0, 3), np.uint8))
     guarded: Bool = field(default_factory=lambda: np.zeros(0, np.bool_))
@@ -140,6 +110,7 @@ def measure(
     clock = StageClock(device)
     begin = clock.now()
     fixer = OneFixer(settings, scene_id, seed, device, threads)
+    fixer.pipeline.stage = no_clock
     timing = Timing((clock.now() - begin) * 1e3, 0.0)
     images: list[U8] = []
     guarded: list[bool] = []

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import torch
 
-from alpasim_plugin.fixers.measure import MB, StageClock
+from alpasim_plugin.fixers.measure import MB
 from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.fixers.random_networks import random_networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.fixers.work import TEXT_TOKENS, BlockWork, check_device, run_block, steady_after
 from alpasim_plugin.nets.attention_kernels import Kernel, attention_kernel
 from alpasim_plugin.nets.graphs import GraphedFunction

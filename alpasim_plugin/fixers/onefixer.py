@@ -16,8 +16,9 @@ from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.base import FIXERS, BlockRule
 from alpasim_plugin.fixers.networks import LATENT, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
-from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
+from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState, no_clock
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
+from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import DOING, SIDE, Views, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE as LATENT_SIDE
 from alpasim_plugin.nets.clips import crop_clip
@@ -73,12 +74,19 @@ class OneFixer:
             torch.set_num_threads(threads)
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)
-        self.pipeline = BlockPipeline(self.networks, settings)
-        self.blocks = BlockRule.of_latents(settings.block_latents)
+        # On an accelerator a clock would wait for every stage and forbid recordings; there the block is timed as a whole.
+        self._clock = StageClock(device) if self.networks.device.type == "cpu" else None
+        self.pipeline = BlockPipeline(self.networks, settings, self._clock or no_clock)
+        self.blocks = BlockRule(1, 1) if settings.history == "none" else BlockRule.of_latents(settings.block_latents)
         self.trained = self.networks.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
         self.label = f"{settings.name}{at}, {self.networks.note}"
         self.reset(seed)
+
+    @property
+    def spent_ms(self) -> dict[str, float]:
+        """Wall time by stage since the session was made, milliseconds; sums that only grow. Empty where stages are not timed."""
+        return {} if self._clock is None else {name: self._clock.ms.get(name, 0.0) for name in TIMED}
 
     def reset(self, seed: int) -> None:
         """Forget all history and take the noise of another seed."""
@@ -141,7 +149,8 @@ class OneFixer:
     def _fix(self, view: Views, past: Past) -> Draft:
         clip = to_clip(view, self.blocks.frames(self._done), self.networks.device)
         shape = (LATENT, clip.rgb.shape[3] // LATENT_SIDE, clip.rgb.shape[4] // LATENT_SIDE)
-        latents = range(past.state.latent, past.state.latent + self.settings.block_latents)
+        first = self._done if self.settings.history == "none" else past.state.latent
+        latents = range(first, first + self.settings.block_latents)
         drawn = latent_noise(self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape)
         noise = [eps.to(self.networks.device) for eps in drawn]
         video, state = self.pipeline.run(past.state, clip.rgb, clip.alpha, clip.maps, noise)
@@ -155,8 +164,11 @@ class OneFixer:
 
     def _keep(self, draft: Draft) -> Past:
         poisoned = any(guard.NAN in events for events in draft.events)
-        state = self.pipeline.forget(draft.state) if poisoned else self.pipeline.keep(draft.state)
         view = draft.views
+        if self.settings.history == "none":
+            state = self._open(view).state
+        else:
+            state = self.pipeline.forget(draft.state) if poisoned else self.pipeline.keep(draft.state)
         return Past(view.cameras, view.shape, state, tuple(times[-1] for times in view.t_us), draft.images[:, -1], view.rgb[:, -1])
 
     def _frames(self, block: Sequence[Frame]) -> tuple[Frame, ...]:

@@ -13,13 +13,13 @@ from alpasim_plugin.fixers.networks import LATENT, Networks
 from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
 from alpasim_plugin.fixers.random_networks import random_networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.stage_clock import STAGES
 from alpasim_plugin.nets.clips import SIDE
 from alpasim_plugin.nets.op_ledger import Ledger, counting
 from alpasim_plugin.nets.precision import weight_bytes
 from alpasim_plugin.nets.roofline import Device, compute_floor_s, eager_floor_s
 
 TEXT_TOKENS = 512  # of the original's prompt
-STAGES = ("encode", "source", "dit", "decode", "cache write")
 HEADROOM = 1.15  # an allocator's rounding, libraries' workspaces
 CONTEXT_BYTES = 0.7e9  # what a process holds on a GPU before the first tensor
 

@@ -94,10 +94,11 @@ class Workshop:
         self.spent_ms[stage] = self.spent_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
 
     def _own_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """File what a fixer timed itself (sums that only grow) under names of their own, and the rest of its call under ``fix``."""
+        """File what a fixer timed itself (sums that only grow) as ``fix: STAGE``, and the rest of its call as ``fix``."""
         for stage, total_ms in after.items():
             part_ms = total_ms - before.get(stage, 0.0)
-            self.spent_ms[stage] = self.spent_ms.get(stage, 0.0) + part_ms
+            name = f"fix: {stage}"
+            self.spent_ms[name] = self.spent_ms.get(name, 0.0) + part_ms
             self.spent_ms["fix"] -= part_ms
 
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from alpasim_plugin.fixers import BlockFixer, make_fixer
 from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
-from alpasim_plugin.fixers.measure import Clip, StageClock
+from alpasim_plugin.fixers.measure import Clip
 from alpasim_plugin.fixers.onefixer import OneFixer
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.fixers.measure import STAGES, StageClock, measure
+from alpasim_plugin.fixers.measure import measure
+from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.stand_in import save_stand_in
 from alpasim_plugin.nets.checkpoints import load_weights
 from tests.fixers.fixer_cases import small_settings as settings
@@ -53,7 +54,7 @@ def test_a_measured_run_gives_the_images_of_an_unmeasured_one_and_a_time_per_blo
     plain = [frame.rgb for frames, maps in clip.blocks(fixer.blocks.frames) for frame in fixer.step(frames, maps)]
     assert np.array_equal(timing.images, np.stack(plain))
     assert len(timing.all_in) == 2  # one block of steady state, two passes
-    assert {name: len(ms) for name, ms in timing.stages.items()} == dict.fromkeys(STAGES, 2)
+    assert {name: len(ms) for name, ms in timing.stages.items()} == dict.fromkeys(TIMED, 2)
     assert all(ms > 0 for series in timing.stages.values() for ms in series)
     assert timing.first_ms > 0
     assert timing.load_ms > 0

@@ -14,7 +14,8 @@ from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.measure_block import measure_blocks
 from alpasim_plugin.fixers.pipeline import BlockPipeline
 from alpasim_plugin.fixers.random_networks import random_networks
-from alpasim_plugin.fixers.work import STAGES, all_weights, block_work, check_device, run_block
+from alpasim_plugin.fixers.stage_clock import STAGES
+from alpasim_plugin.fixers.work import all_weights, block_work, check_device, run_block
 from alpasim_plugin.nets import DiTSizes
 from alpasim_plugin.nets.op_ledger import counting
 from alpasim_plugin.nets.roofline import DEVICES, cache_bytes, device_of, forward_work

@@ -102,7 +102,9 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
     assert entry["foretold"] == 15 - 3
     assert 0 < entry["hits"] <= entry["foretold"]
     assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["foretold"], abs=1e-4)
-    assert {"render", "map", "fix"} <= set(summary["speed"]["onefixer+clean"]["stages"])
+    stages = summary["speed"]["onefixer+clean"]["stages"]
+    assert {"render", "map", "fix", "fix: encode", "fix: dit", "fix: decode", "fix: cache write"} <= set(stages)
+    assert sum(stage["share"] for stage in stages.values()) == pytest.approx(1.0, abs=0.001)
     steps = pq.read_table(finished / "steps.parquet").to_pylist()
     shown = [row["value"] for row in steps if row["metric"] == "pose_error_m"]
     assert len(shown) == entry["frames"]
