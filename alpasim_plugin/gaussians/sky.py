@@ -37,6 +37,11 @@ class Sky:
         # One column repeated at the seam: interpolation never leaves the image.
         self._panorama = np.ascontiguousarray(np.concatenate([panorama, panorama[:, :1]], axis=1))
 
+    @property
+    def panorama(self) -> F32:
+        """Return the directions' colours as given."""
+        return self._panorama[:, :-1]
+
     def image(self, camera: PinholeCamera) -> F32:
         """Return the sky behind every pixel, ``(H, W, 3)`` float32, 0..1."""
         h, w = camera.height, camera.width

@@ -1,0 +1,216 @@
+"""Fit Gaussians to posed views: the training loop of 3D Gaussian Splatting, readable from `fit` downwards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.fit.adam import RowAdam
+from alpasim_plugin.gaussians.fit.checkpoint import STATE_FILE, load_state, save_state
+from alpasim_plugin.gaussians.fit.density import ScreenGradients, densify, reset_opacities
+from alpasim_plugin.gaussians.fit.loss import image_loss, psnr_db
+from alpasim_plugin.gaussians.fit.model import Motion, SplatModel
+from alpasim_plugin.gaussians.fit.panorama import sky_of
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import Start
+from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.seeding import stream
+
+Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
+SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves
+
+
+def fit(
+    views: Sequence[PosedView],
+    start: Start | GaussianCloud,
+    recipe: SplatRecipe,
+    *,
+    scene_id: str = "",
+    folder: Path | None = None,
+    report: Report | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+) -> Reconstruction:
+    """Fit a background, and the actors that ``start`` holds, to posed views.
+
+    Args:
+        views: To train on, all of them; see `held_out`.
+        start: Gaussians to begin with: see `start_from_depth` and `cloud_from_points`. A cloud alone is a background without actors.
+        recipe: Amounts, rates and schedule.
+        scene_id: Key of the random streams, with ``recipe.seed``: order of views and splits.
+        folder: Receives checkpoints; the same call with the same folder continues, and ends with the same bits. None keeps none.
+        report: Called after every update with loss, psnr_db (of the training view just seen) and gaussians.
+        device: ``cpu``, or ``cuda`` through gsplat.
+        threads: Of the CPU rasteriser; None leaves it as it is.
+
+    Returns:
+        Background, actors and the sky that the views saw.
+
+    Raises:
+        InputError: No view, nothing to start from, or a folder begun with other views or another recipe.
+        InfrastructureError: The loss or a gradient is not finite; the folder keeps the state before it.
+    """
+    if not views:
+        raise InputError("fitting Gaussians", "no view", "nothing to learn from", "give at least one posed view")
+    begin = Start(start, {}) if isinstance(start, GaussianCloud) else start
+    if len(begin.background) == 0:
+        raise InputError("fitting Gaussians", "a start cloud", "no Gaussian in the background", "start from points that the views see")
+    run = SplatFit(views, begin, recipe, scene_id, device, threads, folder)
+    while run.step < recipe.steps:
+        numbers = run.update()
+        if report is not None:
+            report(run.step, numbers)
+        if folder is not None and (run.step % recipe.save_every == 0 or run.step == recipe.steps):
+            run.save()
+    background, actors = run.model.clouds()
+    return Reconstruction(background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """A view as the loop needs it; the camera is moved to the fit's frame."""
+
+    name: str
+    camera: PinholeCamera
+    rgb: Tensor  # (H, W, 3) 0..1
+    behind: Tensor | None  # (H, W, 3) sky
+    sky: Tensor | None  # (H, W) 0 or 1
+    counts: Tensor | None  # (H, W, 1) bool
+    motion: Motion
+
+
+class SplatFit:
+    """The state of one fit: Gaussians, moments, screen gradients and the number of updates made."""
+
+    def __init__(
+        self,
+        views: Sequence[PosedView],
+        start: Start,
+        recipe: SplatRecipe,
+        scene_id: str,
+        device: str,
+        threads: int | None,
+        folder: Path | None,
+    ) -> None:
+        centres = np.array([view.camera.centre_world for view in views])
+        origin = np.asarray(centres.mean(axis=0))
+        self.recipe, self.scene_id, self.threads, self.folder = recipe, scene_id, threads, folder
+        self.extent_m = max(1.1 * float(np.linalg.norm(centres - origin, axis=1).max()), SMALLEST_EXTENT_M)
+        self.sky = sky_of(views)
+        self.model = SplatModel.from_start(start, origin, recipe.sh_degree, device)
+        self.adam = RowAdam(self.model.params)
+        self.gradients = ScreenGradients(len(self.model), device)
+        self.step = 0
+        self.targets = [_target(view, self.model, self.sky, device) for view in views]
+        self._facts = json.dumps({"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)}, sort_keys=True)
+        if folder is not None and (folder / STATE_FILE).exists():
+            self._resume(folder)
+
+    def update(self) -> dict[str, float]:
+        """Learn from one view.
+
+        Raises:
+            InfrastructureError: The loss or a gradient is not finite.
+        """
+        target, recipe = self._next_view(), self.recipe
+        splats, rows = self.model.placed(target.motion, recipe.sh_size_at(self.step))
+        out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
+        rgb = out.rgb if target.counts is None else torch.where(target.counts, out.rgb, target.rgb)
+        loss = image_loss(rgb, target.rgb, recipe.ssim_weight)
+        if target.sky is not None:
+            loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
+        if not torch.isfinite(loss):
+            self._stop(target, f"loss {float(loss)}")
+        loss.backward()  # type: ignore[no-untyped-call]
+        for name, p in self.model.params.items():
+            if p.grad is not None and not torch.isfinite(p.grad.sum()):
+                self._stop(target, f"a gradient of {name} that is not finite")
+        assert out.screen.gradient_norm is not None  # the backward pass has run
+        self.gradients.add(rows, out.screen.gradient_norm, out.screen.radii, target.camera.width)
+        self.adam.update(self.model.params, self._rates())
+        self.step += 1
+        self._control_density()
+        return {"loss": float(loss.detach()), "psnr_db": psnr_db(rgb.clamp(0, 1), target.rgb), "gaussians": len(self.model)}
+
+    def save(self) -> None:
+        """Write the checkpoint, whole or not at all."""
+        assert self.folder is not None
+        save_state(self.folder, self.model, self.adam, self.gradients, self.step, self._facts)
+
+    def _resume(self, folder: Path) -> None:
+        self.step = load_state(folder, self.model, self.adam, self.gradients, self._facts)
+
+    def _next_view(self) -> _Target:
+        """Return the view of this step: all in a random order, then all in another."""
+        turn, i = divmod(self.step, len(self.targets))
+        return self.targets[int(stream(self.scene_id, self.recipe.seed, "fit.order", turn).permutation(len(self.targets))[i])]
+
+    def _rates(self) -> dict[str, float]:
+        r = self.recipe
+        return {
+            "means": r.lr_means_at(self.step) * self.extent_m, "log_scales": r.lr_scales, "quaternions": r.lr_quaternions,
+            "logit_opacities": r.lr_opacities, "sh_dc": r.lr_colour, "sh_rest": r.lr_colour / 20,
+        }  # fmt: skip
+
+    def _control_density(self) -> None:
+        if self.recipe.densifies_after(self.step):
+            rng = stream(self.scene_id, self.recipe.seed, "fit.split", self.step)
+            densify(self.model, self.adam, self.gradients, self.recipe, self.extent_m, rng)
+            self.gradients = ScreenGradients(len(self.model), self.model.node.device)
+        if self.recipe.resets_after(self.step):
+            reset_opacities(self.model, self.adam, self.recipe.reset_opacity)
+
+    def _stop(self, target: _Target, found: str) -> None:
+        if self.folder is not None:
+            self.save()
+        do = "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update"
+        raise InfrastructureError("fitting Gaussians", f"view {target.name!r}, update {self.step}", found, do)
+
+
+def _target(view: PosedView, model: SplatModel, sky: Sky | None, device: str) -> _Target:
+    camera = view.camera
+    T = camera.T_camera_world.copy()
+    T[:3, 3] += T[:3, :3] @ model.origin
+    behind = None if sky is None else torch.as_tensor(sky.image(camera), device=device)
+    return _Target(
+        view.name,
+        replace(camera, T_camera_world=T),
+        torch.as_tensor(view.rgb.astype(np.float32) / 255, device=device),
+        behind,
+        None if view.sky is None else torch.as_tensor(view.sky.astype(np.float32), device=device),
+        None if view.mask is None else torch.as_tensor(view.mask, device=device)[..., None],
+        model.motion(view.actors),
+    )
+
+
+def _digest(views: Sequence[PosedView], start: Start) -> str:
+    """Return what the result depends on besides the recipe."""
+    digest = hashlib.blake2b(digest_size=16)
+
+    def add(array: np.ndarray[Any, Any] | None) -> None:
+        digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+
+    for view in views:
+        for array in (view.rgb, view.camera.K, view.camera.T_camera_world, view.sky, view.mask):
+            add(array)
+        for name, T in sorted(view.actors.items()):
+            digest.update(name.encode())
+            add(T)
+    for cloud in (start.background, *(c for _, c in sorted(start.actors.items()))):
+        for part in (cloud.means, cloud.scales, cloud.sh):
+            add(part)
+    return digest.hexdigest()

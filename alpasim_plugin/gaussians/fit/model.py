@@ -1,0 +1,158 @@
+"""Hold the Gaussians that are fitted: a background and rigid actors, each in its own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.gaussians.arrays import logit
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.fit.start import Start
+from alpasim_plugin.gaussians.gradient_types import Splats
+from alpasim_plugin.gaussians.sh import SH_SIZES, sh_rotation
+from alpasim_plugin.geometry import quat_from_matrix
+from alpasim_plugin.types import F64
+
+NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh_dc", "sh_rest")
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Where the actors of one view are, as tensors by node: row 0 is the background, which stands still.
+
+    Attributes:
+        present: ``(M,)`` bool.
+        rotation: ``(M, 3, 3)``; identity where absent.
+        shift: ``(M, 3)`` metres, in the fit's frame.
+        quat: ``(M, 4, 4)``, the matrix that multiplies a quaternion from the left.
+        harmonics: ``(M, K, K)``, which turns colour coefficients with the actor.
+    """
+
+    present: Tensor
+    rotation: Tensor
+    shift: Tensor
+    quat: Tensor
+    harmonics: Tensor
+
+
+class SplatModel:
+    """The trainable state.
+
+    Attributes:
+        actors: Ids; node i + 1 is the i-th.
+        origin: ``(3,)`` world position that is zero in the fit: float32 means keep their digits wherever the scene lies.
+        params: Name (`NAMES`) to a leaf tensor with N rows: means in the node's frame, logarithms of scales, quaternions, logits of
+            opacity, constant and further colour coefficients.
+        node: ``(N,)`` the node of each Gaussian, ascending.
+    """
+
+    def __init__(self, actors: tuple[str, ...], origin: F64, params: Mapping[str, Tensor], node: Tensor) -> None:
+        self.actors, self.origin, self.node = actors, origin, node
+        self.params = {name: params[name].detach().requires_grad_() for name in NAMES}
+
+    @classmethod
+    def from_start(cls, start: Start, origin: F64, sh_degree: int, device: str = "cpu") -> SplatModel:
+        """Take over a start's Gaussians; their colours are padded or cut to the degree."""
+        names = tuple(sorted(start.actors))
+        clouds = [start.background, *(start.actors[name] for name in names)]
+        moved = [clouds[0].means - origin, *(c.means for c in clouds[1:])]
+        joined, size = GaussianCloud.concatenate(clouds), SH_SIZES[sh_degree]
+        sh = np.zeros((len(joined), size, 3))
+        have = min(size, joined.sh.shape[1])
+        sh[:, :have] = joined.sh[:, :have]
+        arrays = {
+            "means": np.concatenate(moved), "log_scales": np.log(joined.scales), "quaternions": joined.quats,
+            "logit_opacities": logit(joined.opacities), "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:],
+        }  # fmt: skip
+        node = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
+        tensors = {name: torch.as_tensor(np.array(a, dtype=np.float32), device=device) for name, a in arrays.items()}
+        return cls(names, origin, tensors, torch.as_tensor(node, device=device))
+
+    def __len__(self) -> int:
+        """Return N."""
+        return len(self.node)
+
+    def motion(self, poses: Mapping[str, F64]) -> Motion:
+        """Turn a view's actor poses ``T_world_box`` into tensors."""
+        m, size = len(self.actors) + 1, 1 + self.params["sh_rest"].shape[1]
+        present, T = np.zeros(m, dtype=bool), np.tile(np.eye(4), (m, 1, 1))
+        quat, harmonics = np.tile(np.eye(4), (m, 1, 1)), np.tile(np.eye(size), (m, 1, 1))
+        present[0] = True
+        for i, name in enumerate(self.actors, start=1):
+            if name in poses:
+                present[i], T[i] = True, poses[name]
+                T[i, :3, 3] -= self.origin
+                quat[i], harmonics[i] = _left_product(quat_from_matrix(T[i, :3, :3])), _harmonics(T[i, :3, :3].tobytes(), size)
+        device = self.node.device
+        tensors = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics))
+        return Motion(torch.as_tensor(present, device=device), *tensors)
+
+    def placed(self, motion: Motion, sh_size: int) -> tuple[Splats, Tensor]:
+        """Move every node to its place.
+
+        Args:
+            motion: Of the view.
+            sh_size: How many colour coefficients are in use.
+
+        Returns:
+            Gaussians in the fit's frame (world minus origin), with graph; and the row of the model that each is, ``(M,)``.
+        """
+        p = self.params
+        still = int(torch.searchsorted(self.node, 1))
+        sh = torch.cat([p["sh_dc"], p["sh_rest"][:, : sh_size - 1]], dim=1) if sh_size > 1 else p["sh_dc"]
+        moving = still + torch.nonzero(motion.present[self.node[still:]])[:, 0]
+        if not len(moving):
+            rows = torch.arange(still, device=self.node.device)
+            return Splats(*(t[:still] for t in (p["means"], p["log_scales"], p["quaternions"], p["logit_opacities"], sh))), rows
+        node = self.node[moving]
+        means = torch.einsum("nij,nj->ni", motion.rotation[node], p["means"][moving]) + motion.shift[node]
+        quats = torch.einsum("nij,nj->ni", motion.quat[node], p["quaternions"][moving])
+        turned = torch.einsum("njk,nkc->njc", motion.harmonics[node, :sh_size, :sh_size], sh[moving])
+        splats = Splats(
+            torch.cat([p["means"][:still], means]),
+            torch.cat([p["log_scales"][:still], p["log_scales"][moving]]),
+            torch.cat([p["quaternions"][:still], quats]),
+            torch.cat([p["logit_opacities"][:still], p["logit_opacities"][moving]]),
+            torch.cat([sh[:still], turned]),
+        )
+        return splats, torch.cat([torch.arange(still, device=moving.device), moving])
+
+    def clouds(self) -> tuple[GaussianCloud, dict[str, GaussianCloud]]:
+        """Return the background in world coordinates and each actor in its box frame, as ordinary clouds; actors without Gaussians too."""
+        p = {name: t.detach().cpu().double().numpy() for name, t in self.params.items()}
+        sh = np.concatenate([p["sh_dc"], p["sh_rest"]], axis=1).astype(np.float32)
+        first = np.searchsorted(self.node.cpu().numpy(), np.arange(len(self.actors) + 2))
+        out: list[GaussianCloud] = []
+        for low, high in pairwise(first.tolist()):
+            part = slice(low, high)
+            opacities = 1 / (1 + np.exp(-p["logit_opacities"][part]))
+            shift = 0.0 if out else self.origin
+            cloud, _ = GaussianCloud.cleaned(
+                p["means"][part] + shift, p["quaternions"][part], np.exp(p["log_scales"][part]).astype(np.float32),
+                opacities.astype(np.float32), sh[part],
+            )  # fmt: skip
+            out.append(cloud)
+        return out[0], dict(zip(self.actors, out[1:], strict=True))
+
+
+def _left_product(q: F64) -> F64:
+    """Return the matrix ``(4, 4)`` whose product with a wxyz quaternion is the Hamilton product q times it."""
+    w, x, y, z = q
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+
+
+@lru_cache(maxsize=100_000)
+def _harmonics(rotation: bytes, size: int) -> F64:
+    """Return the block-diagonal matrix ``(size, size)`` that turns colour coefficients; kept, because every view comes again."""
+    R = np.frombuffer(rotation).reshape(3, 3)
+    out = np.eye(size)
+    for degree in range(1, SH_SIZES.index(size) + 1):
+        band = slice(degree * degree, (degree + 1) ** 2)
+        out[band, band] = sh_rotation(R, degree)
+    return out

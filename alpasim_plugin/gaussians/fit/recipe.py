@@ -1,0 +1,127 @@
+"""Say how a reconstruction is fitted: amounts, rates and schedule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from alpasim_plugin.errors import InputError
+
+
+@dataclass(frozen=True)
+class SplatRecipe:
+    """How Gaussians are fitted to posed views.
+
+    Rates are those of 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 5 and its published code); the schedule is theirs as shares of the
+    steps, because a CPU takes hundreds of steps where they take 30,000.
+
+    Attributes:
+        steps: Updates; each sees one view.
+        views: Views rendered from a scenario's log; those held out are among them.
+        width: Pixels across of rendered views; their height follows from the camera.
+        points: Gaussians of the background at the start, drawn from the views' depth.
+        actor_points: Most Gaussians of an actor at the start.
+        cap: Most Gaussians; densification stops there, the largest screen gradients first.
+        hold_out_every: Every such view is kept for measuring (the eighth, as is usual); 0 trains on all.
+        sh_degree: Highest degree of view-dependent colour, reached by one degree every ``sh_share`` of the steps.
+        sh_share: See ``sh_degree``.
+        lr_means: Rate of the centres at the start, in scene extents; falls exponentially to ``lr_means_end``.
+        lr_means_end: See ``lr_means``.
+        lr_scales: Rate of the scales' logarithms.
+        lr_quaternions: Rate of the rotations.
+        lr_opacities: Rate of the opacities' logits.
+        lr_colour: Rate of the constant colour; view-dependent coefficients get a twentieth.
+        ssim_weight: Share of 1 - SSIM in the image loss, the rest is the mean absolute error.
+        sky_weight: Weight of opacity where a view shows sky.
+        densify_from: Share of the steps after which Gaussians are cloned and split.
+        densify_until: Share of the steps until which they are.
+        densify_every: Steps in between; 0 never densifies or prunes.
+        densify_gradient: Mean norm of the loss's gradient by a Gaussian's place on the screen, in half image widths, above which it is
+            densified.
+        dense_share: Gaussians larger than this share of the extent are split, others cloned.
+        prune_opacity: Gaussians fainter than this are removed whenever Gaussians are densified.
+        prune_share: Gaussians larger than this share of the extent are removed as well.
+        reset_every: Share of the steps after which opacities are lowered to ``reset_opacity``, until ``densify_until``; 0 never.
+        reset_opacity: See ``reset_every``.
+        save_every: Steps between checkpoints.
+        seed: Of the start, the order of views and the splits.
+
+    Raises:
+        InputError: A number outside its range.
+    """
+
+    steps: int = 500
+    views: int = 100
+    width: int = 256
+    points: int = 20_000
+    actor_points: int = 400
+    cap: int = 30_000
+    hold_out_every: int = 8
+    sh_degree: int = 2
+    sh_share: float = 0.25
+    lr_means: float = 1.6e-4
+    lr_means_end: float = 1.6e-6
+    lr_scales: float = 5e-3
+    lr_quaternions: float = 1e-3
+    lr_opacities: float = 0.05
+    lr_colour: float = 2.5e-3
+    ssim_weight: float = 0.2
+    sky_weight: float = 0.05
+    densify_from: float = 0.1
+    densify_until: float = 0.6
+    densify_every: int = 25
+    densify_gradient: float = 2e-4
+    dense_share: float = 0.01
+    prune_opacity: float = 0.005
+    prune_share: float = 0.1
+    reset_every: float = 0.0
+    reset_opacity: float = 0.01
+    save_every: int = 250
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checks = {
+            "steps": self.steps >= 1, "views": self.views >= 1, "width": self.width >= 16, "points": self.points >= 1,
+            "cap": self.cap >= 1, "hold_out_every": self.hold_out_every == 0 or self.hold_out_every >= 2,
+            "sh_degree": 0 <= self.sh_degree <= 3, "ssim_weight": 0 <= self.ssim_weight <= 1, "save_every": self.save_every >= 1,
+            "densify_every": self.densify_every >= 0, "sh_share": self.sh_share >= 0,
+        }  # fmt: skip
+        for name, good in checks.items():
+            if not good:
+                found = f"{name}={getattr(self, name)}"
+                raise InputError("reading a recipe", found, "outside its range", "see SplatRecipe for what it means")
+
+    @classmethod
+    def full(cls) -> SplatRecipe:
+        """Return the recipe of a reconstruction as good as some minutes on two cores allow."""
+        return cls(steps=2000, points=20_000, cap=40_000, reset_every=0.3)
+
+    @classmethod
+    def under_trained(cls, seed: int = 0) -> SplatRecipe:
+        """Return the recipe of an under-trained reconstruction (paper, App. A): few Gaussians and views, stopped early.
+
+        Recognisable as the scene on the logged path: soft, without thin things, with floaters; holes and needles beside it.
+        """
+        return cls(
+            steps=200, views=60, points=9_000, cap=12_000, hold_out_every=0, sh_degree=1, densify_until=0.8, densify_every=30, seed=seed
+        )
+
+    def lr_means_at(self, step: int) -> float:
+        """Return the rate of the centres at a step, in scene extents."""
+        t = min(step / self.steps, 1.0)
+        return float(self.lr_means ** (1 - t) * self.lr_means_end**t)
+
+    def sh_size_at(self, step: int) -> int:
+        """Return how many colour coefficients are in use at a step."""
+        every = self.sh_share * self.steps
+        degree = self.sh_degree if every <= 0 else min(self.sh_degree, int(step / every))
+        return (degree + 1) ** 2
+
+    def densifies_after(self, done: int) -> bool:
+        """Tell whether Gaussians are densified and pruned when ``done`` updates are made."""
+        inside = self.densify_from * self.steps < done <= self.densify_until * self.steps
+        return inside and self.densify_every > 0 and done % self.densify_every == 0
+
+    def resets_after(self, done: int) -> bool:
+        """Tell whether opacities are lowered when ``done`` updates are made."""
+        every = round(self.reset_every * self.steps)
+        return every > 0 and done % every == 0 and done <= self.densify_until * self.steps

@@ -1,0 +1,130 @@
+"""Draw the Gaussians that a fit starts from: sparse, noisy surface points.
+
+Published fits start from LiDAR returns (driving) or structure-from-motion points. Rendered views carry depth; points sampled from it,
+evenly over the image, with a range error along the ray, stand for LiDAR returns accumulated over the drive. Returns inside an actor's box
+are carried to the actor's frame and belong to it, as in Street Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.sh import dc_from_rgb
+from alpasim_plugin.geometry import inverse, transform_points
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F64, Bool, Box
+
+RANGE_ERROR_M, RANGE_ERROR_SHARE = 0.03, 0.004  # spread of a point along its ray: fixed, and by distance
+BOX_MARGIN_M = 0.1  # points this far outside an actor's sides still belong to it; below, its box ends this far above the ground
+START_OPACITY = 0.1
+SMALLEST_M, LARGEST_M = 0.01, 3.0
+FEWEST_POINTS = 4  # an actor seen less often gets no model
+DENSER = 8  # an actor's points are sampled this many times as densely as the background, because they are few and seen from near
+
+_Points = tuple[F64, F64]  # (N, 3) places, metres; (N, 3) colours 0..1
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What a fit begins with.
+
+    Attributes:
+        background: World coordinates.
+        actors: Actor id to Gaussians in its box frame.
+    """
+
+    background: GaussianCloud
+    actors: Mapping[str, GaussianCloud]
+
+
+def start_from_depth(
+    views: Sequence[PosedView], boxes: Mapping[str, Box], count: int, scene_id: str, seed: int, actor_points: int = 400
+) -> Start:
+    """Sample ``count`` surface points from the views' depth, and more on actors.
+
+    Args:
+        views: With depth.
+        boxes: Size of each actor that a view may show.
+        count: Points of the background, shared evenly by the views.
+        scene_id, seed: Key of the sample.
+        actor_points: Most points of an actor.
+
+    Raises:
+        InputError: No view has depth.
+    """
+    owned: dict[str, list[_Points]] = {name: [] for name in sorted(boxes)}
+    rest: list[_Points] = []
+    for i, view in enumerate(views):
+        share = count * (i + 1) // len(views) - count * i // len(views)
+        points, rgb = _sample(view, DENSER * share, stream(scene_id, seed, "fit.start", i))
+        free = np.ones(len(points), dtype=bool)
+        for actor_id in sorted(set(view.actors) & set(boxes)):
+            local = transform_points(inverse(view.actors[actor_id]), points)
+            mine = free & _inside(local, boxes[actor_id])
+            owned[actor_id].append((local[mine], rgb[mine]))
+            free &= ~mine
+        free[share:] = False  # the sample is in random order: its first part is a sample too
+        rest.append((points[free], rgb[free]))
+    if not sum(len(points) for points, _ in rest):
+        do = "give views with depth, or a file of points to start from"
+        raise InputError("drawing a start cloud", f"{len(views)} views", "no pixel with depth", do)
+    actors = {}
+    for name, pieces in owned.items():
+        points, rgb = _thinned(pieces, actor_points, stream(scene_id, seed, f"fit.start.{name}"))
+        if len(points) >= FEWEST_POINTS:
+            actors[name] = cloud_from_points(points, rgb)
+    return Start(cloud_from_points(*_joined(rest)), actors)
+
+
+def cloud_from_points(points: F64, rgb: F64) -> GaussianCloud:
+    """Return round Gaussians at points ``(N, 3)`` of colours ``(N, 3)`` 0..1, as large as the mean distance to their three neighbours.
+
+    Size and opacity (0.1) at the start are those of 3D Gaussian Splatting.
+    """
+    n = len(points)
+    if n > 1:
+        distance, _ = KDTree(points).query(points, k=min(4, n))
+        size = np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1)).clip(SMALLEST_M, LARGEST_M)
+    else:
+        size = np.full(n, LARGEST_M / 10)
+    quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    return GaussianCloud(points, quats, np.repeat(size[:, None], 3, axis=1), np.full(n, START_OPACITY), dc_from_rgb(rgb)[:, None, :])
+
+
+def _sample(view: PosedView, count: int, rng: np.random.Generator) -> _Points:
+    """Return points in random order, ``(n, 3)``, world, and their colours ``(n, 3)``."""
+    if view.depth is None:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    good = (view.depth > 0) & (True if view.mask is None else view.mask)
+    pixels = np.flatnonzero(good)
+    pixels = pixels[rng.permutation(len(pixels))[:count]]
+    rows, columns = np.divmod(pixels, view.camera.width)
+    z = view.depth[rows, columns].astype(np.float64)
+    z += rng.standard_normal(len(z)) * (RANGE_ERROR_M + RANGE_ERROR_SHARE * z)
+    camera = view.camera
+    local = np.stack([(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
+    return transform_points(inverse(camera.T_camera_world), local), view.rgb[rows, columns] / 255.0
+
+
+def _joined(parts: Sequence[_Points]) -> _Points:
+    none = np.zeros((0, 3))
+    return np.concatenate([none, *(points for points, _ in parts)]), np.concatenate([none, *(rgb for _, rgb in parts)])
+
+
+def _thinned(parts: Sequence[_Points], most: int, rng: np.random.Generator) -> _Points:
+    points, rgb = _joined(parts)
+    chosen = rng.permutation(len(points))[:most]
+    return points[chosen], rgb[chosen]
+
+
+def _inside(local: F64, box: Box) -> Bool:
+    half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + BOX_MARGIN_M
+    above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
+    return np.asarray(np.all(np.abs(local) <= half, axis=1) & above_ground)

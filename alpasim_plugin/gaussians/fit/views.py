@@ -1,0 +1,111 @@
+"""Hold posed views, and take them from a scene along a log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.degrade import log_actors
+from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.types import F32, F64, Bool, CameraSpec, Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class PosedView:
+    """One image of which it is known from where it was taken.
+
+    Attributes:
+        camera: From where.
+        rgb: ``(H, W, 3)`` uint8 sRGB.
+        name: For messages and file names.
+        sky: ``(H, W)`` bool, where the image shows sky; None where that is unknown.
+        mask: ``(H, W)`` bool, which pixels count (not the bonnet, say); None counts all.
+        depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; only the start cloud reads it.
+        actors: Actor id to ``T_world_box (4, 4)`` of the actors present.
+
+    Raises:
+        InputError: An array does not have the camera's size.
+    """
+
+    camera: PinholeCamera
+    rgb: npt.NDArray[np.uint8]
+    name: str = "view"
+    sky: Bool | None = None
+    mask: Bool | None = None
+    depth: F32 | None = None
+    actors: Mapping[str, F64] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        wanted = {"rgb": (*size, 3), "sky": size, "mask": size, "depth": size}
+        for name, shape in wanted.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise InputError(
+                    "building a posed view", f"{self.name!r}, {name}", f"shape {value.shape}, the camera has {shape}",
+                    "give images of the camera's size",
+                )  # fmt: skip
+
+
+def scaled_camera(spec: CameraSpec, T_world_camera: F64, width: int) -> PinholeCamera:
+    """Return a rig's camera at a pose with at most ``width`` pixels across, its view unchanged."""
+    scale = min(1.0, width / spec.width)
+    w, h = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
+    K = spec.K.copy()
+    K[0] *= w / spec.width
+    K[1] *= h / spec.height
+    return PinholeCamera.from_pose(w, h, K, T_world_camera)
+
+
+def view_times(scenario: Scenario, count: int) -> list[int]:
+    """Return at most ``count`` times spread evenly over the log, both ends included: actors move while the ego stands."""
+    log = scenario.ego_log.t_us
+    return [int(t) for t in np.unique(np.linspace(log[0], log[-1], max(1, count)).round().astype(np.int64))]
+
+
+def logged_views(
+    scenario: Scenario, scene: SceneGraph, count: int, width: int, *, aside_m: float = 0.0, threads: int | None = None
+) -> list[PosedView]:
+    """Render what the scenario's cameras see along its log.
+
+    Args:
+        scenario: The log, the cameras and the actors' tracks.
+        scene: What is there to see: the scene as built, or another model of it.
+        count: Views in all; several cameras share them.
+        width: Pixels across.
+        aside_m: Moves the rig to its left (paper, App. A, cycle render); 0 stays on the log.
+        threads: Of the rasteriser.
+
+    Returns:
+        Views with sky, depth and actors; in order of time, the cameras of an instant together. Where the scene's opacity is below one half
+        the view shows sky: that stands for the segmentation which recorded images need.
+    """
+    shift = np.eye(4)
+    shift[1, 3] = aside_m
+    views = []
+    for t_us in view_times(scenario, count // max(1, len(scenario.cameras))):
+        T_world_rig, actors = interpolate(scenario.ego_log, t_us) @ shift, log_actors(scenario, t_us)
+        for spec in scenario.cameras:
+            camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, width)
+            views.append(seen_from(camera, scene, actors, f"{spec.name}-{t_us}", threads))
+    return views
+
+
+def seen_from(camera: PinholeCamera, scene: SceneGraph, actors: Mapping[str, F64], name: str, threads: int | None = None) -> PosedView:
+    """Render one view with its sky and depth."""
+    out = scene.render(camera, actors, threads)
+    return PosedView(camera, out.to_uint8(), name, out.alpha <= 0.5, None, np.where(out.alpha > 0.5, out.depth, 0), dict(actors))
+
+
+def held_out(views: Sequence[PosedView], every: int) -> tuple[list[PosedView], list[PosedView]]:
+    """Split views into those to train on and those to measure with: the middle one of every ``every``; 0 holds none out."""
+    if every == 0:
+        return list(views), []
+    chosen = {i for i in range(len(views)) if i % every == every // 2}
+    return [v for i, v in enumerate(views) if i not in chosen], [views[i] for i in sorted(chosen)]
