@@ -1,0 +1,46 @@
+"""``simrun train perceptual``: the frozen feature network behind `perceptual-syn`."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import torch
+import typer
+from rich.console import Console
+
+from alpasim_plugin.nets.perceptual import NAME
+from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.perceptual import PerceptualRecipe, PerceptualTask
+from alpasim_plugin.training.trainer import Schedule, Trainer
+
+EPILOG = "Example: `simrun train perceptual data/pairs --out runs/perceptual --steps 2400`"
+
+
+def perceptual(
+    data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames and maps of its split train are learned from.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 2400,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and draws.")] = 0,
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
+) -> None:
+    """Train the feature network of the perceptual distance; writes OUT/perceptual-syn.safetensors with averaged weights, float16."""
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+    task = PerceptualTask(PairDataset(data, "train").sequences, PerceptualRecipe(seed=seed))
+    schedule = Schedule(steps, peak_lr=2e-3, ema=0.998, save_every=100)
+    trainer = Trainer(task.module, out, schedule, task.batch, task.loss, task.facts)
+    console, began = Console(stderr=True), time.time()
+
+    def report(step: int, numbers: object) -> None:
+        if step % 50 == 0 or step == steps:
+            console.print(f"{step}/{steps} {time.time() - began:.0f} s {json.dumps(numbers)}")
+
+    trainer.run(report)
+    task.module.load_state_dict(trainer.averaged())
+    path = out / f"{NAME}.safetensors"
+    task.module.net.save(path, {"made_by": "simrun train perceptual", "steps": str(steps), "seed": str(seed)})
+    console.print(f"wrote {path}")

@@ -1,0 +1,61 @@
+"""Perceptual distances by name: `perceptual-syn`, which comes with the package, and LPIPS, whose weights are the user's."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal, Protocol, get_args
+
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.lpips import Kind, load_lpips, missing_files
+from alpasim_plugin.nets.perceptual import NAME, load_perceptual
+
+DistanceName = Literal["perceptual-syn", "lpips_alex", "lpips_vgg"]
+FOLDER_VARIABLE = "SIMRUN_METRIC_WEIGHTS"
+_KINDS: dict[str, Kind] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
+
+
+class PictureDistance(Protocol):
+    """A frozen network that says how far apart pictures look."""
+
+    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return ``(B,)`` for pictures ``(B, 3, H, W)`` in [-1, 1]."""
+        ...
+
+
+def weights_folder(folder: str | Path | None = None) -> Path | None:
+    """Return the folder of metric weights: the given one, else what ``SIMRUN_METRIC_WEIGHTS`` names, else None."""
+    named = folder or os.environ.get(FOLDER_VARIABLE)
+    return Path(named) if named else None
+
+
+def available(folder: str | Path | None = None) -> tuple[DistanceName, ...]:
+    """Return the names of the distances whose weights are on disk."""
+    found = weights_folder(folder)
+    names: tuple[DistanceName, ...] = get_args(DistanceName)
+    return tuple(name for name in names if name == NAME or (found is not None and not missing_files(_KINDS[name], found)))
+
+
+def load_distance(name: str, folder: str | Path | None = None) -> PictureDistance:
+    """Load a distance by name, frozen.
+
+    Raises:
+        InputError: Unknown name, no folder of weights, or weights that are missing or changed.
+    """
+    if name == NAME:
+        return load_perceptual()
+    if name not in _KINDS:
+        raise InputError("choosing a perceptual distance", f"name {name!r}", "no such distance", f"choose one of {get_args(DistanceName)}")
+    found = weights_folder(folder)
+    if found is None:
+        do = f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/video-metrics.md, or use {NAME}"
+        raise InputError("loading LPIPS", name, "no folder of weights is named", do)
+    return load_lpips(_KINDS[name], found)
+
+
+def distance_for_training(folder: str | Path | None = None) -> tuple[DistanceName, PictureDistance]:
+    """Return LPIPS with VGG where its weights are on disk, else `perceptual-syn`, with the name that must stand beside every result."""
+    name: DistanceName = "lpips_vgg" if "lpips_vgg" in available(folder) else "perceptual-syn"
+    return name, load_distance(name, folder)
