@@ -15,7 +15,7 @@ from evaluators.aggregate.censoring import censoring
 from evaluators.aggregate.paired import paired
 from evaluators.aggregate.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
 from evaluators.aggregate.summary import aggregate
-from evaluators.base import EVALUATORS, score
+from evaluators.base import EVALUATORS, EVALUATORS_VERSION, score
 from evaluators.collision import ContactEvent, contact_events
 from evaluators.metrics import METRICS, MetricInfo
 from evaluators.presets import PRESETS, Preset, preset
@@ -25,6 +25,7 @@ _BUILTIN = (_collision, _offroad, _route, _plan, _image_health)
 
 __all__ = [
     "EVALUATORS",
+    "EVALUATORS_VERSION",
     "METRICS",
     "PRESETS",
     "ContactEvent",

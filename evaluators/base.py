@@ -16,6 +16,7 @@ from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset
 
 EVALUATORS: Registry[Evaluator] = Registry("evaluator", "simrun.evaluators")
+EVALUATORS_VERSION = 1  # raise with every change of an evaluator, a preset or a reduction that can change a number
 
 
 def score(rollout: RolloutLog, scene: Scene, preset: str | Preset = "paper") -> list[MetricSeries]:

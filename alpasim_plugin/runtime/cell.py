@@ -22,6 +22,7 @@ from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
 from alpasim_plugin.types import Policy, Renderer, Scenario
+from evaluators import EVALUATORS_VERSION
 from policies import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
@@ -102,7 +103,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of
 
 
 def rescore_cell(cell: Cell, options: RunOptions, root: Path) -> dict[str, Any]:
-    """Score a finished rollout again under another preset, from its log alone."""
+    """Score a finished rollout again, under another preset or by newer evaluators, from its log alone."""
     folder = root / cell.folder
     manifest: dict[str, Any] = read_json(folder / MANIFEST)
     manifest |= _score(folder, cell, options, _scenario(cell.ref))
@@ -127,7 +128,8 @@ def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) ->
     scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset)
     keys = {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed}
     write_table(folder / "steps.parquet", [keys | row for row in scored.steps], STEPS_SCHEMA)
-    return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
+    scores = {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
+    return scores | {"evaluators_version": EVALUATORS_VERSION}
 
 
 @lru_cache(maxsize=4)

@@ -25,7 +25,7 @@ from alpasim_plugin.runtime.compose import card_of
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.past import PastRollout
-from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, digest
+from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, digest, score_key
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.run import RunResult, write_run_info
 from alpasim_plugin.runtime.store import read_json, write_json
@@ -88,7 +88,7 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     fork = Cell(
         change.label, past.cell.policy, past.cell.scene, past.cell.seed, past.cell.ref, digest([past.cell.rollout_key, asdict(change)]), ""
     )
-    fork = replace(fork, score_key=digest([fork.rollout_key, options.preset]))
+    fork = replace(fork, score_key=score_key(fork.rollout_key, options.preset))
     threads = thread_budget(1, 1)
     at_us = past.scenario.start_us + change.after_us
     manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, change))

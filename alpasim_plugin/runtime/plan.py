@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.compose import card_of, parse_renderer
 from alpasim_plugin.types import Scenario
+from evaluators import EVALUATORS_VERSION
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
@@ -67,8 +68,8 @@ class RunPlan:
 
     @property
     def key(self) -> str:
-        """Give a short hash of all cells and options: the same command has the same key."""
-        return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
+        """Give a short hash of all rollouts and options: the same command has the same key, however its logs are scored by now."""
+        return digest([[cell.rollout_key for cell in self.cells], asdict(self.options)])[:12]
 
 
 def make_plan(
@@ -115,9 +116,14 @@ def make_plan(
                 for seed in seeds:
                     shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
                     rollout_key = digest([*shaped_by, cards[renderer].as_dict()] if renderer in cards else shaped_by)
-                    score_key = digest([rollout_key, options.preset])
-                    cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], rollout_key, score_key))
+                    keys = rollout_key, score_key(rollout_key, options.preset)
+                    cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], *keys))
     return RunPlan(tuple(cells), scenarios, tuple(renderers), tuple(policies), tuple(seeds), options, cards)
+
+
+def score_key(rollout_key: str, preset: str) -> str:
+    """Return the content key of a rollout's scores: another preset or other evaluators give another one."""
+    return digest([rollout_key, preset, EVALUATORS_VERSION])
 
 
 def digest(value: object) -> str:
