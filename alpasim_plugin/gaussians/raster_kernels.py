@@ -27,12 +27,12 @@ CUT = _f((np.log2(ALPHA_MIN) + 4.0) / 8.0)
 _ALPHA_MAX = _f(ALPHA_MAX)
 _STOP = _f(TRANSMITTANCE_STOP)
 # Columns of a block's state, sixteen pixels each. A finished pixel keeps its transmittance with the sign turned.
-_T, _R, _G, _B, _D = 0, 16, 32, 48, 64
-_STATE = 80
+STATE_T, STATE_R, STATE_G, STATE_B, STATE_D = 0, 16, 32, 48, 64
+STATE = 80
 
 
 @njit(cache=True, nogil=True)
-def _start_tile(state, tile_x, tile_y, width, height):
+def start_tile(state, tile_x, tile_y, width, height):
     """Reset the state of a tile and return the bit mask of blocks that hold a pixel of the image."""
     live = 0
     state[:] = _f(0.0)
@@ -41,67 +41,89 @@ def _start_tile(state, tile_x, tile_y, width, height):
             x = tile_x * TILE + (block & 3) * 4 + (pixel & 3)
             y = tile_y * TILE + (block >> 2) * 4 + (pixel >> 2)
             inside = x < width and y < height
-            state[block * _STATE + _T + pixel] = _f(1.0) if inside else _f(-1.0)
+            state[block * STATE + STATE_T + pixel] = _f(1.0) if inside else _f(-1.0)
             if inside:
                 live |= 1 << block
     return live
 
 
 @njit(cache=True, nogil=True)
-def _composite_tile(lists, start, end, records, x0, y0, state, live):
-    """Blend a tile's splats in order; ``x0, y0`` is the centre of its first pixel. Returns how many splats were looked at."""
+def touched_blocks(records, at, dx, dy):
+    """Return the bit mask of the sixteen blocks that a splat can touch; ``dx, dy`` is the tile's first pixel from the splat's centre."""
+    nil, four, middle = _f(0.0), _f(4.0), _f(1.5)
+    l11, l12, l22 = records[at + L11], records[at + L12], records[at + L22]
+    s = v.splat(l11 * dx + l12 * dy + middle * (l11 + l12)) + v.lane_pattern(four * l11, four * l12)
+    t = v.splat(l22 * dy + middle * l22) + v.lane_pattern(nil, four * l22)
+    touched = v.fma(s, s, t * t) <= v.splat(records[at + BLOCK_REACH])
+    x = v.splat(dx + middle) + v.lane_pattern(four, nil)
+    y = v.splat(dy + middle) + v.lane_pattern(nil, four)
+    touched = touched & (v.absolute(x) <= v.splat(records[at + RADIUS_X] + middle))
+    touched = touched & (v.absolute(y) <= v.splat(records[at + RADIUS_Y] + middle))
+    return v.bits(touched)
+
+
+@njit(cache=True, nogil=True)
+def block_coordinates(records, at, dx, dy, block):
+    """Return ``s`` and ``t`` at the sixteen pixels of a block: the splat's exponent is ``peak - s^2 - t^2``."""
+    l11, l12, l22 = records[at + L11], records[at + L12], records[at + L22]
+    column, row = _f(_f(4.0) * _f(block & 3)), _f(_f(4.0) * _f(block >> 2))
+    s = v.splat(l11 * dx + l12 * dy + l11 * column + l12 * row) + v.lane_pattern(l11, l12)
+    t = v.splat(l22 * dy + l22 * row) + v.lane_pattern(_f(0.0), l22)
+    return s, t
+
+
+@njit(cache=True, nogil=True)
+def falloff(y):
+    """Return ``2^(8 y - 4)``, the opacity at an exponent between the cut and 0.5, not yet held to the largest alpha."""
+    p = v.fma(v.splat(P5), y, v.splat(P4))
+    p = v.fma(p, y, v.splat(P3))
+    p = v.fma(p, y, v.splat(P2))
+    p = v.fma(p, y, v.splat(P1))
+    p = v.fma(p, y, v.splat(P0))
+    p = p * p
+    p = p * p
+    return p * p
+
+
+@njit(cache=True, nogil=True)
+def composite_tile(lists, start, end, records, x0, y0, state, live, last):
+    """Blend a tile's splats in order; ``x0, y0`` is the centre of its first pixel. Returns how many splats were looked at.
+
+    ``last`` is None, or takes per pixel (sixteen a block) the position in the tile's list of the last splat drawn there.
+    """
     zero = v.splat(_f(0.0))
-    nil, four = _f(0.0), _f(4.0)
-    block_x = v.lane_pattern(four, nil)
-    block_y = v.lane_pattern(nil, four)
     for i in range(start, end):
         v.prefetch(records, np.int64(lists[min(i + 8, end - 1)]) * RECORD)
         at = np.int64(lists[i]) * RECORD
         dx, dy = x0 - records[at + U], y0 - records[at + V]
-        l11, l12, l22 = records[at + L11], records[at + L12], records[at + L22]
-        s0, t0 = l11 * dx + l12 * dy, l22 * dy
-        middle = _f(1.5)
-        s = v.splat(s0 + middle * (l11 + l12)) + v.lane_pattern(four * l11, four * l12)
-        t = v.splat(t0 + middle * l22) + v.lane_pattern(nil, four * l22)
-        touched = v.fma(s, s, t * t) <= v.splat(records[at + BLOCK_REACH])
-        touched = touched & (v.absolute(v.splat(dx + middle) + block_x) <= v.splat(records[at + RADIUS_X] + middle))
-        touched = touched & (v.absolute(v.splat(dy + middle) + block_y) <= v.splat(records[at + RADIUS_Y] + middle))
-        todo = v.bits(touched) & live
+        todo = touched_blocks(records, at, dx, dy) & live
         if todo == 0:
             continue
-        pattern_s = v.lane_pattern(l11, l12)
-        pattern_t = v.lane_pattern(nil, l22)
         peak = v.splat(records[at + PEAK])
         red, green, blue, depth = v.splat(records[at + R]), v.splat(records[at + G]), v.splat(records[at + B]), v.splat(records[at + Z])
         while todo != 0:
             block = v.lowest_bit(todo)
             todo &= todo - 1
-            column, row = _f(four * _f(block & 3)), _f(four * _f(block >> 2))
-            s = v.splat(s0 + l11 * column + l12 * row) + pattern_s
-            t = v.splat(t0 + l22 * row) + pattern_t
+            s, t = block_coordinates(records, at, dx, dy, block)
             y = v.fnma(s, s, v.fnma(t, t, peak))
             drawn = y >= v.splat(CUT)
             if v.bits(drawn) == 0:
                 continue
-            p = v.fma(v.splat(P5), y, v.splat(P4))
-            p = v.fma(p, y, v.splat(P3))
-            p = v.fma(p, y, v.splat(P2))
-            p = v.fma(p, y, v.splat(P1))
-            p = v.fma(p, y, v.splat(P0))
-            p = p * p
-            p = p * p
-            alpha = v.select(drawn, v.minimum(p * p, v.splat(_ALPHA_MAX)), zero)
-            base = block * _STATE
-            before = v.load(state, base + _T)
+            alpha = v.select(drawn, v.minimum(falloff(y), v.splat(_ALPHA_MAX)), zero)
+            base = block * STATE
+            before = v.load(state, base + STATE_T)
             after = v.fnma(before, alpha, before)
             goes_on = after > v.splat(_STOP)
             weight = v.select(goes_on, before * alpha, zero)
             after = v.select(goes_on, after, v.negative(v.absolute(before)))
-            v.store(state, base + _T, after)
-            v.store(state, base + _R, v.fma(weight, red, v.load(state, base + _R)))
-            v.store(state, base + _G, v.fma(weight, green, v.load(state, base + _G)))
-            v.store(state, base + _B, v.fma(weight, blue, v.load(state, base + _B)))
-            v.store(state, base + _D, v.fma(weight, depth, v.load(state, base + _D)))
+            v.store(state, base + STATE_T, after)
+            v.store(state, base + STATE_R, v.fma(weight, red, v.load(state, base + STATE_R)))
+            v.store(state, base + STATE_G, v.fma(weight, green, v.load(state, base + STATE_G)))
+            v.store(state, base + STATE_B, v.fma(weight, blue, v.load(state, base + STATE_B)))
+            v.store(state, base + STATE_D, v.fma(weight, depth, v.load(state, base + STATE_D)))
+            if last is not None:
+                place = v.splat(_f(i - start))
+                v.store(last, block * 16, v.select(goes_on & drawn, place, v.load(last, block * 16)))
             if v.bits(after > zero) == 0:
                 live &= ~(1 << block)
         if live == 0:
@@ -119,20 +141,20 @@ def _finish_tile(state, tile_x, tile_y, background, rgb, alpha, depth):
         y = tile_y * TILE + row
         for column in range(min(TILE, width - tile_x * TILE)):
             x = tile_x * TILE + column
-            at = ((row >> 2) * 4 + (column >> 2)) * _STATE + (row & 3) * 4 + (column & 3)
-            through = abs(state[at + _T])
+            at = ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
+            through = abs(state[at + STATE_T])
             opacity = one - through
             alpha[y, x] = opacity
-            depth[y, x] = state[at + _D] / opacity if opacity > zero else zero
+            depth[y, x] = state[at + STATE_D] / opacity if opacity > zero else zero
             for channel in range(3):
-                value = state[at + _R + 16 * channel] + through * background[y * step_y, x * step_x, channel]
+                value = state[at + STATE_R + 16 * channel] + through * background[y * step_y, x * step_x, channel]
                 rgb[y, x, channel] = min(max(value, zero), one)
 
 
 @njit(cache=True, nogil=True)
 def raster_tiles(cursor, tiles_x, starts, lists, records, background, rgb, alpha, depth):
     """Render tiles until none is left; called by each thread. ``cursor[0]`` is the next tile, ``cursor[1]`` sums the splats looked at."""
-    state = np.empty(16 * _STATE, np.float32)
+    state = np.empty(16 * STATE, np.float32)
     height, width = alpha.shape
     n_tiles = starts.shape[0] - 1
     while True:
@@ -140,8 +162,8 @@ def raster_tiles(cursor, tiles_x, starts, lists, records, background, rgb, alpha
         if tile >= n_tiles:
             return
         tile_x, tile_y = tile % tiles_x, tile // tiles_x
-        live = _start_tile(state, tile_x, tile_y, width, height)
+        live = start_tile(state, tile_x, tile_y, width, height)
         x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
-        looked_at = _composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live)
+        looked_at = composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, None)
         v.fetch_add(cursor, 1, looked_at)
         _finish_tile(state, tile_x, tile_y, background, rgb, alpha, depth)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +25,7 @@ from alpasim_plugin.gaussians.layout import (
     SPHERE_SIZE,
     TILE,
 )
-from alpasim_plugin.gaussians.output import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.output import F32, Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.project_kernels import nodes_in_view, project_node
 from alpasim_plugin.gaussians.raster_kernels import raster_tiles
@@ -32,7 +33,7 @@ from alpasim_plugin.gaussians.workers import run_on_threads, thread_count
 from alpasim_plugin.types import F64
 
 
-class _Buffers(threading.local):
+class Buffers(threading.local):
     """Arrays kept between frames, one set per calling thread: fresh memory would be paid for page by page in every frame."""
 
     def __init__(self) -> None:
@@ -47,8 +48,8 @@ class _Buffers(threading.local):
 
 
 _IDENTITY = np.eye(4)
-_WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
-_buffers = _Buffers()
+WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
+_buffers = Buffers()
 _prepared: weakref.WeakKeyDictionary[GaussianCloud, PreparedCloud] = weakref.WeakKeyDictionary()
 
 
@@ -77,16 +78,9 @@ def rasterize_prepared(
     """
     threads = thread_count(threads)
     behind = background_image(background, camera)
-    low_x, high_x, low_y, high_y = camera.slope_limits()
-    view = np.array(
-        [
-            *(camera.fx, camera.fy, camera.cx, camera.cy),
-            *(low_x, high_x, low_y, high_y),
-            *(camera.width, camera.height, lod_px),
-        ],
-        np.float32,
-    )
-    poses = _node_poses(nodes, camera, near_m)
+    view = camera_numbers(camera, lod_px)
+    turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
+    poses = node_poses([T for _, T in nodes], turned, camera, near_m)
     in_view = nodes_in_view(np.array([prepared.sphere for prepared, _ in nodes]).reshape(-1, SPHERE_SIZE), poses, view)
     total = sum(len(nodes[i][0]) for i in in_view)
     records = _buffers.get("records", total * RECORD, np.float32)
@@ -97,40 +91,93 @@ def rasterize_prepared(
         prepared = nodes[i][0]
         cursor[0] = 0
         run_on_threads(
-            threads if len(prepared) > _WORTH_THREADS else 1, project_node, cursor, prepared.means, prepared.geometry, prepared.sh,
+            threads if len(prepared) > WORTH_THREADS else 1, project_node, cursor, prepared.means, prepared.geometry, prepared.sh,
             prepared.sh_size, prepared.index, prepared.spheres, first_ids[i], poses[i], view, records, ids,
         )  # fmt: skip
     count = int(cursor[1])
 
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    keys, spare = _buffers.get("keys", count, np.int64), _buffers.get("spare", count, np.int64)
-    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
-    ordered = _buffers.get("ordered", count * RECORD, np.float32)
-    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
-    chunk_size = max(2048, -(-count // 64))
-    n_chunks, n_tiles = -(-count // chunk_size), tiles_x * tiles_y
-    histogram = _buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
-    starts = np.empty(n_tiles + 1, np.int64)
-    cursor[:] = 0
-    workers = threads if count > _WORTH_THREADS else 1
-    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram)
-    pairs = int(tile_offsets(histogram, starts))
-    lists = _buffers.get("lists", pairs, np.int32)
-    cursor[:] = 0
-    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists)
-
+    tiles = list_per_tile(count, records, ids, camera, threads, _buffers)
     shape = (camera.height, camera.width)
     rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
     cursor[:] = 0
-    run_on_threads(threads, raster_tiles, cursor, tiles_x, starts, lists, ordered, behind, rgb, alpha, depth)
-    stats = {"gaussians": sum(p.n_input for p, _ in nodes), "visible": count, "pairs": pairs, "pairs_looked_at": int(cursor[1])}
+    run_on_threads(threads, raster_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, behind, rgb, alpha, depth)
+    stats = {"gaussians": sum(p.n_input for p, _ in nodes), "visible": count, "pairs": tiles.pairs, "pairs_looked_at": int(cursor[1])}
     return RasterOutput(rgb, alpha, depth, stats)
 
 
-def _node_poses(nodes: Sequence[Node], camera: PinholeCamera, near_m: float) -> F64:
-    """Pack the nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64."""
-    poses = np.empty((len(nodes), POSE_SIZE))
-    given = [_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for _, T in nodes]
+def camera_numbers(camera: PinholeCamera, lod_px: float = 0.0) -> F32:
+    """Return a camera as the kernels read it, columns ``CAM_*``."""
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    return np.array(
+        [
+            *(camera.fx, camera.fy, camera.cx, camera.cy),
+            *(low_x, high_x, low_y, high_y),
+            *(camera.width, camera.height, lod_px),
+        ],
+        np.float32,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """Visible splats in the order of depth, and which of them each tile may show.
+
+    Attributes:
+        columns: Tiles in a row of tiles.
+        order: int64; its low 32 bits name the record of each rank.
+        ordered: float32, RECORD per rank.
+        starts: int64, where each tile's list begins, and the end of the last.
+        lists: int32, ranks, ascending within a tile.
+        pairs: Entries of ``lists`` in use.
+    """
+
+    columns: int
+    order: npt.NDArray[np.generic]
+    ordered: npt.NDArray[np.generic]
+    starts: npt.NDArray[np.int64]
+    lists: npt.NDArray[np.generic]
+    pairs: int
+
+
+def list_per_tile(
+    count: int, records: npt.NDArray[np.generic], ids: npt.NDArray[np.generic], camera: PinholeCamera, threads: int, buffers: Buffers
+) -> TileLists:
+    """Sort ``count`` projected records by depth and list them per tile; the arrays returned belong to ``buffers``."""
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    keys, spare = buffers.get("keys", count, np.int64), buffers.get("spare", count, np.int64)
+    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
+    ordered = buffers.get("ordered", count * RECORD, np.float32)
+    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
+    chunk_size = max(2048, -(-count // 64))
+    n_chunks, n_tiles = -(-count // chunk_size), tiles_x * tiles_y
+    histogram = buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
+    starts = np.empty(n_tiles + 1, np.int64)
+    cursor = np.zeros(2, np.int64)
+    workers = threads if count > WORTH_THREADS else 1
+    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram)
+    pairs = int(tile_offsets(histogram, starts))
+    lists = buffers.get("lists", pairs, np.int32)
+    cursor[:] = 0
+    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists)
+    return TileLists(tiles_x, order, ordered, starts, lists, pairs)
+
+
+def node_poses(
+    T_world_nodes: Sequence[npt.NDArray[np.floating] | None], turned: npt.NDArray[np.bool_], camera: PinholeCamera, near_m: float
+) -> F64:
+    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64.
+
+    Args:
+        T_world_nodes: Rigid transforms; None is the identity.
+        turned: ``(N,)``, which nodes' colours are seen along world directions instead of the node's own.
+        camera: Seen from where.
+        near_m: Near plane, metres.
+
+    Raises:
+        InputError: A transform is not rigid.
+    """
+    poses = np.empty((len(T_world_nodes), POSE_SIZE))
+    given = [_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for T in T_world_nodes]
     if not all(T.shape == (4, 4) for T in given) or not _all_rigid(np.array(given).reshape(-1, 4, 4)):
         for T in given:  # the precise message is composed only where the cheap test of all nodes at once fails
             require_rigid(T, "placing a node")
@@ -138,7 +185,6 @@ def _node_poses(nodes: Sequence[Node], camera: PinholeCamera, near_m: float) -> 
     rotation = T_world_node[:, :3, :3]
     poses[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
     poses[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
-    turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
     poses[:, POSE_NEAR], poses[:, POSE_FAR] = near_m, FAR_M
     poses[:, POSE_COLOUR:POSE_NEAR] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
     return poses

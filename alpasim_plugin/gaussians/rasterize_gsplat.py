@@ -24,39 +24,46 @@ from alpasim_plugin.gaussians.output import Background, RasterOutput, background
 _DOING = "rendering Gaussians with gsplat"
 
 
-def gsplat_arguments(cloud: GaussianCloud, camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
-    """Return the keyword arguments of ``gsplat.rasterization`` for one view.
-
-    Means are given relative to the camera centre, subtracted in float64, and the view matrix only rotates: gsplat computes in float32,
-    where UTM-sized coordinates would move by centimetres. View directions, and so colours, stay those of the world's axes.
-    """
-
-    def tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
-        return torch.as_tensor(np.array(array, dtype=np.float32), device=device)
-
+def view_arguments(camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
+    """Return those keyword arguments of ``gsplat.rasterization`` that describe one view, with the camera at the origin."""
     view = np.eye(4)
     view[:3, :3] = camera.T_camera_world[:3, :3]
-    quats = cloud.quats.astype(np.float64)
     return {
-        "means": tensor(cloud.means.astype(np.float64) - camera.centre_world),
-        "quats": tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
-        "scales": tensor(cloud.scales),
-        "opacities": tensor(cloud.opacities),
-        "colors": tensor(cloud.sh),
-        "viewmats": tensor(view)[None],
-        "Ks": tensor(camera.K)[None],
+        "viewmats": _tensor(view, device)[None],
+        "Ks": _tensor(camera.K, device)[None],
         "width": camera.width,
         "height": camera.height,
         "near_plane": near_m,
         "far_plane": FAR_M,
         "radius_clip": 0.0,
         "eps2d": EPS2D_PX2,
-        "sh_degree": cloud.sh_degree,
         "packed": True,
         "tile_size": 16,
         "render_mode": "RGB+ED",
         "rasterize_mode": "classic",
     }
+
+
+def gsplat_arguments(cloud: GaussianCloud, camera: PinholeCamera, near_m: float, device: str) -> dict[str, Any]:
+    """Return the keyword arguments of ``gsplat.rasterization`` for one view of a cloud.
+
+    Means are given relative to the camera centre, subtracted in float64, and the view matrix only rotates: gsplat computes in float32,
+    where UTM-sized coordinates would move by centimetres. View directions, and so colours, stay those of the world's axes.
+    """
+    quats = cloud.quats.astype(np.float64)
+    return {
+        "means": _tensor(cloud.means.astype(np.float64) - camera.centre_world, device),
+        "quats": _tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True), device),
+        "scales": _tensor(cloud.scales, device),
+        "opacities": _tensor(cloud.opacities, device),
+        "colors": _tensor(cloud.sh, device),
+        "sh_degree": cloud.sh_degree,
+        **view_arguments(camera, near_m, device),
+    }
+
+
+def _tensor(array: np.ndarray[Any, Any], device: str) -> torch.Tensor:
+    return torch.as_tensor(np.array(array, dtype=np.float32), device=device)
 
 
 def _draw(gsplat: Any, cloud: GaussianCloud, camera: PinholeCamera, background: Background, near_m: float, device: str) -> RasterOutput:

@@ -241,6 +241,21 @@ def bits(typingctx, mask):
 
 
 @intrinsic
+def total(typingctx, a):
+    """Return the sum of the lanes: halves are added onto each other, an order that is the same on every machine."""
+
+    def codegen(context, builder, sig, args):
+        value, lanes = args[0], LANES
+        while lanes > 1:
+            lanes //= 2
+            low, high = (ir.Constant(ir.VectorType(_I32, lanes), list(range(first, first + lanes))) for first in (0, lanes))
+            value = builder.fadd(builder.shuffle_vector(value, value, low), builder.shuffle_vector(value, value, high))
+        return builder.extract_element(value, _I32(0))
+
+    return (types.float32 if a is F32X16 else types.float64)(a), codegen
+
+
+@intrinsic
 def to_f32(typingctx, a):
     """Round a float64 vector to float32."""
 
