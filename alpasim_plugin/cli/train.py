@@ -14,6 +14,8 @@ from rich.console import Console
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
+from alpasim_plugin.cli.train_splat import EPILOG as SPLAT_EXAMPLE
+from alpasim_plugin.cli.train_splat import splat
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
@@ -34,6 +36,7 @@ EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensor
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 app.command("perceptual", epilog=PERCEPTUAL_EXAMPLE)(perceptual)
+app.command("splat", epilog=SPLAT_EXAMPLE)(splat)
 
 
 @app.callback()

@@ -88,7 +88,11 @@ def _rendered(scenario: Scenario, recipe: SplatRecipe, threads: int | None) -> t
     views = logged_views(scenario, scene_of(scenario), recipe.views, recipe.width, threads=threads)
     train, kept = held_out(views, recipe.hold_out_every)
     boxes = {actor.actor_id: actor.box for actor in scenario.actors}
-    return train, kept, start_from_depth(train, boxes, recipe.points, scenario.scene_id, recipe.seed, recipe.actor_points)
+    return (
+        train,
+        kept,
+        start_from_depth(train, boxes, recipe.points, scenario.scene_id, recipe.seed, recipe.actor_points, recipe.start_size),
+    )
 
 
 def _given(scenario: Scenario, folder: Path, recipe: SplatRecipe) -> tuple[list[PosedView], list[PosedView], GaussianCloud]:

@@ -1,13 +1,11 @@
 """Reconstruct a scene: fit 3D Gaussians to posed views.
 
-`logged_views` or `view_files.read_views` give views, `start_from_depth` a start and `fit` the `Reconstruction`; `reconstruct` does all
-three for a scenario and its scene.
+`logged_views` or `view_files.read_views` give views, `start_from_depth` gives a start, and `fit` the `Reconstruction`.
 """
 
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.fit.scenario import reconstruct
 from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points, start_from_depth
 from alpasim_plugin.gaussians.fit.views import PosedView, held_out, logged_views
 
@@ -20,6 +18,5 @@ __all__ = [
     "fit",
     "held_out",
     "logged_views",
-    "reconstruct",
     "start_from_depth",
 ]

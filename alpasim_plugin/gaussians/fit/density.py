@@ -27,11 +27,9 @@ class ScreenGradients:
         self.total, self.count = torch.zeros(n, device=device), torch.zeros(n, device=device)
 
     def add(self, rows: Tensor, gradient_norm_px: Tensor, radii: Tensor, width_px: int) -> None:
-        """Count one view: its Gaussians' rows ``(M,)``, the norms by pixels ``(M,)`` and the radii ``(M,)``, 0 where not drawn."""
-        drawn = radii > 0
-        seen = rows[drawn]
-        self.total[seen] += gradient_norm_px[drawn] * (width_px / 2)
-        self.count[seen] += 1
+        """Count one view: its Gaussians' rows ``(M,)``, the norms by pixels ``(M,)`` and the radii ``(M,)``, both 0 where not drawn."""
+        self.total.index_add_(0, rows, gradient_norm_px * (width_px / 2))
+        self.count.index_add_(0, rows, (radii > 0).float())
 
     def mean(self) -> Tensor:
         """Return ``(N,)``; 0 for what no view showed."""

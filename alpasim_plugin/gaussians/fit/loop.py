@@ -19,11 +19,12 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.adam import RowAdam
 from alpasim_plugin.gaussians.fit.checkpoint import STATE_FILE, load_state, save_state
 from alpasim_plugin.gaussians.fit.density import ScreenGradients, densify, reset_opacities
-from alpasim_plugin.gaussians.fit.loss import image_loss, psnr_db
 from alpasim_plugin.gaussians.fit.model import Motion, SplatModel
 from alpasim_plugin.gaussians.fit.panorama import sky_of
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
+from alpasim_plugin.gaussians.fit.ssim_cpu import SsimTruth
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
@@ -91,6 +92,7 @@ class _Target:
     sky: Tensor | None  # (H, W) 0 or 1
     counts: Tensor | None  # (H, W, 1) bool
     motion: Motion
+    ssim: SsimTruth | None  # on the CPU
 
 
 class SplatFit:
@@ -130,11 +132,9 @@ class SplatFit:
         splats, rows = self.model.placed(target.motion, recipe.sh_size_at(self.step))
         out = rasterize_gradient(splats, target.camera, background=target.behind, threads=self.threads)
         rgb = out.rgb if target.counts is None else torch.where(target.counts, out.rgb, target.rgb)
-        loss = image_loss(rgb, target.rgb, recipe.ssim_weight)
-        if target.sky is not None:
-            loss = loss + recipe.sky_weight * (out.alpha * target.sky).mean()
+        loss = _loss(rgb, out.alpha, target, recipe)
         if not torch.isfinite(loss):
-            self._stop(target, f"loss {float(loss)}")
+            self._stop(target, f"loss {float(loss.detach())}")
         loss.backward()  # type: ignore[no-untyped-call]
         for name, p in self.model.params.items():
             if p.grad is not None and not torch.isfinite(p.grad.sum()):
@@ -186,15 +186,25 @@ def _target(view: PosedView, model: SplatModel, sky: Sky | None, device: str) ->
     T = camera.T_camera_world.copy()
     T[:3, 3] += T[:3, :3] @ model.origin
     behind = None if sky is None else torch.as_tensor(sky.image(camera), device=device)
+    rgb = torch.as_tensor(view.rgb.astype(np.float32) / 255, device=device)
     return _Target(
         view.name,
         replace(camera, T_camera_world=T),
-        torch.as_tensor(view.rgb.astype(np.float32) / 255, device=device),
+        rgb,
         behind,
         None if view.sky is None else torch.as_tensor(view.sky.astype(np.float32), device=device),
         None if view.mask is None else torch.as_tensor(view.mask, device=device)[..., None],
         model.motion(view.actors),
+        SsimTruth(rgb) if rgb.device.type == "cpu" else None,
     )
+
+
+def _loss(rgb: Tensor, alpha: Tensor, target: _Target, recipe: SplatRecipe) -> Tensor:
+    """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), and the opacity that stands before the sky."""
+    w = recipe.ssim_weight
+    similarity = ssim(rgb, target.rgb) if target.ssim is None else target.ssim.similarity(rgb)
+    loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - similarity)
+    return loss if target.sky is None else loss + recipe.sky_weight * (alpha * target.sky).mean()
 
 
 def _digest(views: Sequence[PosedView], start: Start) -> str:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.fit.loss import psnr_db, ssim
+from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene_graph import SceneGraph
 

@@ -11,8 +11,9 @@ from alpasim_plugin.errors import InputError
 class SplatRecipe:
     """How Gaussians are fitted to posed views.
 
-    Rates are those of 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 5 and its published code); the schedule is theirs as shares of the
-    steps, because a CPU takes hundreds of steps where they take 30,000.
+    What is done is 3D Gaussian Splatting (Kerbl et al. 2023, Sec. 5 and its published code) with its schedule as shares of the steps. A CPU
+    takes hundreds of steps where they take 30,000, so Gaussians start more opaque and smaller, and rates are higher: centres and scales
+    four times (theirs: 1.6e-4 to 1.6e-6 extents, 5e-3), rotations five times, colours twice. docs/reconstruction.md has the comparison.
 
     Attributes:
         steps: Updates; each sees one view.
@@ -20,6 +21,7 @@ class SplatRecipe:
         width: Pixels across of rendered views; their height follows from the camera.
         points: Gaussians of the background at the start, drawn from the views' depth.
         actor_points: Most Gaussians of an actor at the start.
+        start_size: Of the Gaussians at the start, in distances to their neighbours.
         cap: Most Gaussians; densification stops there, the largest screen gradients first.
         hold_out_every: Every such view is kept for measuring (the eighth, as is usual); 0 trains on all.
         sh_degree: Highest degree of view-dependent colour, reached by one degree every ``sh_share`` of the steps.
@@ -54,16 +56,17 @@ class SplatRecipe:
     width: int = 256
     points: int = 20_000
     actor_points: int = 400
+    start_size: float = 0.6
     cap: int = 30_000
     hold_out_every: int = 8
     sh_degree: int = 2
     sh_share: float = 0.25
-    lr_means: float = 1.6e-4
-    lr_means_end: float = 1.6e-6
-    lr_scales: float = 5e-3
-    lr_quaternions: float = 1e-3
+    lr_means: float = 6e-4
+    lr_means_end: float = 2e-5
+    lr_scales: float = 0.02
+    lr_quaternions: float = 5e-3
     lr_opacities: float = 0.05
-    lr_colour: float = 2.5e-3
+    lr_colour: float = 5e-3
     ssim_weight: float = 0.2
     sky_weight: float = 0.05
     densify_from: float = 0.1
@@ -124,4 +127,4 @@ class SplatRecipe:
     def resets_after(self, done: int) -> bool:
         """Tell whether opacities are lowered when ``done`` updates are made."""
         every = round(self.reset_every * self.steps)
-        return every > 0 and done % every == 0 and done <= self.densify_until * self.steps
+        return every > 0 and done % every == 0 and 0 < done <= self.densify_until * self.steps

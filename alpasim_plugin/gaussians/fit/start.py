@@ -23,7 +23,7 @@ from alpasim_plugin.types import F64, Bool, Box
 
 RANGE_ERROR_M, RANGE_ERROR_SHARE = 0.03, 0.004  # spread of a point along its ray: fixed, and by distance
 BOX_MARGIN_M = 0.1  # points this far outside an actor's sides still belong to it; below, its box ends this far above the ground
-START_OPACITY = 0.1
+START_OPACITY = 0.3
 SMALLEST_M, LARGEST_M = 0.01, 3.0
 FEWEST_POINTS = 4  # an actor seen less often gets no model
 DENSER = 8  # an actor's points are sampled this many times as densely as the background, because they are few and seen from near
@@ -45,7 +45,13 @@ class Start:
 
 
 def start_from_depth(
-    views: Sequence[PosedView], boxes: Mapping[str, Box], count: int, scene_id: str, seed: int, actor_points: int = 400
+    views: Sequence[PosedView],
+    boxes: Mapping[str, Box],
+    count: int,
+    scene_id: str,
+    seed: int,
+    actor_points: int = 400,
+    size: float = 1.0,
 ) -> Start:
     """Sample ``count`` surface points from the views' depth, and more on actors.
 
@@ -55,6 +61,7 @@ def start_from_depth(
         count: Points of the background, shared evenly by the views.
         scene_id, seed: Key of the sample.
         actor_points: Most points of an actor.
+        size: See `cloud_from_points`.
 
     Raises:
         InputError: No view has depth.
@@ -79,23 +86,24 @@ def start_from_depth(
     for name, pieces in owned.items():
         points, rgb = _thinned(pieces, actor_points, stream(scene_id, seed, f"fit.start.{name}"))
         if len(points) >= FEWEST_POINTS:
-            actors[name] = cloud_from_points(points, rgb)
-    return Start(cloud_from_points(*_joined(rest)), actors)
+            actors[name] = cloud_from_points(points, rgb, size)
+    return Start(cloud_from_points(*_joined(rest), size), actors)
 
 
-def cloud_from_points(points: F64, rgb: F64) -> GaussianCloud:
-    """Return round Gaussians at points ``(N, 3)`` of colours ``(N, 3)`` 0..1, as large as the mean distance to their three neighbours.
+def cloud_from_points(points: F64, rgb: F64, size: float = 1.0) -> GaussianCloud:
+    """Return round Gaussians at points ``(N, 3)`` of colours ``(N, 3)`` 0..1.
 
-    Size and opacity (0.1) at the start are those of 3D Gaussian Splatting.
+    Their standard deviation is ``size`` times the root mean square distance to three neighbours: 1 is that of 3D Gaussian Splatting, whose
+    opacity of 0.1 is too slow a start for some hundred steps.
     """
     n = len(points)
     if n > 1:
         distance, _ = KDTree(points).query(points, k=min(4, n))
-        size = np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1)).clip(SMALLEST_M, LARGEST_M)
+        sigma = (size * np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))).clip(SMALLEST_M, LARGEST_M)
     else:
-        size = np.full(n, LARGEST_M / 10)
+        sigma = np.full(n, LARGEST_M / 10)
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    return GaussianCloud(points, quats, np.repeat(size[:, None], 3, axis=1), np.full(n, START_OPACITY), dc_from_rgb(rgb)[:, None, :])
+    return GaussianCloud(points, quats, np.repeat(sigma[:, None], 3, axis=1), np.full(n, START_OPACITY), dc_from_rgb(rgb)[:, None, :])
 
 
 def _sample(view: PosedView, count: int, rng: np.random.Generator) -> _Points:

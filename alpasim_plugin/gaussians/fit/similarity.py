@@ -1,4 +1,4 @@
-"""The loss of 3D Gaussian Splatting: mean absolute error and structural dissimilarity."""
+"""Structural similarity and signal-to-noise ratio of images as torch sees them: any device, differentiable, plain."""
 
 from __future__ import annotations
 
@@ -10,12 +10,6 @@ from torch.nn.functional import conv2d
 
 WINDOW, SIGMA = 11, 1.5  # Wang et al. 2004
 C1, C2 = 0.01**2, 0.03**2  # for values 0..1
-
-
-def image_loss(rgb: Tensor, truth: Tensor, ssim_weight: float) -> Tensor:
-    """Return ``(1 - w) L1 + w (1 - SSIM)`` of images ``(H, W, 3)`` 0..1 (Kerbl et al. 2023, Eq. 7)."""
-    absolute = (rgb - truth).abs().mean()
-    return absolute if ssim_weight == 0 else (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(rgb, truth))
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:

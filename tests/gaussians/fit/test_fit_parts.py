@@ -1,0 +1,248 @@
+"""Each part of the fit against something independent of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud
+from alpasim_plugin.gaussians.fit import SplatRecipe, Start, cloud_from_points, held_out, start_from_depth
+from alpasim_plugin.gaussians.fit.adam import RowAdam
+from alpasim_plugin.gaussians.fit.density import ScreenGradients, densify, reset_opacities
+from alpasim_plugin.gaussians.fit.model import SplatModel
+from alpasim_plugin.gaussians.fit.panorama import sky_of
+from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
+from alpasim_plugin.gaussians.fit.ssim_cpu import SsimTruth
+from alpasim_plugin.gaussians.sh import dc_from_rgb
+from alpasim_plugin.seeding import stream
+from tests.gaussians.fit.conftest import BOX, FAR, HEIGHT, WIDTH, Posed, actor_pose
+from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
+
+
+def images() -> tuple[torch.Tensor, torch.Tensor]:
+    rng = stream("fit-tests", 0, "images")
+    a, b = (torch.as_tensor(rng.random((20, 31, 3), dtype=np.float32)) for _ in range(2))
+    return a, (a + 0.3 * b) / 1.3
+
+
+def model_of(cloud: GaussianCloud, actors: dict[str, GaussianCloud] | None = None, degree: int = 1) -> SplatModel:
+    return SplatModel.from_start(Start(cloud, actors or {}), np.zeros(3), degree)
+
+
+# --- loss -----------------------------------------------------------------------------------------------------------
+
+
+def test_similarity_and_its_gradient_equal_the_plain_ones() -> None:
+    a, b = images()
+    a[3:9, 4:12] = b[3:9, 4:12] = 0.5  # flat in both: only the constants keep the quotient
+    wanted, found = a.clone().requires_grad_(), a.clone().requires_grad_()
+    plain, fast = ssim(wanted, b), SsimTruth(b).similarity(found)
+    (3 * plain).backward()
+    (3 * fast).backward()
+    assert float(plain.detach()) == pytest.approx(float(fast.detach()), abs=1e-6)
+    assert float((wanted.grad - found.grad).abs().max()) < 1e-4 * float(wanted.grad.abs().max())
+
+
+def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_error() -> None:
+    a, _ = images()
+    assert float(ssim(a, a)) == pytest.approx(1.0, abs=1e-6)
+    assert psnr_db(a, a + 0.1) == pytest.approx(20.0, abs=1e-4)
+
+
+# --- optimiser ------------------------------------------------------------------------------------------------------
+
+
+def test_updates_follow_the_published_algorithm() -> None:
+    start = stream("fit-tests", 0, "adam").standard_normal((5, 3)).astype(np.float32)
+    p = torch.as_tensor(start.copy()).requires_grad_()
+    adam, wanted, m, v = RowAdam({"p": p}), start.astype(np.float64), 0.0, 0.0
+    for t in range(1, 11):
+        p.pow(3).sum().backward()
+        adam.update({"p": p}, {"p": 0.01 / t})
+        gradient = 3 * wanted**2
+        m, v = 0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient**2
+        wanted -= 0.01 / t * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-15)
+    assert np.allclose(p.detach().numpy(), wanted, atol=1e-5)
+
+
+def test_rows_keep_their_moments_when_others_come_and_go() -> None:
+    p = torch.arange(6.0).reshape(3, 2).requires_grad_()
+    adam = RowAdam({"p": p})
+    p.sum().backward()
+    adam.update({"p": p}, {"p": 0.1})
+    before = adam.first["p"].clone()
+    adam.take(torch.tensor([2, 0, 0]), torch.tensor([False, False, True]))
+    assert torch.equal(adam.first["p"], torch.stack([before[2], before[0], torch.zeros(2)]))
+
+
+# --- model ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_actor_is_placed_as_a_moved_cloud_is() -> None:
+    ground, car = random_cloud(20, 1), random_cloud(15, 2)
+    model, T = model_of(ground, {"car": car, "gone": random_cloud(5, 3)}, degree=3), random_rigid(4)
+    splats, rows = model.placed(model.motion({"car": T, "stranger": T}), 16)
+    wanted = GaussianCloud.concatenate([ground, car.transformed(T)])
+    assert rows.tolist() == list(range(35)), "background and car, without what is not there"
+    found = splats.to_cloud()
+    assert np.allclose(found.means, wanted.means, atol=1e-5)
+    assert np.allclose(found.covariances(), wanted.covariances(), atol=1e-5)
+    assert np.allclose(found.sh, wanted.sh, atol=1e-5)
+    assert np.allclose(found.opacities, wanted.opacities, atol=1e-6)
+
+
+def test_a_placed_actor_passes_gradients_to_its_own_frame() -> None:
+    model, T = model_of(random_cloud(3, 1), {"car": random_cloud(4, 2)}), random_rigid(5)
+    splats, _ = model.placed(model.motion({"car": T}), 4)
+    splats.means[3:, 0].sum().backward()
+    gradient = model.params["means"].grad
+    assert gradient is not None
+    assert torch.allclose(gradient[3:], torch.as_tensor(T[0, :3], dtype=torch.float32).expand(4, 3), atol=1e-6)
+    assert not gradient[:3].any()
+
+
+def test_clouds_come_back_as_they_went_in_far_from_the_origin() -> None:
+    cloud = random_cloud(30, 6, degree=1)
+    far = replace(cloud, means=cloud.means + FAR, opacities=cloud.opacities.clip(0.01, 0.99))
+    model = SplatModel.from_start(Start(far, {"car": cloud}), FAR, 1)
+    background, actors = model.clouds()
+    assert np.abs(background.means - far.means).max() < 1e-5
+    assert np.abs(actors["car"].means - cloud.means).max() < 1e-5
+    assert np.allclose(background.scales, far.scales, rtol=1e-5)
+    assert np.allclose(background.opacities, far.opacities, atol=1e-6)
+
+
+# --- density --------------------------------------------------------------------------------------------------------
+
+
+def density_case(cap: int = 100) -> tuple[SplatModel, RowAdam, ScreenGradients, SplatRecipe]:
+    """Three background Gaussians (small and pulled, large and pulled, calm), one of a car (pulled)."""
+    cloud = GaussianCloud(
+        np.array([[0, 0, 0], [1.0, 0, 0], [2, 0, 0]]), np.tile([1.0, 0, 0, 0], (3, 1)), np.array([[0.1] * 3, [2.0] * 3, [0.2] * 3]),
+        np.full(3, 0.5), np.zeros((3, 1, 3)),
+    )  # fmt: skip
+    model = model_of(cloud, {"car": cloud.take([0])})
+    gradients = ScreenGradients(4)
+    gradients.add(torch.arange(4), torch.tensor([1e-3, 2e-3, 0.0, 5e-3]) / 50, torch.tensor([3, 3, 3, 3]), 100)
+    return model, RowAdam(model.params), gradients, SplatRecipe(cap=cap, densify_gradient=2e-4, dense_share=0.01, prune_share=1.0)
+
+
+def test_small_ones_are_cloned_large_ones_split_calm_ones_kept() -> None:
+    model, adam, gradients, recipe = density_case()
+    densify(model, adam, gradients, recipe, 50.0, stream("t", 0, "split"))
+    size = model.params["log_scales"].exp().max(dim=1).values.tolist()
+    assert sorted(round(s, 3) for s in size[:5]) == [0.1, 0.1, 0.2, 1.25, 1.25]
+    assert model.node.tolist() == [0, 0, 0, 0, 0, 1, 1], "a car's clone belongs to the car"
+    at = sorted(round(float(x), 3) for x in model.params["means"].detach()[:5, 0])
+    assert at.count(0.0) == 2, "a clone starts where its original is"
+    assert at.count(1.0) == 0, "two drawn from the split one"
+    assert all(len(t) == 7 for t in (*adam.first.values(), *adam.second.values(), *model.params.values()))
+
+
+def test_where_the_cap_leaves_room_for_one_the_strongest_pull_wins() -> None:
+    model, adam, gradients, recipe = density_case(cap=5)
+    densify(model, adam, gradients, recipe, 50.0, stream("t", 0, "split"))
+    assert model.node.tolist() == [0, 0, 0, 1, 1]
+
+
+def test_faint_and_oversized_ones_are_removed() -> None:
+    model, adam, gradients, recipe = density_case()
+    with torch.no_grad():
+        model.params["logit_opacities"][2] = -6.0
+    densify(model, adam, gradients, replace(recipe, densify_gradient=1.0, prune_share=0.03), 50.0, stream("t", 0, "split"))
+    assert [round(float(x), 3) for x in model.params["means"].detach()[:, 0]] == [0.0, 0.0]
+
+
+def test_reset_lowers_opacities_and_forgets_their_moments() -> None:
+    model, adam, _, _ = density_case()
+    adam.second["logit_opacities"] += 1.0
+    reset_opacities(model, adam, 0.01)
+    assert torch.allclose(model.params["logit_opacities"].sigmoid(), torch.tensor(0.01))
+    assert not adam.second["logit_opacities"].any()
+
+
+def test_a_gaussian_that_no_view_showed_has_no_pull() -> None:
+    gradients = ScreenGradients(2)
+    gradients.add(torch.tensor([0, 1]), torch.tensor([0.5, 0.0]), torch.tensor([2, 0]), 4)
+    gradients.add(torch.tensor([0]), torch.tensor([0.1]), torch.tensor([2]), 4)
+    assert gradients.mean().tolist() == pytest.approx([0.6, 0.0])
+
+
+# --- start and sky --------------------------------------------------------------------------------------------------
+
+
+def test_start_points_lie_on_the_surfaces_and_actors_own_theirs(posed: Posed) -> None:
+    start = start_from_depth(posed.views, {"car": BOX}, 400, "s", 0, 50)
+    assert len(start.actors["car"]) == 50
+    assert np.abs(start.actors["car"].means).max() < 2.2
+    # What is left is the wall and the floor, up to the range error and the sizes of their Gaussians.
+    local = start.background.means - FAR
+    assert np.quantile(np.minimum(np.abs(local[:, 0] - 12), np.abs(local[:, 2])), 0.9) < 1.0
+    again = start_from_depth(posed.views, {"car": BOX}, 400, "s", 0, 50)
+    assert np.array_equal(start.background.means, again.background.means)
+
+
+def test_an_actor_that_is_not_in_view_gets_no_model(posed: Posed) -> None:
+    views = [
+        replace(v, actors={"car": actor_pose(0) @ np.diag([1.0, 1, 1, 1]) + np.array([[0, 0, 0, 500.0]] * 3 + [[0] * 4])})
+        for v in posed.views
+    ]
+    assert not start_from_depth(views, {"car": BOX}, 100, "s", 0).actors
+
+
+def test_views_without_depth_give_no_start(posed: Posed) -> None:
+    with pytest.raises(InputError, match="no pixel with depth"):
+        start_from_depth([replace(v, depth=None) for v in posed.views], {}, 100, "s", 0)
+
+
+def test_points_become_gaussians_as_large_as_their_distance() -> None:
+    line = np.column_stack([np.arange(5) * 0.5, np.zeros(5), np.zeros(5)])
+    cloud = cloud_from_points(line, np.full((5, 3), 0.25))
+    assert cloud.scales[2, 0] > 0.2
+    assert np.allclose(cloud.sh[:, 0], dc_from_rgb([0.25] * 3))
+    assert len(cloud_from_points(line[:1], np.zeros((1, 3)))) == 1
+
+
+def test_the_panorama_shows_the_sky_that_the_views_saw(posed: Posed) -> None:
+    sky = sky_of(posed.views)
+    assert sky is not None
+    for view in posed.views[::3]:
+        assert view.sky is not None
+        error = np.abs(sky.image(view.camera) - view.rgb / 255.0)[view.sky]
+        assert error.mean() < 0.03
+    assert np.isfinite(sky.panorama).all()
+    assert sky_of([replace(v, sky=None) for v in posed.views]) is None
+
+
+def test_views_are_held_out_evenly(posed: Posed) -> None:
+    train, kept = held_out(posed.views, 4)
+    assert [v.name for v in kept] == ["view-2", "view-6"]
+    assert len(train) == 6
+    assert held_out(posed.views, 0) == (posed.views, [])
+
+
+def test_a_view_whose_image_has_another_size_is_refused(posed: Posed) -> None:
+    with pytest.raises(InputError, match="the camera has"):
+        replace(posed.views[0], rgb=np.zeros((HEIGHT + 1, WIDTH, 3), np.uint8))
+
+
+# --- recipe ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_schedule_stretches_with_the_steps() -> None:
+    short, long = SplatRecipe(steps=100, reset_every=0.3, densify_every=10), SplatRecipe(steps=1000, reset_every=0.3, densify_every=100)
+    assert [i for i in range(101) if short.densifies_after(i)] == [20, 30, 40, 50, 60]
+    assert [10 * i for i in range(101) if short.resets_after(i)] == [i for i in range(1001) if long.resets_after(i)] == [300, 600]
+    assert short.lr_means_at(0) == pytest.approx(short.lr_means)
+    assert short.lr_means_at(100) == pytest.approx(short.lr_means_end)
+    assert [short.sh_size_at(i) for i in (0, 24, 25, 50, 99)] == [1, 1, 4, 9, 9]
+
+
+@pytest.mark.parametrize("change", [{"steps": 0}, {"sh_degree": 4}, {"hold_out_every": 1}, {"ssim_weight": 1.5}])
+def test_a_recipe_outside_its_range_is_refused(change: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(SplatRecipe(), **change)

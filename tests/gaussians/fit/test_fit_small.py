@@ -1,0 +1,140 @@
+"""The training loop on a scene of 500 Gaussians: does it learn, continue, follow the actor, and stop on a bad number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.gaussians import GaussianCloud
+from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, fit, held_out, loop
+from alpasim_plugin.gaussians.fit.checkpoint import STATE_FILE
+from alpasim_plugin.gaussians.fit.quality import compare, summary
+from tests.gaussians.fit.conftest import BOX, Posed, actor_pose, at, camera_at
+
+QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, reset_every=0.25, save_every=15, sh_degree=1)
+
+
+def mean_psnr(model: Reconstruction, views: list[PosedView]) -> float:
+    return float(summary(compare(model.graph(), views, 1))["psnr_db"])
+
+
+def bits(model: Reconstruction) -> list[bytes]:
+    clouds = [model.background, *(model.actors[name] for name in sorted(model.actors))]
+    return [np.ascontiguousarray(getattr(c, name)).tobytes() for c in clouds for name in ("means", "quats", "scales", "opacities", "sh")]
+
+
+def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed: Posed) -> None:
+    train, kept = held_out(posed.views, 4)
+    recipe = replace(QUICK, steps=80, reset_every=0.0)
+    before = mean_psnr(fit(train, posed.start, replace(recipe, steps=1)), kept)
+    numbers: list[dict[str, float]] = []
+    after = fit(train, posed.start, recipe, report=lambda step, row: numbers.append({"step": step, **row}))
+    assert mean_psnr(after, kept) > before + 4.0
+    assert [row["step"] for row in numbers] == list(range(1, 81))
+    assert numbers[-1]["loss"] < 0.5 * numbers[0]["loss"]
+    assert len(posed.start.background) < len(after) <= recipe.cap
+
+
+def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed: Posed, tmp_path) -> None:
+    whole = fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "whole")
+
+    class CutOffError(Exception):
+        pass
+
+    def cut(step: int, numbers: object) -> None:
+        if step == 27:  # between checkpoints, between densifications, after a reset of opacities
+            raise CutOffError
+
+    with pytest.raises(CutOffError):
+        fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "cut", report=cut)
+    steps: list[int] = []
+    again = fit(posed.views, posed.start, QUICK, scene_id="s", folder=tmp_path / "cut", report=lambda step, _: steps.append(step))
+    assert steps[0] == 16, "continues after the checkpoint"
+    assert bits(again) == bits(whole)
+
+
+def test_threads_do_not_change_the_result(posed: Posed) -> None:
+    recipe = replace(QUICK, steps=12)
+    assert bits(fit(posed.views, posed.start, recipe, threads=1)) == bits(fit(posed.views, posed.start, recipe, threads=2))
+
+
+def test_another_seed_gives_another_model(posed: Posed) -> None:
+    recipe = replace(QUICK, steps=3)
+    assert bits(fit(posed.views, posed.start, recipe)) != bits(fit(posed.views, posed.start, replace(recipe, seed=1)))
+
+
+def test_a_folder_begun_with_another_recipe_is_refused(posed: Posed, tmp_path) -> None:
+    recipe = replace(QUICK, steps=2)
+    fit(posed.views, posed.start, recipe, folder=tmp_path)
+    with pytest.raises(InputError, match="choose another folder"):
+        fit(posed.views, posed.start, replace(recipe, lr_scales=0.1), folder=tmp_path)
+    with pytest.raises(InputError, match="choose another folder"):
+        fit(posed.views[1:], posed.start, recipe, folder=tmp_path)
+
+
+def test_the_actor_is_learned_in_its_own_frame(posed: Posed) -> None:
+    model = fit(posed.views, posed.start, replace(QUICK, steps=80, reset_every=0.0))
+    car = model.actors["car"]
+    solid = car.opacities > 0.3
+    assert solid.sum() > 10
+    inside = np.all(np.abs(car.means[solid]) < np.array([BOX.length_m, BOX.width_m, BOX.height_m]) / 2 + 0.5, axis=1)
+    assert inside.mean() > 0.9, "in the frame of its box, not in the world"
+    # Put where no view saw it, it is drawn there and nowhere else.
+    camera, graph = camera_at(0.0), model.graph()
+    T = actor_pose(0)
+    T[:3, 3] = at(8.0, 2.0, 0.8)
+    moved = np.abs(graph.render(camera, {"car": T}, 1).rgb - graph.render(camera, {}, 1).rgb).max(axis=2)
+    rows, columns = np.nonzero(moved > 0.1)
+    assert len(rows) > 20
+    assert columns.max() < 0.6 * camera.width, "to the left, as it was put"
+
+
+def test_a_mask_keeps_what_it_hides_out_of_the_model(posed: Posed) -> None:
+    spoiled = []
+    for view in posed.views:
+        rgb, mask = view.rgb.copy(), np.ones(view.rgb.shape[:2], dtype=bool)
+        rgb[-8:], mask[-8:] = (255, 0, 255), False
+        spoiled.append(replace(view, rgb=rgb, mask=mask))
+    model = fit(spoiled, posed.start, replace(QUICK, steps=40)).graph()
+    shown = model.render(posed.views[3].camera, posed.views[3].actors, 1).rgb[-6:]
+    magenta = (shown[..., 0] > 0.8) & (shown[..., 1] < 0.2) & (shown[..., 2] > 0.8)
+    assert magenta.mean() < 0.05
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit_with_the_state_before_it(posed: Posed, tmp_path, monkeypatch) -> None:
+    real, calls = loop.rasterize_gradient, []
+
+    def breaks(*args, **kwargs):
+        calls.append(1)
+        out = real(*args, **kwargs)
+        return replace(out, rgb=out.rgb * float("nan")) if len(calls) == 4 else out
+
+    monkeypatch.setattr(loop, "rasterize_gradient", breaks)
+    with pytest.raises(InfrastructureError) as error:
+        fit(posed.views, posed.start, QUICK, folder=tmp_path)
+    assert "update 3" in str(error.value)
+    assert "view-" in str(error.value)
+    monkeypatch.setattr(loop, "rasterize_gradient", real)
+    steps: list[int] = []
+    fit(posed.views, posed.start, QUICK, folder=tmp_path, report=lambda step, _: steps.append(step))
+    assert (tmp_path / STATE_FILE).exists()
+    assert steps[0] == 4
+
+
+def test_a_gradient_that_is_not_finite_stops_it_too(posed: Posed) -> None:
+    run = loop.SplatFit(posed.views, posed.start, QUICK, "", "cpu", None, None)
+    run.model.params["means"].register_hook(lambda gradient: gradient * float("inf"))
+    before = {name: p.detach().clone() for name, p in run.model.params.items()}
+    with pytest.raises(InfrastructureError, match="gradient of means"):
+        run.update()
+    assert all(torch.equal(before[name], p.detach()) for name, p in run.model.params.items())
+
+
+@pytest.mark.parametrize("missing", ["views", "start"])
+def test_nothing_to_learn_from_is_one_clear_error(posed: Posed, missing: str) -> None:
+    with pytest.raises(InputError):
+        fit([], posed.start, QUICK) if missing == "views" else fit(posed.views, Start(GaussianCloud.empty(), {}), QUICK)
