@@ -11,6 +11,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.config import apply_overrides, load_yaml, validate
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.yaml_marks import Document
 
 DOING = "reading the settings of a fixer"
@@ -116,7 +117,7 @@ class OneFixerSettings(FixerSettings):
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
     history: Literal["finalise", "last-forward", "none"] = Field(
         default="last-forward",
-        description="What the history keeps of a block: keys and values of an extra forward, or of the last step. none: there is no history, "
+        description="What the history keeps of a block: keys and values of an extra forward, or of the last step. none: no history, "
         "every frame is fixed by itself.",
     )
     holes: Literal["noise", "render"] = Field(
@@ -158,7 +159,28 @@ def load_settings(name: str, model: type[S], overrides: Sequence[str] = ()) -> S
     """
     path = Path(str(resources.files("configs.fixers"))) / f"{name}.yaml"
     document = load_yaml(path, DOING) if path.is_file() else Document({"name": name}, {}, f"the defaults of {name}")
-    return validate(model, _absolute(_override(document, overrides)), DOING)
+    return validate(model, _absolute(_override(_without_shipped(document, overrides), overrides)), DOING)
+
+
+def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
+    """Let parts named in overrides take the place of the bundle that the file names; sizes are what its weights are, so they stay.
+
+    Raises:
+        InputError: Other sizes for weights that have theirs.
+    """
+    keys = {text.partition("=")[0].strip() for text in overrides}
+    weights = document.data.get("weights")
+    if not isinstance(weights, dict) or weights.get("bundle") is None or "weights.bundle" in keys:
+        return document
+    sizes = sorted(key for key in keys if key.partition(".")[0] in ("dit", "vae"))
+    if sizes:
+        found = f"the weights in {weights['bundle']} have their sizes"
+        do = "add --set fixer.weights.bundle=null for an untrained network of other sizes, or give a bundle of yours"
+        raise InputError(DOING, ", ".join(f"fixer.{key}" for key in sizes), found, do)
+    if not any(f"weights.{part}" in keys for part in ("dit", "vae", "decoder", "prompt")):
+        return document
+    kept = {key: value for key, value in weights.items() if key not in ("bundle", "sha256")}
+    return replace(document, data={**document.data, "weights": kept})
 
 
 def _override(document: Document, overrides: Sequence[str]) -> Document:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from alpasim_plugin.errors import FixerError, InputError
 from alpasim_plugin.fixers import FIXERS, BlockRule, fixer_settings, make_fixer
 from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
+from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings, WeightsSettings, load_settings
 from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.fixers.fixer_cases import small_settings
@@ -90,6 +91,24 @@ def test_paths_start_where_they_were_written() -> None:
     assert isinstance(settings, OneFixerSettings)
     assert settings.weights.dit == str(Path.cwd() / "nets/a.safetensors")
     assert settings.weights.vae == "/b.safetensors"
+
+
+def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped = tmp_path / "shipped.yaml"
+    plain = Path(str(resources.files("configs.fixers"))) / "onefixer-tiny.yaml"
+    shipped.write_text(plain.read_text().partition("weights:")[0] + "weights: {bundle: here.safetensors}\n")
+    monkeypatch.setattr("alpasim_plugin.fixers.settings.resources.files", lambda package: tmp_path)
+
+    def weights(*overrides: str) -> WeightsSettings:
+        return load_settings("shipped", OneFixerSettings, overrides).weights
+
+    assert weights().bundle == str(tmp_path / "here.safetensors")
+    assert weights("window=4").bundle == str(tmp_path / "here.safetensors")
+    assert (weights("weights.dit=/a").bundle, weights("weights.dit=/a").dit) == (None, "/a")
+    assert weights("weights.bundle=/b").bundle == "/b"
+    assert weights("weights.bundle=null", "dit.width=24").bundle is None
+    with pytest.raises(InputError, match=r"fixer\.dit\.width[\s\S]*have their sizes[\s\S]*weights\.bundle=null"):
+        weights("dit.width=24")
 
 
 def test_the_large_fixer_does_not_go_without_weights() -> None:
