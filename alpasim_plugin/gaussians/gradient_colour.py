@@ -16,7 +16,7 @@ from alpasim_plugin.gaussians.layout import RECORD, B, G, R
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def write_basis(basis, size, x, y, z):
     """Write ``size`` harmonics of a unit direction."""
     basis[0] = C0
@@ -32,7 +32,7 @@ def write_basis(basis, size, x, y, z):
             basis[14], basis[15] = C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def basis_gradient(weights, size, x, y, z):
     """Return the gradient with respect to x, y and z of the harmonics' sum weighted by ``weights``."""
     gx, gy, gz = 0.0, 0.0, 0.0
@@ -54,27 +54,28 @@ def basis_gradient(weights, size, x, y, z):
     return gx, gy, gz
 
 
-@njit(cache=True, nogil=True)
-def colour_splats(cursor, chunk_size, gaussian, means, centre, sh, records):
-    """Write the colours of splats in the order of depth; called by each thread.
+@njit(cache=True, nogil=True, error_model="numpy")
+def colour_splats(cursor, chunk_size, count, ids, means, centre, sh, records):
+    """Write the colours of projected splats; called by each thread.
 
     Args:
-        cursor: int64 ``(1,)``, the next chunk; shared by all threads.
+        cursor: int64 ``(2,)``: the next chunk, and 1 where a colour was not finite; shared by all threads.
         chunk_size: Splats taken at once.
-        gaussian: int64 ``(M,)``, which Gaussian a rank shows.
+        count: Records.
+        ids: int64, which Gaussian a record shows.
         means: float64 ``(N, 3)``, metres, world.
         centre: float64 ``(3,)``, camera centre, metres, world.
         sh: float32 ``(N, K, 3)``.
-        records: float32, RECORD per rank; columns R, G, B are written, clamped at 0 below.
+        records: float32, RECORD per splat; columns R, G, B are written, clamped at 0 below.
     """
     basis = np.empty(16)
     size = sh.shape[1]
     while True:
         first = v.fetch_add(cursor, 0, 1) * chunk_size
-        if first >= gaussian.shape[0]:
+        if first >= count:
             return
-        for rank in range(first, min(first + chunk_size, gaussian.shape[0])):
-            i = gaussian[rank]
+        for place in range(first, min(first + chunk_size, count)):
+            i = ids[place]
             x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
             length = 1.0 / np.sqrt(x * x + y * y + z * z)
             write_basis(basis, size, x * length, y * length, z * length)
@@ -83,5 +84,7 @@ def colour_splats(cursor, chunk_size, gaussian, means, centre, sh, records):
                 red += basis[k] * sh[i, k, 0]
                 green += basis[k] * sh[i, k, 1]
                 blue += basis[k] * sh[i, k, 2]
-            at = rank * RECORD
+            if not np.isfinite(red + green + blue):
+                cursor[1] = 1
+            at = place * RECORD
             records[at + R], records[at + G], records[at + B] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)

@@ -48,17 +48,64 @@ from alpasim_plugin.gaussians.layout import (
     POSE_CENTRE,
     POSE_ROTATION,
     RECORD,
-    B,
-    G,
     R,
 )
 
 _f = np.float32
 
 
-@njit(cache=True, nogil=True)
-def _rotation(w, x, y, z):
-    """Return the rotation matrix of a unit quaternion, row by row."""
+# Small vectors and matrices are tuples (of rows) with constant indices: they live in registers.
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _dot(a, b):
+    """Return the inner product of two 3-vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _times(matrix, b):
+    """Return a 3 x 3 matrix times a column."""
+    return _dot(matrix[0], b), _dot(matrix[1], b), _dot(matrix[2], b)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _transposed(matrix):
+    """Return a 3 x 3 matrix with rows and columns swapped."""
+    p, q, r = matrix
+    return (p[0], q[0], r[0]), (p[1], q[1], r[1]), (p[2], q[2], r[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scaled(a, factor):
+    """Return a 3-vector times a number."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _less(a, share, b):
+    """Return ``a - share b`` of 3-vectors."""
+    return a[0] - share * b[0], a[1] - share * b[1], a[2] - share * b[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _two_products(p, a, q, b):
+    """Return ``p a + q b`` of two numbers and two 3-vectors."""
+    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _unit_quaternion(quaternions, i):
+    """Return row i as w, x, y, z of length one, and one over its length, float64."""
+    w, x, y, z = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
+    inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return (w * inverse, x * inverse, y * inverse, z * inverse), inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rotation(q):
+    """Return the rotation matrix of a unit quaternion."""
+    w, x, y, z = q
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -66,7 +113,7 @@ def _rotation(w, x, y, z):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pack(means, log_scales, quaternions, logits, lane_means, geometry):
     """Write parameters into the lanes that `project_kernels.project_node` reads; Gaussians below the alpha cut get means of NaN.
 
@@ -77,12 +124,12 @@ def pack(means, log_scales, quaternions, logits, lane_means, geometry):
     lane_means[:] = np.nan
     bad = -1
     for i in range(n):
-        w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
-        length = math.sqrt(np.float64(w) * w + np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
-        finite = means[i, 0] + means[i, 1] + means[i, 2] + length + logits[i]
+        q, inverse_length = _unit_quaternion(quaternions, i)
         largest = max(log_scales[i, 0], max(log_scales[i, 1], log_scales[i, 2]))
+        finite = means[i, 0] + means[i, 1] + means[i, 2] + inverse_length + logits[i]
         finite += log_scales[i, 0] + log_scales[i, 1] + log_scales[i, 2]
-        if not (math.isfinite(finite) and length > 0.0 and largest <= LOG_SCALE_LIMIT):
+        # A quaternion of length zero has an infinite inverse, one that is not finite an inverse of zero or NaN.
+        if not (math.isfinite(finite) and inverse_length > 0.0 and largest <= LOG_SCALE_LIMIT):
             if bad < 0:
                 bad = i
             continue
@@ -93,61 +140,98 @@ def pack(means, log_scales, quaternions, logits, lane_means, geometry):
         for axis in range(3):
             lane_means[group * 48 + axis * 16 + lane] = means[i, axis]
         at = group * (GEO_SIZE * 16) + lane
-        rotation = _rotation(w / length, x / length, y / length, z / length)
-        for column in range(3):
-            scale = math.exp(np.float64(log_scales[i, column]))
-            for row in range(3):
-                geometry[at + (GEO_FACTOR + row * 3 + column) * 16] = rotation[row][column] * scale
+        s0, s1, s2 = math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1])), math.exp(np.float64(log_scales[i, 2]))
+        p, q, r = _rotation(q)
+        f = at + GEO_FACTOR * 16
+        geometry[f], geometry[f + 16], geometry[f + 32] = p[0] * s0, p[1] * s1, p[2] * s2
+        geometry[f + 48], geometry[f + 64], geometry[f + 80] = q[0] * s0, q[1] * s1, q[2] * s2
+        geometry[f + 96], geometry[f + 112], geometry[f + 128] = r[0] * s0, r[1] * s1, r[2] * s2
         geometry[at + GEO_PEAK * 16] = (math.log2(opacity) + 4.0) / 8.0
         geometry[at + GEO_EXTENT * 16] = min(EXTENT_MAX_SIGMA, math.sqrt(2.0 * math.log(opacity / ALPHA_MIN)))
-        geometry[at + GEO_REACH * 16] = math.exp(np.float64(largest))
+        geometry[at + GEO_REACH * 16] = max(s0, max(s1, s2))
     return bad
 
 
-@njit(cache=True, nogil=True)
-def _sum_pairs(first, end, starts, lists, pairs, sums):
-    """Add up the rows of ``pairs`` of ranks ``first`` to ``end`` over all tiles, tile by tile: the order never depends on threads."""
-    sums[:] = 0.0
-    for tile in range(starts.shape[0] - 1):
-        low, high = starts[tile], starts[tile + 1]
-        while low < high:  # ranks ascend within a tile
-            middle = (low + high) // 2
-            if lists[middle] < first:
-                low = middle + 1
-            else:
-                high = middle
-        while low < starts[tile + 1] and lists[low] < end:
-            at = (lists[low] - first) * PAIR
+@njit(cache=True, nogil=True, error_model="numpy")
+def sum_pairs(cursor, chunk_size, gaussian, starts, lists, pairs, records, sums):
+    """Add up the pairs of each visible splat; called by each thread. The order, tile by tile, never depends on threads.
+
+    Args:
+        cursor: int64 ``(1,)``, the next chunk; shared by all threads.
+        chunk_size: Splats taken at once.
+        gaussian: int64 ``(M,)``, which Gaussian a rank shows.
+        starts: See `binning.tile_offsets`.
+        lists: Ranks per tile.
+        pairs: From `gradient_kernels.tile_gradients`.
+        records: Splats in the order of depth; where a colour is 0 its clamp ends the gradient.
+        sums: float32 output, PAIR per Gaussian; rows of Gaussians that are not visible stay as they are.
+    """
+    chunk = np.empty(chunk_size * PAIR)
+    while True:
+        first = v.fetch_add(cursor, 0, 1) * chunk_size
+        if first >= gaussian.shape[0]:
+            return
+        end = min(first + chunk_size, gaussian.shape[0])
+        chunk[:] = 0.0
+        for tile in range(starts.shape[0] - 1):
+            low, high = starts[tile], starts[tile + 1]
+            while low < high:  # ranks ascend within a tile
+                middle = (low + high) // 2
+                if lists[middle] < first:
+                    low = middle + 1
+                else:
+                    high = middle
+            while low < starts[tile + 1] and lists[low] < end:
+                at = (lists[low] - first) * PAIR
+                for k in range(PAIR):
+                    chunk[at + k] += pairs[low * PAIR + k]
+                low += 1
+        for rank in range(first, end):
+            at, out = (rank - first) * PAIR, gaussian[rank] * PAIR
             for k in range(PAIR):
-                sums[at + k] += pairs[low * PAIR + k]
-            low += 1
+                sums[out + k] = chunk[at + k]
+            for channel in range(3):
+                if not records[rank * RECORD + R + channel] > _f(0.0):
+                    sums[out + PAIR_R + channel] = _f(0.0)
 
 
-@njit(cache=True, nogil=True)
-def _shape_gradient(m, n, whitened, h_s, h_t, h_ss, h_st, h_tt):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shape_gradient(m, n, sums, at):
     """Return the gradients of (u, v), of row m and of row n from the moments of h."""
-    l11, l12, l22 = whitened
-    # W M and then (sum h w w^T) W M.
-    s0, s1, s2 = l11 * m[0] + l12 * n[0], l11 * m[1] + l12 * n[1], l11 * m[2] + l12 * n[2]
-    t0, t1, t2 = l22 * n[0], l22 * n[1], l22 * n[2]
-    a0, a1, a2 = h_ss * s0 + h_st * t0, h_ss * s1 + h_st * t1, h_ss * s2 + h_st * t2
-    b0, b1, b2 = h_st * s0 + h_tt * t0, h_st * s1 + h_tt * t1, h_st * s2 + h_tt * t2
-    uv = (l11 * h_s, l12 * h_s + l22 * h_t)
-    return uv, (l11 * a0, l11 * a1, l11 * a2), (l12 * a0 + l22 * b0, l12 * a1 + l22 * b1, l12 * a2 + l22 * b2)
+    mm, nn, mn = _dot(m, m), _dot(n, n), _dot(m, n)
+    c22 = nn + EPS2D_PX2
+    x01, x02, x12 = m[0] * n[1] - m[1] * n[0], m[0] * n[2] - m[2] * n[0], m[1] * n[2] - m[2] * n[1]
+    det = x01 * x01 + x02 * x02 + x12 * x12 + EPS2D_PX2 * (mm + c22)
+    # The moments are over s and t, which are the whitened coordinates times EXPONENT_SCALE.
+    w11, w22 = math.sqrt(c22 / det) / EXPONENT_SCALE, 1.0 / (math.sqrt(c22) * EXPONENT_SCALE)
+    w12 = -w11 * mn / c22
+    du, dv = w11 * sums[at + PAIR_S], w12 * sums[at + PAIR_S] + w22 * sums[at + PAIR_T]
+    h_ss, h_st, h_tt = sums[at + PAIR_SS], sums[at + PAIR_ST], sums[at + PAIR_TT]
+    # W M, then (sum h w w^T) W M, then W^T on the left; each w above holds one factor 1 / EXPONENT_SCALE.
+    s, t = _two_products(w11, m, w12, n), _scaled(n, w22)
+    a, b = _two_products(h_ss, s, h_st, t), _two_products(h_st, s, h_tt, t)
+    return du, dv, _scaled(a, w11), _two_products(w12, a, w22, b)
 
 
-@njit(cache=True, nogil=True)
-def _quaternion_gradient(w, x, y, z, d):
-    """Return the gradient of a unit quaternion from that of its rotation matrix, ``(3, 3)``."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _quaternion_gradient(q, inverse_length, d):
+    """Return the gradient of a quaternion from that of the rotation matrix of its unit form."""
+    w, x, y, z = q
+    (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = d
+    gw = 2 * (x * (d21 - d12) + y * (d02 - d20) + z * (d10 - d01))
+    gx = 2 * (y * (d01 + d10) + z * (d02 + d20) + w * (d21 - d12) - 2 * x * (d11 + d22))
+    gy = 2 * (x * (d01 + d10) + z * (d12 + d21) + w * (d02 - d20) - 2 * y * (d00 + d22))
+    gz = 2 * (x * (d02 + d20) + y * (d12 + d21) + w * (d10 - d01) - 2 * z * (d00 + d11))
+    radial = gw * w + gx * x + gy * y + gz * z  # the length does not matter, so its share goes
     return (
-        2 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1])),
-        2 * (y * (d[0, 1] + d[1, 0]) + z * (d[0, 2] + d[2, 0]) + w * (d[2, 1] - d[1, 2]) - 2 * x * (d[1, 1] + d[2, 2])),
-        2 * (x * (d[0, 1] + d[1, 0]) + z * (d[1, 2] + d[2, 1]) + w * (d[0, 2] - d[2, 0]) - 2 * y * (d[0, 0] + d[2, 2])),
-        2 * (x * (d[0, 2] + d[2, 0]) + y * (d[1, 2] + d[2, 1]) + w * (d[1, 0] - d[0, 1]) - 2 * z * (d[0, 0] + d[1, 1])),
+        (gw - radial * w) * inverse_length,
+        (gx - radial * x) * inverse_length,
+        (gy - radial * y) * inverse_length,
+        (gz - radial * z) * inverse_length,
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _colour_gradient(i, size, direction, red, green, blue, sh, g_sh, basis, weights):
     """Write the gradient of a Gaussian's coefficients and return that of its unit view direction."""
     write_basis(basis, size, direction[0], direction[1], direction[2])
@@ -157,21 +241,18 @@ def _colour_gradient(i, size, direction, red, green, blue, sh, g_sh, basis, weig
     return basis_gradient(weights, size, direction[0], direction[1], direction[2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def splat_gradients(
-    cursor, chunk_size, gaussian, starts, lists, pairs, records, pose, camera, means, log_scales, quaternions, logits, sh,
+    cursor, chunk_size, radii, sums, pose, camera, means, log_scales, quaternions, logits, sh,
     g_means, g_log_scales, g_quaternions, g_logits, g_sh, screen,
 ):  # fmt: skip
-    """Sum the pairs of each visible splat and write the gradients of its Gaussian; called by each thread.
+    """Write the gradients of visible Gaussians, in their own order (memory decides the speed); called by each thread.
 
     Args:
         cursor: int64 ``(1,)``, the next chunk; shared by all threads.
-        chunk_size: Splats taken at once.
-        gaussian: int64 ``(M,)``, which Gaussian a rank shows.
-        starts: See `binning.tile_offsets`.
-        lists: Ranks per tile.
-        pairs: From `gradient_kernels.tile_gradients`.
-        records: Splats in the order of depth; where a colour is 0 its clamp ended the gradient.
+        chunk_size: Gaussians taken at once.
+        radii: int32 ``(N,)``, 0 where a Gaussian is not visible.
+        sums: From `sum_pairs`.
         pose: See layout; the node is the world.
         camera: See layout.
         means: float64 ``(N, 3)``, metres, world.
@@ -186,109 +267,62 @@ def splat_gradients(
         g_sh: See above.
         screen: float32 output ``(N,)``, length of the gradient of the mean in pixels; zero at the start.
     """
-    sums = np.empty(chunk_size * PAIR)
-    basis, weights, d_rotation = np.empty(16), np.empty(16), np.empty((3, 3))
-    r = pose[POSE_ROTATION : POSE_ROTATION + 9]
+    basis, weights = np.empty(16), np.empty(16)
+    size = sh.shape[1]
+    r = POSE_ROTATION
+    right = (pose[r], pose[r + 1], pose[r + 2])
+    down = (pose[r + 3], pose[r + 4], pose[r + 5])
+    ahead = (pose[r + 6], pose[r + 7], pose[r + 8])
     fx, fy = np.float64(camera[CAM_FX]), np.float64(camera[CAM_FY])
-    d_factor, factor = np.empty((3, 3)), np.empty((3, 3))
-    scale = np.empty(3)
     while True:
         first = v.fetch_add(cursor, 0, 1) * chunk_size
-        if first >= gaussian.shape[0]:
+        if first >= radii.shape[0]:
             return
-        end = min(first + chunk_size, gaussian.shape[0])
-        _sum_pairs(first, end, starts, lists, pairs, sums)
-        for rank in range(first, end):
-            i = gaussian[rank]
-            at = (rank - first) * PAIR
-            px, py, pz = means[i, 0] - pose[POSE_CENTRE], means[i, 1] - pose[POSE_CENTRE + 1], means[i, 2] - pose[POSE_CENTRE + 2]
-            z = r[6] * px + r[7] * py + r[8] * pz
-            inverse_z = 1.0 / z
-            slope_x, slope_y = (r[0] * px + r[1] * py + r[2] * pz) * inverse_z, (r[3] * px + r[4] * py + r[5] * pz) * inverse_z
-            a = min(max(slope_x, camera[CAM_SLOPE_LOW_X]), camera[CAM_SLOPE_HIGH_X])
-            b = min(max(slope_y, camera[CAM_SLOPE_LOW_Y]), camera[CAM_SLOPE_HIGH_Y])
-            sx, sy = fx * inverse_z, fy * inverse_z
-            j = (sx * (r[0] - a * r[6]), sx * (r[1] - a * r[7]), sx * (r[2] - a * r[8]))
-            k = (sy * (r[3] - b * r[6]), sy * (r[4] - b * r[7]), sy * (r[5] - b * r[8]))
-            qw, qx, qy, qz = (
-                np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1]), np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
-            )  # fmt: skip
-            inverse_length = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-            qw, qx, qy, qz = qw * inverse_length, qx * inverse_length, qy * inverse_length, qz * inverse_length
-            rotation = _rotation(qw, qx, qy, qz)
-            for column in range(3):
-                scale[column] = math.exp(np.float64(log_scales[i, column]))
-                for row in range(3):
-                    factor[row, column] = rotation[row][column] * scale[column]
-            m0, m1, m2 = (
-                j[0] * factor[0, 0] + j[1] * factor[1, 0] + j[2] * factor[2, 0],
-                j[0] * factor[0, 1] + j[1] * factor[1, 1] + j[2] * factor[2, 1],
-                j[0] * factor[0, 2] + j[1] * factor[1, 2] + j[2] * factor[2, 2],
-            )
-            n0, n1, n2 = (
-                k[0] * factor[0, 0] + k[1] * factor[1, 0] + k[2] * factor[2, 0],
-                k[0] * factor[0, 1] + k[1] * factor[1, 1] + k[2] * factor[2, 1],
-                k[0] * factor[0, 2] + k[1] * factor[1, 2] + k[2] * factor[2, 2],
-            )
-            mm, nn, mn = m0 * m0 + m1 * m1 + m2 * m2, n0 * n0 + n1 * n1 + n2 * n2, m0 * n0 + m1 * n1 + m2 * n2
-            c22 = nn + EPS2D_PX2
-            x01, x02, x12 = m0 * n1 - m1 * n0, m0 * n2 - m2 * n0, m1 * n2 - m2 * n1
-            det = x01 * x01 + x02 * x02 + x12 * x12 + EPS2D_PX2 * (mm + c22)
-            l11 = math.sqrt(c22 / det)
-            whitened = (l11, -l11 * mn / c22, 1.0 / math.sqrt(c22))
-            # The pairs' moments are over s, t in units of EXPONENT_SCALE.
-            h_s, h_t = sums[at + PAIR_S] / EXPONENT_SCALE, sums[at + PAIR_T] / EXPONENT_SCALE
-            square = EXPONENT_SCALE * EXPONENT_SCALE
-            (du, dv), dm, dn = _shape_gradient(
-                (m0, m1, m2), (n0, n1, n2), whitened, h_s, h_t, sums[at + PAIR_SS] / square, sums[at + PAIR_ST] / square,
-                sums[at + PAIR_TT] / square,
-            )  # fmt: skip
+        for i in range(first, min(first + chunk_size, radii.shape[0])):
+            if radii[i] == 0:
+                continue
+            at = i * PAIR
+            p = (means[i, 0] - pose[POSE_CENTRE], means[i, 1] - pose[POSE_CENTRE + 1], means[i, 2] - pose[POSE_CENTRE + 2])
+            inverse_z = 1.0 / _dot(ahead, p)
+            slope_x, slope_y = _dot(right, p) * inverse_z, _dot(down, p) * inverse_z
+            a = min(max(slope_x, np.float64(camera[CAM_SLOPE_LOW_X])), np.float64(camera[CAM_SLOPE_HIGH_X]))
+            b = min(max(slope_y, np.float64(camera[CAM_SLOPE_LOW_Y])), np.float64(camera[CAM_SLOPE_HIGH_Y]))
+            scale_x, scale_y = fx * inverse_z, fy * inverse_z
+            j, k = _scaled(_less(right, a, ahead), scale_x), _scaled(_less(down, b, ahead), scale_y)
+            q, inverse_length = _unit_quaternion(quaternions, i)
+            rotation = _rotation(q)
+            s = (math.exp(np.float64(log_scales[i, 0])), math.exp(np.float64(log_scales[i, 1])), math.exp(np.float64(log_scales[i, 2])))
+            # Columns of R_q diag(s), then the rows m, n of M.
+            x, y, z = _transposed(rotation)
+            x, y, z = _scaled(x, s[0]), _scaled(y, s[1]), _scaled(z, s[2])
+            columns = (x, y, z)
+            du, dv, dm, dn = _shape_gradient(_times(columns, j), _times(columns, k), sums, at)
             screen[i] = math.sqrt(du * du + dv * dv)
             g_logits[i] = sums[at + PAIR_H] / (1.0 + math.exp(np.float64(logits[i])))
 
-            # M = (J R_camera) (R_q diag s): rows j, k of the first factor, then the second.
-            dj0, dj1, dj2 = (
-                factor[0, 0] * dm[0] + factor[0, 1] * dm[1] + factor[0, 2] * dm[2],
-                factor[1, 0] * dm[0] + factor[1, 1] * dm[1] + factor[1, 2] * dm[2],
-                factor[2, 0] * dm[0] + factor[2, 1] * dm[1] + factor[2, 2] * dm[2],
-            )
-            dk0, dk1, dk2 = (
-                factor[0, 0] * dn[0] + factor[0, 1] * dn[1] + factor[0, 2] * dn[2],
-                factor[1, 0] * dn[0] + factor[1, 1] * dn[1] + factor[1, 2] * dn[2],
-                factor[2, 0] * dn[0] + factor[2, 1] * dn[1] + factor[2, 2] * dn[2],
-            )
-            for column in range(3):
-                along = 0.0
-                for row in range(3):
-                    d_factor[row, column] = j[row] * dm[column] + k[row] * dn[column]
-                    along += factor[row, column] * d_factor[row, column]
-                    d_rotation[row, column] = d_factor[row, column] * scale[column]
-                g_log_scales[i, column] = along
-            gw, gx, gy, gz = _quaternion_gradient(qw, qx, qy, qz, d_rotation)
-            radial = gw * qw + gx * qx + gy * qy + gz * qz
-            g_quaternions[i, 0] = (gw - radial * qw) * inverse_length
-            g_quaternions[i, 1] = (gx - radial * qx) * inverse_length
-            g_quaternions[i, 2] = (gy - radial * qy) * inverse_length
-            g_quaternions[i, 3] = (gz - radial * qz) * inverse_length
+            # M = (J R_camera) (R_q diag s): the gradient of the second factor by columns, then that of the rows j, k of the first.
+            d0, d1, d2 = _two_products(dm[0], j, dn[0], k), _two_products(dm[1], j, dn[1], k), _two_products(dm[2], j, dn[2], k)
+            g_log_scales[i, 0], g_log_scales[i, 1], g_log_scales[i, 2] = _dot(x, d0), _dot(y, d1), _dot(z, d2)
+            turned = _transposed((_scaled(d0, s[0]), _scaled(d1, s[1]), _scaled(d2, s[2])))
+            gw, gx, gy, gz = _quaternion_gradient(q, inverse_length, turned)
+            g_quaternions[i, 0], g_quaternions[i, 1], g_quaternions[i, 2], g_quaternions[i, 3] = gw, gx, gy, gz
+            rows = _transposed(columns)
+            dj, dk = _times(rows, dm), _times(rows, dn)
 
             # Depth: its own sum, the 1/z of J, and the slopes; a clamped slope passes nothing on.
-            dz = sums[at + PAIR_Z] - (dj0 * j[0] + dj1 * j[1] + dj2 * j[2] + dk0 * k[0] + dk1 * k[1] + dk2 * k[2]) * inverse_z
             d_slope_x, d_slope_y = fx * du, fy * dv
             if a == slope_x:
-                d_slope_x -= sx * (dj0 * r[6] + dj1 * r[7] + dj2 * r[8])
+                d_slope_x -= scale_x * _dot(dj, ahead)
             if b == slope_y:
-                d_slope_y -= sy * (dk0 * r[6] + dk1 * r[7] + dk2 * r[8])
+                d_slope_y -= scale_y * _dot(dk, ahead)
             dx, dy = d_slope_x * inverse_z, d_slope_y * inverse_z
-            dz -= dx * slope_x + dy * slope_y
+            dz = sums[at + PAIR_Z] - (_dot(dj, j) + _dot(dk, k)) * inverse_z - dx * slope_x - dy * slope_y
 
-            size = sh.shape[1]
-            distance = math.sqrt(px * px + py * py + pz * pz)
-            direction = (px / distance, py / distance, pz / distance)
-            red = sums[at + PAIR_R] if records[rank * RECORD + R] > _f(0.0) else 0.0
-            green = sums[at + PAIR_G] if records[rank * RECORD + G] > _f(0.0) else 0.0
-            blue = sums[at + PAIR_B] if records[rank * RECORD + B] > _f(0.0) else 0.0
-            ex, ey, ez = _colour_gradient(i, size, direction, red, green, blue, sh, g_sh, basis, weights)
-            radial = ex * direction[0] + ey * direction[1] + ez * direction[2]
-            g_means[i, 0] = r[0] * dx + r[3] * dy + r[6] * dz + (ex - radial * direction[0]) / distance
-            g_means[i, 1] = r[1] * dx + r[4] * dy + r[7] * dz + (ey - radial * direction[1]) / distance
-            g_means[i, 2] = r[2] * dx + r[5] * dy + r[8] * dz + (ez - radial * direction[2]) / distance
+            inverse_distance = 1.0 / math.sqrt(_dot(p, p))
+            direction = _scaled(p, inverse_distance)
+            red, green, blue = sums[at + PAIR_R], sums[at + PAIR_G], sums[at + PAIR_B]
+            e = _colour_gradient(i, size, direction, red, green, blue, sh, g_sh, basis, weights)
+            e = _scaled(_less(e, _dot(e, direction), direction), inverse_distance)
+            g_means[i, 0] = right[0] * dx + down[0] * dy + ahead[0] * dz + e[0]
+            g_means[i, 1] = right[1] * dx + down[1] * dy + ahead[1] * dz + e[1]
+            g_means[i, 2] = right[2] * dx + down[2] * dy + ahead[2] * dz + e[2]

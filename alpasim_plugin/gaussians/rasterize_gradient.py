@@ -18,9 +18,9 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.constants import NEAR_M
 from alpasim_plugin.gaussians.gradient_colour import colour_splats
 from alpasim_plugin.gaussians.gradient_kernels import KEPT, PAIR, composite_tiles, tile_gradients
-from alpasim_plugin.gaussians.gradient_project import pack, splat_gradients
+from alpasim_plugin.gaussians.gradient_project import pack, splat_gradients, sum_pairs
 from alpasim_plugin.gaussians.gradient_types import GradientOutput, ScreenStatistics, Splats
-from alpasim_plugin.gaussians.layout import GEO_SIZE, POSE_CENTRE, RADIUS_X, RADIUS_Y, RECORD, SPHERE_SIZE
+from alpasim_plugin.gaussians.layout import BUNDLE, GEO_SIZE, POSE_CENTRE, RADIUS_X, RADIUS_Y, RECORD
 from alpasim_plugin.gaussians.project_kernels import project_node
 from alpasim_plugin.gaussians.rasterize_cpu import WORTH_THREADS, Buffers, TileLists, camera_numbers, list_per_tile, node_poses
 from alpasim_plugin.gaussians.workers import run_on_threads, thread_count
@@ -78,14 +78,13 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, npt.NDArray[np.int
     groups = -(-n // _LANES)
     lane_means, geometry = np.empty(groups * 3 * _LANES), np.zeros(groups * GEO_SIZE * _LANES, np.float32)
     bad = pack(p.means, p.log_scales, p.quaternions, p.logits, lane_means, geometry)
-    if bad >= 0 or not np.isfinite(np.sum(p.sh, dtype=np.float64)):
+    if bad >= 0:
         _refuse(p, bad)
     buffers = Buffers()
     records, ids = buffers.get("records", n * RECORD, np.float32), buffers.get("ids", n, np.int64)
     # Colours follow for the visible ones alone, and bundles in the optimiser's order have no bounding spheres worth a test.
     plain = np.zeros(groups * 3 * _LANES, np.float32)
-    everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-groups // _LANES))
-    assert everywhere.size % SPHERE_SIZE == 0
+    everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-n // BUNDLE))
     cursor = np.zeros(2, np.int64)
     index = np.arange(groups * _LANES, dtype=np.int64)
     workers = view.threads if n > WORTH_THREADS else 1
@@ -93,11 +92,13 @@ def _project(p: _Parameters, view: _View) -> tuple[TileLists, npt.NDArray[np.int
         workers, project_node, cursor, lane_means, geometry, plain, 1, index, everywhere, 0, view.pose, view.numbers, records, ids
     )
     count = int(cursor[1])
-    tiles = list_per_tile(count, records, ids, view.camera, view.threads, buffers)
-    gaussian = np.asarray(ids[tiles.order[:count] & 0xFFFFFFFF], np.int64)  # type: ignore[operator]
     cursor[:] = 0
     centre = view.pose[POSE_CENTRE : POSE_CENTRE + 3]
-    run_on_threads(workers, colour_splats, cursor, _chunk(count), gaussian, p.means, centre, p.sh, tiles.ordered)
+    run_on_threads(workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records)
+    if cursor[1]:
+        _refuse(p, -1)
+    tiles = list_per_tile(count, records, ids, view.camera, view.threads, buffers)
+    gaussian = np.asarray(ids[tiles.order[:count] & 0xFFFFFFFF], np.int64)  # type: ignore[operator]
     return tiles, gaussian
 
 
@@ -150,11 +151,16 @@ class _Rasterize(torch.autograd.Function):
         )  # fmt: skip
         out = [np.zeros(a.shape, a.dtype) for a in (p.means, p.log_scales, p.quaternions, p.logits, p.sh)]
         norm = np.zeros(len(p.means), np.float32)
-        cursor[:] = 0
+        sums = np.empty(len(p.means) * PAIR, np.float32)
         workers = view.threads if len(kept.gaussian) > WORTH_THREADS else 1
+        cursor[:] = 0
         run_on_threads(
-            workers, splat_gradients, cursor, _chunk(len(kept.gaussian)), kept.gaussian, tiles.starts, tiles.lists, pairs, tiles.ordered,
-            view.pose, view.numbers, p.means, p.log_scales, p.quaternions, p.logits, p.sh, *out, norm,
+            workers, sum_pairs, cursor, _chunk(len(kept.gaussian)), kept.gaussian, tiles.starts, tiles.lists, pairs, tiles.ordered, sums
+        )
+        cursor[:] = 0
+        run_on_threads(
+            workers, splat_gradients, cursor, _chunk(len(p.means)), ctx.screen.radii.numpy(), sums, view.pose, view.numbers, p.means,
+            p.log_scales, p.quaternions, p.logits, p.sh, *out, norm,
         )  # fmt: skip
         ctx.screen.gradient_norm = torch.from_numpy(norm)
         return (*(torch.from_numpy(g).to(t.dtype) for g, t in zip(out, tensors, strict=True)), None, None)

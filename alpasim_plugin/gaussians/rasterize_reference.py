@@ -11,7 +11,8 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, NEAR_M, TRANSMITTANCE_STOP
 from alpasim_plugin.gaussians.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.project import project_gaussians
+from alpasim_plugin.gaussians.project import Projection, project_gaussians
+from alpasim_plugin.types import F64
 
 
 def rasterize_reference(
@@ -38,7 +39,23 @@ def rasterize_reference(
         InputError: The cloud holds Gaussians that cannot be drawn, or the background does not fit.
     """
     splats = project_gaussians(cloud, camera, near_m, lod_px)
-    behind = background_image(background, camera).astype(np.float64)
+    colour, alpha, depth = composite_reference(splats, camera, background_image(background, camera).astype(np.float64), brute)
+    stats = {"gaussians": len(cloud), "visible": len(splats)}
+    return RasterOutput(np.clip(colour, 0, 1).astype(np.float32), alpha.astype(np.float32), depth.astype(np.float32), stats)
+
+
+def composite_reference(splats: Projection, camera: PinholeCamera, behind: F64, brute: bool = False) -> tuple[F64, F64, F64]:
+    """Blend projected Gaussians, nearest first, in float64.
+
+    Args:
+        splats: In the order in which they are drawn.
+        camera: Gives the image's size.
+        behind: ``(H, W, 3)`` or ``(1, 1, 3)`` background.
+        brute: See `rasterize_reference`.
+
+    Returns:
+        Colour ``(H, W, 3)`` with background, not clamped; alpha ``(H, W)``; depth ``(H, W)``, metres, 0 where alpha is 0.
+    """
     height, width = camera.height, camera.width
     rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
     colour = np.zeros((height, width, 3))
@@ -69,6 +86,4 @@ def rasterize_reference(
 
     alpha_total = 1 - transmittance
     depth = np.divide(depth_sum, alpha_total, out=np.zeros_like(depth_sum), where=alpha_total > 0)
-    rgb = np.clip(colour + transmittance[:, :, None] * behind, 0, 1)
-    stats = {"gaussians": len(cloud), "visible": len(splats)}
-    return RasterOutput(rgb.astype(np.float32), alpha_total.astype(np.float32), depth.astype(np.float32), stats)
+    return colour + transmittance[:, :, None] * behind, alpha_total, depth
