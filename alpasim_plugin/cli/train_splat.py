@@ -20,7 +20,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.degrade import log_actors
-from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, fit, held_out, logged_views, start_from_depth
+from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
+from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary, write_pictures
 from alpasim_plugin.gaussians.fit.view_files import read_views
 from alpasim_plugin.renderers.gaussian import scene_of

@@ -1,9 +1,9 @@
 """Reconstruct a scene: fit 3D Gaussians to posed views.
 
-`logged_views` or `view_files.read_views` give views, `start_from_depth` gives a start, and `fit` the `Reconstruction`.
+`logged_views` or `view_files.read_views` give views, `start_from_depth` gives a start, and `loop.fit` the `Reconstruction`. The loop is not
+imported here, because it loads torch, which those who only read a reconstruction do without.
 """
 
-from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import Start, cloud_from_points, start_from_depth
@@ -15,7 +15,6 @@ __all__ = [
     "SplatRecipe",
     "Start",
     "cloud_from_points",
-    "fit",
     "held_out",
     "logged_views",
     "start_from_depth",

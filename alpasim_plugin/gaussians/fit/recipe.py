@@ -96,7 +96,7 @@ class SplatRecipe:
     @classmethod
     def full(cls) -> SplatRecipe:
         """Return the recipe of a reconstruction as good as some minutes on two cores allow."""
-        return cls(steps=2000, points=20_000, cap=40_000, reset_every=0.3)
+        return cls(steps=1500)
 
     @classmethod
     def under_trained(cls, seed: int = 0) -> SplatRecipe:
