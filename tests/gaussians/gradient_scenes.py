@@ -1,0 +1,124 @@
+"""Scenes of splats for training in float64, and gradients of them by slow ways that can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
+from alpasim_plugin.gaussians.arrays import logit, sigmoid
+from alpasim_plugin.gaussians.gradient_types import GradientOutput, Splats
+from alpasim_plugin.gaussians.project import project_gaussians
+from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.rasterize_reference import composite_reference
+from alpasim_plugin.gaussians.rasterize_torch import GaussianTensors, rasterize_tensors
+from alpasim_plugin.seeding import stream
+
+FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
+Gradients = dict[str, np.ndarray]
+_DEPTH_SHARE = 0.05  # weight of depths, which are metres, beside colours
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Splats as float64 arrays, a camera and a background."""
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    logit_opacities: np.ndarray
+    sh: np.ndarray
+    camera: PinholeCamera
+    background: tuple[float, float, float] = (0.3, 0.6, 0.2)
+    depth_weight: float = _DEPTH_SHARE
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {name: getattr(self, name) for name in FIELDS}
+
+
+def scene(means, scales, cam: PinholeCamera, *, opacities=0.6, quaternions=None, sh=None, seed: int = 0, **other) -> Scene:
+    """Build a scene; what is not given is random, and every number is one that float32 can hold."""
+    rng = stream("gradient-tests", seed, "scene")
+    means = np.atleast_2d(np.asarray(means, float))
+    n = len(means)
+    arrays = (
+        means,
+        np.log(np.broadcast_to(np.asarray(scales, float), (n, 3))),
+        rng.normal(size=(n, 4)) if quaternions is None else np.broadcast_to(np.asarray(quaternions, float), (n, 4)),
+        logit(np.broadcast_to(np.asarray(opacities, float), (n,))),
+        rng.normal(size=(n, 4, 3)) * 0.2 if sh is None else np.asarray(sh, float),
+    )
+    return Scene(*(a.astype(np.float32).astype(np.float64) for a in arrays), cam, **other)
+
+
+def weights_of(cam: PinholeCamera) -> np.ndarray:
+    """Return ``(H, W, 5)`` random weights of colour, alpha and depth: the loss is the weighted sum."""
+    return stream("gradient-tests", 0, "weights").normal(size=(cam.height, cam.width, 5))
+
+
+def weighted(out: GradientOutput | object, s: Scene) -> Tensor:
+    """Return the loss of rendered tensors."""
+    image = torch.cat([out.rgb, out.alpha[..., None], s.depth_weight * out.depth[..., None]], dim=2)  # type: ignore[attr-defined]
+    return (image * torch.as_tensor(weights_of(s.camera), dtype=image.dtype)).sum()
+
+
+def kernel_gradients(s: Scene, threads: int = 1, dtype: torch.dtype = torch.float32) -> tuple[Gradients, GradientOutput]:
+    """Return the gradients of the compiled kernels, and the image that they belong to."""
+    tensors = {k: torch.tensor(a, dtype=dtype if k == "means" else torch.float32).requires_grad_(True) for k, a in s.arrays().items()}
+    background = torch.tensor(s.background, requires_grad=True)
+    out = rasterize_gradient(Splats(**tensors), s.camera, background=background, threads=threads)
+    weighted(out, s).backward()
+    leaves = {**tensors, "background": background}
+    return {name: t.grad.double().numpy() for name, t in leaves.items()}, out
+
+
+def torch_gradients(s: Scene) -> Gradients:
+    """Return the gradients of `rasterize_torch` in float64."""
+    t = {name: torch.tensor(a).requires_grad_(True) for name, a in {**s.arrays(), "background": np.array(s.background)}.items()}
+    gaussians = GaussianTensors(t["means"], t["quaternions"], t["log_scales"].exp(), t["logit_opacities"].sigmoid(), t["sh"])
+    weighted(rasterize_tensors(gaussians, s.camera, t["background"]), s).backward()
+    return {name: np.zeros_like(a) if (a := leaf.grad) is None else a.numpy() for name, leaf in t.items()}
+
+
+def reference_loss(s: Scene, values: dict[str, np.ndarray]) -> float:
+    """Return the loss of the float64 reference at other values of the parameters."""
+    cloud = GaussianCloud(
+        values["means"], values["quaternions"], np.exp(values["log_scales"]), sigmoid(values["logit_opacities"]), values["sh"]
+    )
+    behind = np.asarray(values["background"], float).reshape(1, 1, 3)
+    colour, alpha, depth = composite_reference(project_gaussians(cloud, s.camera), s.camera, behind)
+    image = np.concatenate([colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2)
+    return float((image * weights_of(s.camera)).sum())
+
+
+def central_differences(function: Callable[[], float], value: np.ndarray, step: float) -> np.ndarray:
+    """Return the gradient of a function by an array that it reads, changing it in place and back."""
+    out = np.zeros_like(value)
+    for at in np.ndindex(value.shape):
+        kept = value[at]
+        value[at] = kept + step
+        high = function()
+        value[at] = kept - step
+        out[at] = (high - function()) / (2 * step)
+        value[at] = kept
+    return out
+
+
+def numeric_gradients(s: Scene, step: float = 1e-6) -> Gradients:
+    """Return central finite differences of the float64 reference."""
+    values = {**{k: a.copy() for k, a in s.arrays().items()}, "background": np.array(s.background, float)}
+    return {name: central_differences(lambda: reference_loss(s, values), array, step) for name, array in values.items()}
+
+
+def assert_close(found: Gradients, wanted: Gradients, share: float, names=(*FIELDS, "background")) -> None:
+    """Compare row by row: each Gaussian's error in a field is at most ``share`` of the largest gradient of that row and field."""
+    for name in names:
+        a, b = (np.atleast_2d(g[name]).reshape(len(np.atleast_2d(g[name])), -1) for g in (found, wanted))
+        assert np.isfinite(a).all(), name
+        scale = np.maximum(np.abs(b).max(axis=1), 1e-3 * np.abs(b).max(initial=1e-12))
+        error = np.abs(a - b).max(axis=1) / np.maximum(scale, 1e-12)
+        assert error.max(initial=0.0) <= share, f"{name}: row {error.argmax()} off by {error.max():.2g} of its largest, {a[error.argmax()]}"

@@ -1,0 +1,296 @@
+"""Check the compiled backward pass on hard cases, against finite differences of the reference and autograd of the torch twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
+from alpasim_plugin.gaussians.bench import driving_camera, driving_like_scene
+from alpasim_plugin.gaussians.gradient_types import Splats
+from alpasim_plugin.gaussians.project import project_gaussians
+from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.rasterize_reference import composite_reference, rasterize_reference
+from alpasim_plugin.gaussians.sh import dc_from_rgb
+from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
+from tests.gaussians.gradient_scenes import (
+    FIELDS,
+    Scene,
+    assert_close,
+    central_differences,
+    kernel_gradients,
+    numeric_gradients,
+    scene,
+    torch_gradients,
+    weighted,
+    weights_of,
+)
+
+SMALL = camera(24, 18, 20.0)
+TOLERANCE = 5e-4  # of the largest gradient of a Gaussian in a field; float32 sums of terms that cancel
+
+
+def overlapping() -> Scene:
+    rng = np.random.default_rng(3)
+    means = rng.uniform([-0.6, -0.5, 1.5], [0.6, 0.5, 4.0], (3, 3))
+    return scene(means, rng.uniform(0.1, 0.5, (3, 3)), SMALL, opacities=rng.uniform(0.2, 0.95, 3))
+
+
+def needles_before_the_camera() -> Scene:
+    """Splats of up to 3000 pixels by half a pixel, at 0.3 to 1 m."""
+    means = [[0.02, 0.01, 0.3], [-0.05, 0.0, 0.6], [0.1, 0.05, 1.0]]
+    scales = [[2.0, 0.002, 0.002], [5.0, 0.004, 0.001], [12.0, 0.003, 0.004]]
+    aslant = [[0.95, 0.05, 0.02, 0.3], [0.9, 0.0, 0.01, -0.2], [0.99, 0.01, 0.02, 0.05]]
+    return scene(means, scales, camera(24, 18, 250.0), quaternions=aslant, opacities=0.7)
+
+
+def centres_outside_with_clamped_slopes() -> Scene:
+    means = [[2.4, 0.0, 1.4], [0.1, -2.2, 1.5], [-2.6, 2.1, 1.6]]
+    return scene(means, [[0.9, 0.8, 0.7]], SMALL)
+
+
+def opaque_stack() -> Scene:
+    """Layers of opacity 0.999: alpha is held at 0.99 and the second such layer ends the pixel."""
+    means = [[0.0, 0.0, 2.0], [0.05, 0.0, 2.2], [0.0, 0.05, 2.4], [0.1, 0.0, 2.6], [0.0, 0.0, 6.0]]
+    return scene(means, [[0.35, 0.3, 0.3]], SMALL, opacities=[0.6, 0.999, 0.998, 0.9, 0.9])
+
+
+def smaller_than_the_low_pass() -> Scene:
+    return scene([[0.1, 0.1, 4.0], [-0.5, 0.2, 5.0], [0.0, -0.3, 6.0]], [[0.01, 0.02, 0.005]], SMALL, opacities=0.9)
+
+
+def behind_and_before_the_near_plane() -> Scene:
+    return scene([[0.0, 0.0, -2.0], [0.02, 0.0, 0.05], [0.0, 0.0, 2.0]], [[0.2, 0.1, 0.3]], SMALL)
+
+
+def colours_clamped_at_zero() -> Scene:
+    sh = np.zeros((3, 4, 3))
+    sh[:, 0] = [dc_from_rgb([-0.4, 0.5, 0.2]), dc_from_rgb([0.3, -0.2, -0.6]), dc_from_rgb([-0.5, -0.5, -0.5])]
+    sh[:, 1:] = np.random.default_rng(0).normal(size=(3, 3, 3)) * 0.1
+    return scene([[0.0, 0.1, 2.0], [0.2, 0.0, 2.5], [-0.3, 0.0, 3.0]], [[0.4, 0.3, 0.2]], SMALL, sh=sh)
+
+
+def principal_point_beyond_the_corner() -> Scene:
+    K = np.array([[22.0, 0, -5.0], [0, 19.0, 25.0], [0, 0, 1]])
+    return scene([[1.2, -1.0, 2.0], [2.5, -2.5, 3.5], [0.1, -0.5, 1.5]], [[0.4, 0.3, 0.2]], PinholeCamera(24, 18, K, np.eye(4)))
+
+
+def quaternions_of_any_length() -> Scene:
+    quaternions = np.random.default_rng(1).normal(size=(3, 4)) * [[1e-2], [1.0], [30.0]]
+    return scene([[0.0, 0.1, 2.0], [0.2, 0.0, 2.5], [-0.3, 0.0, 3.0]], [[0.4, 0.1, 0.05]], SMALL, quaternions=quaternions)
+
+
+def turned_camera_and_harmonics_of_degree_three() -> Scene:
+    T = random_rigid(3, 2.0)
+    means = np.array([[0.4, -0.2, 2.5], [-0.5, 0.0, 1.2]]) - T[:3, 3]
+    sh = np.random.default_rng(2).normal(size=(2, 16, 3)) * 0.2
+    return scene(means @ T[:3, :3], [[0.4, 0.3, 0.1]], camera(24, 18, 20.0, T), sh=sh)
+
+
+HARD = (
+    overlapping,
+    needles_before_the_camera,
+    centres_outside_with_clamped_slopes,
+    opaque_stack,
+    smaller_than_the_low_pass,
+    behind_and_before_the_near_plane,
+    colours_clamped_at_zero,
+    principal_point_beyond_the_corner,
+    quaternions_of_any_length,
+    turned_camera_and_harmonics_of_degree_three,
+)
+
+
+@pytest.mark.parametrize("make", HARD)
+def test_gradient_equals_finite_differences_of_the_reference(make):
+    s = make()
+    found, _ = kernel_gradients(s)
+    assert_close(found, numeric_gradients(s), TOLERANCE)
+    assert np.abs(found["means"]).max() > 1e-3
+
+
+@pytest.mark.parametrize("make", HARD)
+def test_gradient_equals_that_of_the_torch_twin(make):
+    s = make()
+    assert_close(kernel_gradients(s)[0], torch_gradients(s), TOLERANCE)
+
+
+def test_scenes_are_as_hard_as_their_names_say():
+    s = needles_before_the_camera()
+    assert kernel_gradients(s)[1].screen.radii.min() > 1000
+    s = centres_outside_with_clamped_slopes()
+    low_x, high_x, low_y, high_y = s.camera.slope_limits()
+    x, y = s.means[:, 0] / s.means[:, 2], s.means[:, 1] / s.means[:, 2]
+    assert ((x > high_x) | (x < low_x)).tolist() == [True, False, True]
+    assert ((y > high_y) | (y < low_y)).tolist() == [False, True, True]
+    _, out = kernel_gradients(opaque_stack())
+    assert float(out.alpha.detach().max()) > 0.99
+    s = smaller_than_the_low_pass()
+    assert np.exp(s.log_scales).max() * 20.0 / 4.0 < 0.3**0.5 / 4
+    assert (kernel_gradients(behind_and_before_the_near_plane())[0]["means"][:2] == 0).all()
+    found, _ = kernel_gradients(colours_clamped_at_zero())
+    assert (found["sh"][0, :, 0] == 0).all()
+    assert (found["sh"][0, :3, 1] != 0).all()
+    assert (found["sh"][2] == 0).all()
+
+
+def test_what_lies_behind_the_stop_gets_no_gradient_and_the_clamp_keeps_colours_moving():
+    s = scene([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 4.0]], [[5.0, 5.0, 5.0]], camera(4, 4, 20.0), opacities=0.9999)
+    found, out = kernel_gradients(s)
+    assert np.allclose(out.alpha.detach(), 0.99, atol=1e-6)
+    for name in FIELDS:
+        assert (found[name][1:] == 0).all(), name  # the second layer would cross the stop: it ends the pixel
+    assert (found["logit_opacities"] == 0).all()  # alpha is at its largest everywhere
+    assert (found["log_scales"] == 0).all()
+    assert np.abs(found["sh"][0]).max() > 0.1
+
+
+def test_equal_depths_are_drawn_and_differentiated_in_the_order_given():
+    means = [[0.0, 0.0, 2.0], [0.1, 0.05, 2.0], [-0.1, 0.0, 2.0]]
+    s = scene(means, [[0.3, 0.2, 0.25]], SMALL, opacities=0.8)
+    found, out = kernel_gradients(s)
+    assert_close(found, torch_gradients(s), TOLERANCE)
+    # Moving along x and y, and every other parameter, leaves the depths equal.
+    numeric = numeric_gradients(s)
+    assert_close({**found, "means": found["means"][:, :2]}, {**numeric, "means": numeric["means"][:, :2]}, TOLERANCE)
+    order = [2, 1, 0]
+    turned = Scene(*(a[order] for a in s.arrays().values()), s.camera, s.background)
+    assert np.abs((kernel_gradients(turned)[1].rgb - out.rgb).detach().numpy()).max() > 0.01
+
+
+def test_image_equals_the_reference_without_its_clamp():
+    cloud, cam = random_cloud(300, 21), camera()
+    cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh * 3)
+    splats = Splats.from_cloud(cloud)
+    out = rasterize_gradient(splats, cam, background=torch.tensor([0.3, 0.2, 0.1]))
+    projected = project_gaussians(splats.to_cloud(), cam)
+    colour, alpha, depth = composite_reference(projected, cam, np.array([[[0.3, 0.2, 0.1]]]))
+    assert colour.max() > 1.2
+    for found, wanted, atol in ((out.rgb, colour, 1e-4), (out.alpha, alpha, 2e-5), (out.depth * out.alpha, depth * alpha, 1e-3)):
+        assert np.mean(np.abs(found.numpy() - wanted) > atol) < 1e-3
+    on_screen = project_gaussians(splats.to_cloud(), cam, on_screen_only=True)
+    radii = np.zeros(len(cloud))
+    radii[on_screen.index] = on_screen.radii().max(axis=1)
+    assert np.abs(out.screen.radii.numpy() - np.ceil(radii)).max() <= 1
+    assert ((out.screen.radii.numpy() > 0) == (radii > 0)).all()
+
+
+def test_many_random_splats_agree_with_the_torch_twin():
+    """Pixels that meet the alpha cut or the stop within rounding may differ: few, hence the norm."""
+    cloud = random_cloud(120, 12)
+    s = scene(cloud.means, cloud.scales, camera(), opacities=np.clip(cloud.opacities, 0.01, 0.99), quaternions=cloud.quats, sh=cloud.sh)
+    found, wanted = kernel_gradients(s)[0], torch_gradients(s)
+    for name in (*FIELDS, "background"):
+        assert np.linalg.norm(found[name] - wanted[name]) < 1e-3 * np.linalg.norm(wanted[name]), name
+
+
+def test_gradient_on_the_screen_is_that_of_the_projected_mean():
+    s = overlapping()
+    _, out = kernel_gradients(s)
+    cloud = Splats(*(torch.tensor(a, dtype=torch.float32) for a in s.arrays().values())).to_cloud()
+    projected = project_gaussians(cloud, s.camera)
+
+    def loss() -> float:
+        colour, alpha, depth = composite_reference(projected, s.camera, np.array(s.background).reshape(1, 1, 3))
+        return float((np.concatenate([colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2) * weights_of(s.camera)).sum())
+
+    numeric = np.linalg.norm(central_differences(loss, projected.uv, 1e-6), axis=1)
+    assert np.allclose(out.screen.gradient_norm[projected.index], numeric, rtol=1e-3)
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_image_and_gradients_do_not_depend_on_threads(threads):
+    cloud, cam = driving_like_scene(9000), driving_camera(120, 70)
+    runs = []
+    for count in (1, threads):
+        splats = Splats.from_cloud(cloud)
+        leaves = [getattr(splats, name).requires_grad_(True) for name in FIELDS]
+        out = rasterize_gradient(splats, cam, threads=count)
+        (out.rgb.square().sum() + out.alpha.sum() + 0.1 * out.depth.sum()).backward()
+        runs.append([out.rgb.detach(), out.alpha.detach(), out.depth.detach(), out.screen.gradient_norm, *(leaf.grad for leaf in leaves)])
+    assert int((out.screen.radii > 0).sum()) > 5000
+    for one, other in zip(*runs, strict=True):
+        assert one.abs().max() > 0
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(("n", "depth"), [(0, 1.0), (3, -1.0)])
+def test_nothing_visible_shows_the_background_and_moves_nothing_else(n, depth):
+    s = scene(np.full((n, 3), [0.0, 0.0, depth]), np.full((n, 3), 0.1), SMALL)
+    found, out = kernel_gradients(s)
+    assert torch.equal(out.rgb.detach(), torch.tensor(s.background).expand(18, 24, 3))
+    assert (out.screen.radii == 0).all()
+    assert np.allclose(found["background"], weights_of(SMALL)[..., :3].sum(axis=(0, 1)), atol=1e-4)
+    for name in FIELDS:
+        assert (found[name] == 0).all()
+        assert found[name].shape == s.arrays()[name].shape
+
+
+def test_large_coordinates_in_float64_change_nothing():
+    s = overlapping()
+    offset = np.array([4.5e5, 5.4e6, 100.0])
+    T = np.eye(4)
+    T[:3, 3] = -offset
+    far = Scene(s.means + offset, *(s.arrays()[name] for name in FIELDS[1:]), camera(24, 18, 20.0, T))
+    assert_close(kernel_gradients(far, dtype=torch.float64)[0], kernel_gradients(s)[0], 1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (16, 16)])
+def test_sizes_that_are_no_multiple_of_the_tile(size):
+    s = overlapping()
+    odd = Scene(*s.arrays().values(), camera(*size, 20.0), s.background)
+    assert_close(kernel_gradients(odd)[0], torch_gradients(odd), TOLERANCE)
+
+
+def test_a_background_image_gets_its_gradient_through_what_is_transparent():
+    s = overlapping()
+    splats = Splats(*(torch.tensor(a, dtype=torch.float32) for a in s.arrays().values()))
+    image = torch.rand(18, 24, 3, generator=torch.Generator().manual_seed(0)).requires_grad_(True)
+    out = rasterize_gradient(splats, s.camera, background=image)
+    weighted(out, s).backward()
+    assert torch.allclose(image.grad, (1 - out.alpha)[..., None] * torch.tensor(weights_of(s.camera)[..., :3]).float(), atol=1e-6)
+
+
+def test_a_second_backward_pass_through_a_kept_graph_repeats_the_first():
+    s = overlapping()
+    splats = Splats(*(torch.tensor(a, dtype=torch.float32).requires_grad_(True) for a in s.arrays().values()))
+    loss = weighted(rasterize_gradient(splats, s.camera), s)
+    first = torch.autograd.grad(loss, splats.means, retain_graph=True)[0]
+    assert torch.equal(first, torch.autograd.grad(loss, splats.means)[0])
+
+
+def test_cloud_survives_the_way_through_the_optimiser_s_form():
+    cloud = random_cloud(50, 3)
+    back = Splats.from_cloud(cloud).to_cloud()
+    found, wanted = rasterize_reference(back, camera()), rasterize_reference(cloud, camera())
+    assert np.mean(np.abs(found.rgb - wanted.rgb) > 1e-4) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("field", "at", "value", "text"),
+    [
+        ("means", (2, 1), np.nan, "number 2 has a mean, scale"),
+        ("log_scales", (1, 0), np.inf, "number 1 has a mean, scale"),
+        ("log_scales", (1, 0), 21.0, "scale beyond exp"),
+        ("quaternions", (2,), 0.0, "number 2 has a mean, scale"),
+        ("quaternions", (2, 2), np.inf, "number 2 has a mean, scale"),
+        ("logit_opacities", (0,), np.nan, "number 0 has a mean, scale"),
+        ("sh", (1, 2, 0), np.nan, "number 1 has a colour"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(field, at, value, text):
+    arrays = {name: a.copy() for name, a in overlapping().arrays().items()}
+    arrays[field][at] = value
+    splats = Splats(**{name: torch.tensor(a, dtype=torch.float32) for name, a in arrays.items()})
+    with pytest.raises(InputError, match=text):
+        rasterize_gradient(splats, SMALL)
+
+
+def test_shapes_that_do_not_fit_are_named():
+    t = {name: torch.tensor(a, dtype=torch.float32) for name, a in overlapping().arrays().items()}
+    with pytest.raises(InputError, match=r"sh \(3, 2, 3\)"):
+        Splats(**{**t, "sh": t["sh"][:, :2]})
+    with pytest.raises(InputError, match=r"background of shape \(24, 18, 3\)"):
+        rasterize_gradient(Splats(**t), SMALL, background=torch.zeros(24, 18, 3))
