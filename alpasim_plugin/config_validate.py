@@ -105,7 +105,8 @@ def _explain(model: type[BaseModel], document: Document, item: Any, loc: Key, kn
         keys = sorted({k for m in _models_at(model, loc[:-1]) for k in m.model_fields})
         near = difflib.get_close_matches(str(loc[-1]), keys, n=1, cutoff=0.6)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        return f"unknown key {str(loc[-1])!r} in {dotted(known[:-1])}", f"{hint}valid keys: {', '.join(keys)}"
+        place = f"in {dotted(known[:-1])}" if known[:-1] else "at the top level"
+        return f"unknown key {str(loc[-1])!r} {place}", f"{hint}valid keys: {', '.join(keys)}"
     if kind == "missing":
         return f"{name} has no {str(loc[-1])!r}", f"add {loc[-1]}: {_wanted(model, loc)}"
     if kind in ("union_tag_invalid", "literal_error", "enum"):

@@ -114,7 +114,7 @@ def _locate(text: str, base: Path | None) -> Path:
     near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5) or [n for n in names if n.split("/")[-1] == name.split("/")[-1]]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     raise InputError(
-        DOING, text, "no such file or folder, and no shipped scenario or suite has that name",
+        "finding a scenario", text, "no such file or folder, and no shipped scenario or suite has that name",
         f"{hint}give a path, or a name that 'simrun list scenarios' shows",
     )  # fmt: skip
 

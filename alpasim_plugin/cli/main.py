@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import traceback
 
@@ -67,7 +68,12 @@ def run_command(args: list[str]) -> int:
 
 
 def main() -> None:
-    """Run the process's command line and exit with the code of DESIGN section 4."""
+    """Run the process's command line and exit with its code.
+
+    The working directory is searched for ``--policy package.module:Class`` last, after everything that is installed.
+    """
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
     sys.exit(run_command(sys.argv[1:]))
 
 

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.plan import RunPlan
+from evaluators.report.numbers import plural
 
 
 class Silent:
@@ -79,9 +80,14 @@ def make_progress(quiet: bool) -> Silent | Lines | Bar:
 
 def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
     """Say in one line what runs where."""
-    counts = (len(plan.renderers), len(plan.policies), len(plan.scenarios), len(plan.seeds))
-    shape = "{} renderers x {} policies x {} scenes x {} seeds".format(*counts)
-    line = f"{len(plan.cells)} rollouts ({shape}), {threads.workers} worker(s) x {threads.per_worker} thread(s) -> {root}"
+    axes = (
+        plural(len(plan.renderers), "renderer"),
+        plural(len(plan.policies), "policy", "policies"),
+        plural(len(plan.scenarios), "scene"),
+        plural(len(plan.seeds), "seed"),
+    )
+    cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
+    line = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}".replace("\u00a0", " ") + f" -> {root}"
     return "\n".join([line, *(f"{name}: {card.label}, {card.settings.mode}" for name, card in plan.cards.items())])
 
 

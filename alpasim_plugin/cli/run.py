@@ -26,6 +26,7 @@ from scenarios.suite import expand
 
 INTERRUPTED = 130
 FIXER_PREFIX = "fixer."
+MAX_SEED = 2**63 - 1  # what the tables' integers hold
 
 EPILOG = """
 Examples:
@@ -116,17 +117,18 @@ def parse_seeds(text: str) -> list[int]:
         ([0, 1, 2], [4, 7])
 
     Raises:
-        InputError: Not a positive count nor a list of non-negative integers.
+        InputError: Not a positive count nor a list of non-negative integers of 63 bits.
     """
     try:
         values = [int(part) for part in text.split(",") if part.strip()]
     except ValueError:
         values = []
-    if "," not in text and len(values) == 1 and values[0] > 0:
+    if "," not in text and len(values) == 1 and 0 < values[0] <= MAX_SEED:
         return list(range(values[0]))
-    if "," in text and values and min(values) >= 0:
+    if "," in text and values and 0 <= min(values) <= max(values) <= MAX_SEED:
         return values
-    raise InputError("reading --seeds", f"--seeds {text}", "neither a count nor a list", "write a count such as 3, or a list such as 4,7")
+    found = "neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1"
+    raise InputError("reading --seeds", f"--seeds {text}", found, "write a count such as 3, or a list such as 4,7")
 
 
 def _check_preset(preset: str) -> None:
@@ -155,7 +157,7 @@ def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -
         print(json.dumps(facts))
         return
     for key, value in facts.items():
-        print(f"{key:>18}  {', '.join(map(str, value)) if isinstance(value, list) else value}")
+        print(f"{key:>18}  {(', '.join(map(str, value)) or '-') if isinstance(value, list) else value}")
 
 
 def _print_result(result: RunResult, as_json: bool) -> None:

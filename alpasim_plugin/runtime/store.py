@@ -21,7 +21,10 @@ def write_bytes(path: Path, data: bytes) -> None:
     Raises:
         InfrastructureError: The disk refused (full, read-only, quota); what stood at ``path`` before is untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(path.parent, error) from error
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
@@ -37,12 +40,9 @@ def write_bytes(path: Path, data: bytes) -> None:
 def disk_error(path: Path, error: OSError) -> InfrastructureError:
     """Name a failed write in four parts."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    return InfrastructureError(
-        "writing a result",
-        str(path),
-        f"{error.strerror or error}",
-        "free disk space and run the same command again; finished rollouts are kept" if full else "make the folder writable",
-    )
+    room = "free disk space and run the same command again; finished rollouts are kept"
+    do = room if full else "make the folder writable, or name another one"
+    return InfrastructureError("writing a result", str(path), f"{error.strerror or error}", do)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -128,7 +128,7 @@ def _margin(side: Side, base: Side, arm: tuple[str, str], name: str, metric: str
     said = _paired_text(entry, metric, arm[0])
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
-        said += f"; {entry['n_scenes']} scenes, the gate asks for {spec.min_scenes}"
+        said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
     elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
         cause = "undecided"
         said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"

@@ -99,6 +99,6 @@ def duration(seconds: float | None) -> str:
     return f"{fixed(minutes, 0)}\u00a0min" if minutes < 120 else f"{fixed(minutes / 60, 1)}\u00a0h"
 
 
-def plural(n: int, noun: str) -> str:
-    """Print a count with its noun."""
-    return f"{n}\u00a0{noun}" if n == 1 else f"{n}\u00a0{noun}s"
+def plural(n: int, noun: str, many: str = "") -> str:
+    """Print a count with its noun; ``many`` is the plural where an s does not make it."""
+    return f"{n}\u00a0{noun}" if n == 1 else f"{n}\u00a0{many or noun + 's'}"

@@ -10,7 +10,7 @@ from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.files import write_whole
 from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.headline import find
-from evaluators.report.numbers import Cell
+from evaluators.report.numbers import Cell, plural
 from evaluators.report.provenance import provenance
 from evaluators.report.run_folder import Rollout, Run, read_run
 from evaluators.report.speed import speed
@@ -42,7 +42,7 @@ def summary_md(run: Run) -> str:
     parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     if rows:
-        head = ["metric", *(f"{c.arm} ({c.n_rollouts} rollouts, {c.n_scenes} scenes)" for c in tables.columns(run))]
+        head = ["metric", *(f"{c.arm} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
         body = [[_label(r.name, r.unit, r.arrow), *(_cell(c) for c in r.cells)] for r in rows]
         parts.append(f"\n### Results, preset {escape(str(run.summary.get('preset')))}\n\n{table(head, body)}\n{INTERVAL_NOTE}\n")
     pairs = tables.pair_rows(run.summary)

@@ -13,6 +13,7 @@ from evaluators.report.numbers import Cell, plural
 from evaluators.report.tables import metric_rows
 
 MARGIN_NOTE = "\u00b1: 1.96 sigma / sqrt(N) over rollouts; a to b: 95 %, scenes as clusters"
+GAP_NOTE = "; \u2014: one rollout or one scene is too few, or no valid value (report.html says which)"
 
 
 def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Table:
@@ -28,7 +29,9 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Tab
     rows = metric_rows(summary)
     if headline_only and any(row.is_headline for row in rows):
         rows = [row for row in rows if row.is_headline]
-    table = Table(box=box.SIMPLE_HEAD, caption=MARGIN_NOTE, caption_justify="left", pad_edge=False)
+    gaps = any("\u2014" in cell.text + cell.detail for row in rows for cell in row.cells)
+    note = MARGIN_NOTE + (GAP_NOTE if gaps else "") if rows else None
+    table = Table(box=box.SIMPLE_HEAD, caption=note, caption_justify="left", pad_edge=False)
     table.add_column(Text(f"preset {summary.get('preset', '?')}", style="dim"), overflow="fold")
     for arm, entries in (summary.get("metrics") or {}).items():
         counts = [(int(e.get("n_rollouts") or 0), int(e.get("n_scenes") or 0)) for e in entries.values()]

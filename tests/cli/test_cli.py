@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.main import main, run_command
 from alpasim_plugin.cli.run import parse_seeds
 from alpasim_plugin.errors import InputError
 
@@ -125,6 +126,28 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path: Path, 
     assert run_command(["report", str(tmp_path)]) == 0
 
 
+def test_a_run_folder_that_cannot_be_made_is_a_four_part_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert run_command([*GOOD, "--out", str(tmp_path / "file"), "--quiet", "smoke/straight"]) == 4
+    parts = four_parts(capsys.readouterr().err)
+    assert parts["with"].startswith(str(tmp_path / "file"))
+    assert "name another one" in parts["do"]
+
+
+def test_policy_of_the_working_directory_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "policy_of_this_folder.py").write_text("from policies.constant_velocity import ConstantVelocity as Mine\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])  # as a console script finds it: without the working directory
+    command = ["simrun", "--renderer", "clean", "--policy", "policy_of_this_folder:Mine", "--dry-run", "--json", "smoke/straight"]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 0
+    assert json.loads(capsys.readouterr().out)["policies"] == ["policy_of_this_folder:Mine"]
+
+
 def test_report_of_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["report", str(tmp_path)]) == 2
     assert "name a folder written by simrun" in four_parts(capsys.readouterr().err)["do"]
@@ -156,7 +179,7 @@ def test_seeds_are_a_count_or_a_list(text: str, seeds: list[int]) -> None:
     assert parse_seeds(text) == seeds
 
 
-@pytest.mark.parametrize("text", ["-1", "", "x", "1,-2", "1.5"])
+@pytest.mark.parametrize("text", ["-1", "", "x", "1,-2", "1.5", f"0,{2**63}"])
 def test_other_seeds_are_refused(text: str) -> None:
     with pytest.raises(InputError):
         parse_seeds(text)

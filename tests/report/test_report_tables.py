@@ -171,4 +171,13 @@ def test_terminal_table_can_be_short(usual_run: Path) -> None:
     summary = json.loads((usual_run / "summary.json").read_text())
     assert render_table(summary, headline_only=True).row_count == 5
     assert render_table(summary).row_count == 13
-    assert render_table({"metrics": {}}, headline_only=True).row_count == 0
+    nothing = render_table({"metrics": {}}, headline_only=True)
+    assert (nothing.row_count, nothing.caption) == (0, None)
+
+
+def test_terminal_table_says_what_a_dash_means_where_there_is_one() -> None:
+    alone = {"mean": 0.1, "ci95": None, "ci95_clustered": None, "n_rollouts": 1, "n_scenes": 1, "unit": "m", "direction": "lower"}
+    many = alone | {"ci95": 0.02, "ci95_clustered": [0.05, 0.2], "n_rollouts": 9, "n_scenes": 3}
+    for entry, explained in ((alone, True), (many, False)):
+        table = render_table({"metrics": {"clean": {"route_distance_m": entry}}})
+        assert (f"{DASH}: one rollout or one scene is too few" in str(table.caption)) == explained
