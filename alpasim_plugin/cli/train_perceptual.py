@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -13,17 +14,19 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.nets.perceptual import NAME
+from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.perceptual import PerceptualRecipe, PerceptualTask
-from alpasim_plugin.training.trainer import Schedule, Trainer
+from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
-EPILOG = "Example: `simrun train perceptual data/pairs --out runs/perceptual --steps 2400`"
+WHAT = "Feature network of the perceptual distance perceptual-syn: not LPIPS, trained on synthetic scenes"
+EPILOG = "Example: `simrun train perceptual data/pairs --out runs/perceptual --steps 1500`"
 
 
 def perceptual(
     data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames and maps of its split train are learned from.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 2400,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 1500,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and draws.")] = 0,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
 ) -> None:
@@ -43,4 +46,8 @@ def perceptual(
     task.module.load_state_dict(trainer.averaged())
     path = out / f"{NAME}.safetensors"
     task.module.net.save(path, {"made_by": "simrun train perceptual", "steps": str(steps), "seed": str(seed)})
+    rows, hours = curves(out / LOG_FILE)
+    data_card = {"pairs": "clean frames, renders and maps of the split train", "sequences": len(task.sequences)}
+    training = {"schedule": asdict(schedule), "recipe": asdict(task.recipe)}
+    ModelCard(WHAT, data_card, training, rows, hours).write(path)
     console.print(f"wrote {path}")

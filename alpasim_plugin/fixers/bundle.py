@@ -88,6 +88,29 @@ def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
     return Bundle(parts, trained, note or "trained")
 
 
+def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
+    """Return the fixer that a bundle is for and the overrides that make its settings those of the weights, the bundle included.
+
+    Raises:
+        InputError: Not a bundle.
+    """
+    header = read_metadata(path)
+    made_for = json.loads(header.get("settings", "{}"))
+    if header.get("format") != FORMAT or not isinstance(made_for, dict) or "name" not in made_for:
+        found = f"format {header.get('format')!r} in its header"
+        raise InputError(DOING, str(path), found, f"give a file that save_bundle wrote ({FORMAT})")
+    name = str(made_for.pop("name"))
+    return name, (*_flat(made_for), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
+
+
+def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:
+    """Return ``KEY=VALUE`` for every leaf of nested settings."""
+    out: list[str] = []
+    for key, value in data.items():
+        out += _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}={json.dumps(value)}"]
+    return out
+
+
 def _at(data: object, key: str) -> object:
     for part in key.split("."):
         data = data.get(part) if isinstance(data, dict) else None

@@ -104,9 +104,8 @@ class PerceptualTask:
 
     def __init__(self, sequences: Sequence[PairSequence], recipe: PerceptualRecipe) -> None:
         self.sequences, self.recipe = sequences, recipe
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(recipe.seed)
-            self.module = Lessons(PerceptualDistance())
+        self.module = Lessons(PerceptualDistance())
+        _draw_weights(self.module, torch.Generator().manual_seed(recipe.seed))
         _spread(self.module.net.trunk)
 
     @property
@@ -243,6 +242,15 @@ def draw_shapes(rng: np.random.Generator, side: int) -> F32:
 def to_picture(image: F32) -> Tensor:
     """Map ``(H, W, 3)`` in 0 to 1 to ``(3, H, W)`` in [-1, 1]."""
     return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1) * 2 - 1
+
+
+def _draw_weights(module: nn.Module, generator: torch.Generator) -> None:
+    """Draw what torch draws for a new convolution, from a generator of our own."""
+    for conv in module.modules():
+        if isinstance(conv, nn.Conv2d):
+            bound = conv.weight[0].numel() ** -0.5
+            nn.init.uniform_(conv.weight, -bound, bound, generator=generator)
+            nn.init.uniform_(conv.bias, -bound, bound, generator=generator)  # type: ignore[arg-type]
 
 
 def _spread(trunk: FeatureNet) -> None:

@@ -35,13 +35,13 @@ class Ladder:
         return float((np.diff(self.made, axis=1) > 0)[counted].mean()) if counted.any() else float("nan")
 
 
-def check_frames(sequences: Sequence[PairSequence], count: int) -> F32:
-    """Return ``count`` clean frames ``(count, H, W, 3)`` in 0 to 1, evenly from all sequences."""
+def check_frames(sequences: Sequence[PairSequence], count: int, channel: str = "rgb_gt") -> F32:
+    """Return ``count`` frames ``(count, H, W, 3)`` of a channel in 0 to 1, evenly from all sequences."""
     which = np.linspace(0, 1, count, endpoint=False)
     picked = []
     for i, share in enumerate(which):
         clip = sequences[i % len(sequences)].clip
-        picked.append(clip.rgb_gt[int(share * len(clip))])
+        picked.append(getattr(clip, channel)[int(share * len(clip))])
     return np.stack(picked).astype(np.float32) / np.float32(255)
 
 

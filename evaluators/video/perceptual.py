@@ -1,8 +1,11 @@
-"""Perceptual distance of frames: `perceptual-syn`, and LPIPS where its weights are on disk. Torch is loaded only when one is asked for."""
+"""Perceptual distance of frames by a network that is handed in: `perceptual-syn`, or LPIPS where its weights are on disk.
+
+Networks come from `alpasim_plugin.nets.picture_distance.load_distance`; torch is loaded only when one is used.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -10,16 +13,24 @@ from alpasim_plugin.types import F64, U8
 from evaluators.video.frames import check_stacks
 
 if TYPE_CHECKING:
-    from alpasim_plugin.nets.picture_distance import PictureDistance
+    from torch import Tensor
 
 BATCH = 8  # frames at a time
+
+
+class PictureDistance(Protocol):
+    """A frozen network that says how far apart pictures look."""
+
+    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return ``(B,)`` for pictures ``(B, 3, H, W)`` in [-1, 1]."""
+        ...
 
 
 def picture_distances(net: PictureDistance, made: U8, truth: U8) -> F64:
     """Return a network's distance of every frame to the true one.
 
     Args:
-        net: From `alpasim_plugin.nets.picture_distance.load_distance`.
+        net: The network.
         made, truth: ``(T, H, W, 3)``.
 
     Returns:
@@ -32,9 +43,9 @@ def picture_distances(net: PictureDistance, made: U8, truth: U8) -> F64:
 
     check_stacks("computing a perceptual distance", made, truth)
 
-    def pictures(frames: U8) -> torch.Tensor:
+    def pictures(frames: U8) -> Tensor:
         return torch.from_numpy(np.array(frames)).permute(0, 3, 1, 2).float() / 127.5 - 1
 
     with torch.inference_mode():
         parts = [net.distance(pictures(made[i : i + BATCH]), pictures(truth[i : i + BATCH])) for i in range(0, len(made), BATCH)]
-    return torch.cat(parts).double().numpy()
+    return np.asarray(torch.cat(parts).double().numpy())

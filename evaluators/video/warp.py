@@ -51,7 +51,7 @@ def late_window(pairs: int) -> slice:
 
     Example:
         >>> late_window(197), late_window(60), late_window(10)
-        (slice(132, None, None), slice(30, None, None), slice(0, None, None))
+        (slice(131, None, None), slice(30, None, None), slice(0, None, None))
     """
     return slice(max(pairs - max(-(-pairs // LATE_SHARE), LATE_LEAST), 0), None)
 

@@ -1,0 +1,134 @@
+"""Open-loop quality: a fixer over a recorded clip as it runs in the closed loop, block by block, and what came of it against the truth."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers import BlockFixer
+from alpasim_plugin.fixers.card import Card
+from alpasim_plugin.fixers.refine import StreamTally, refine_frames
+from alpasim_plugin.types import I64, U8, Frame
+from evaluators.video import clip_quality
+from evaluators.video.perceptual import PictureDistance
+from evaluators.video.summary import TRUTH
+
+RAW = "3dgs"  # the arm of the damaged render as it is
+VERSION = 1  # of what a row holds and how it is measured; part of its key
+CAMERA = "camera"
+DIGITS = 7  # significant, of stored values
+
+
+@dataclass(frozen=True)
+class QualityClip:
+    """A damaged render with everything a fixer gets, and the truth; ``T`` frames of one camera."""
+
+    name: str
+    identity: Mapping[str, Any]  # what tells this clip from another of the same name
+    render: U8  # (T, H, W, 3)
+    truth: U8  # (T, H, W, 3)
+    opacity: U8  # (T, H, W), 255 is opaque
+    sdmap: U8  # (T, H, W, 3)
+    t_us: I64  # (T,)
+
+    def first(self, frames: int) -> QualityClip:
+        """Return the clip's first frames, all of them where it has fewer."""
+        cut = {name: getattr(self, name)[:frames] for name in ("render", "truth", "opacity", "sdmap", "t_us")}
+        return QualityClip(self.name, self.identity, **cut)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One row of the table: the render as it is (``3dgs``), the truth, or a fixer under a label."""
+
+    label: str
+    card: Card | None = None  # None for 3dgs and the truth
+
+    def __post_init__(self) -> None:
+        if self.card is None and self.label not in (RAW, TRUTH):
+            raise InputError("choosing what to measure", f"arm {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything that decides its pictures."""
+        return {"label": self.label, "fixer": self.card and self.card.as_dict()}
+
+
+@dataclass(frozen=True)
+class Rolled:
+    """What an arm made of a clip.
+
+    Args:
+        video: ``(T, H, W, 3)``.
+        ms_per_frame: Of every block, the first included; empty where no fixer ran.
+        events: Frames that a guard passed on unrefined, by event.
+    """
+
+    video: U8
+    ms_per_frame: tuple[float, ...]
+    events: Mapping[str, int]
+
+
+def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mapping[str, str]) -> str:
+    """Return the digest of everything that decides a row except how fast the machine is.
+
+    Args:
+        clip: Already cut to length.
+        arm: With the digests of its weights.
+        seed: Of the fixer's noise.
+        device: Where the fixer computes.
+        networks: Perceptual distances by name, each with what identifies its weights.
+    """
+    facts = [VERSION, clip.name, len(clip.t_us), dict(clip.identity), arm.as_dict(), seed, device, dict(networks)]
+    return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def roll(clip: QualityClip, arm: Arm, fixer: BlockFixer | None) -> Rolled:
+    """Run an arm over a clip.
+
+    Args:
+        clip: The clip.
+        arm: Which.
+        fixer: A session at the start of a rollout, for arms that are fixers.
+
+    Raises:
+        InputError: A fixer that is missing, or given where none runs.
+    """
+    if (fixer is None) != (arm.card is None):
+        raise InputError("rolling a clip", f"arm {arm.label!r}", "a fixer too many or too few", "give a session exactly for a fixer's arm")
+    if fixer is None or arm.card is None:
+        return Rolled(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
+    tally, frames = StreamTally(), []
+    for block in refine_frames(_frames(clip, arm.card.settings.uses_map), fixer):
+        tally.add(block)
+        frames += [frame.rgb for frame in block.fixed]
+    return Rolled(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
+
+
+def measure(clip: QualityClip, arm: Arm, rolled: Rolled, seed: int, networks: Mapping[str, PictureDistance]) -> dict[str, Any]:
+    """Return the row of one clip under one arm, as `evaluators.video.summary` takes it."""
+    found = clip_quality(rolled.video, None if arm.label == TRUTH else clip.truth, networks)
+    return {
+        "arm": arm.label,
+        "clip": clip.name,
+        "seed": seed,
+        "frames": len(clip.t_us),
+        "size": list(clip.truth.shape[1:3]),
+        "values": found.means,
+        "identical": found.identical,
+        "events": dict(rolled.events),
+        # The first block is shorter and opens the history; where there are more, it does not count.
+        "ms_per_frame": [round(ms, 4) for ms in rolled.ms_per_frame[1:] or rolled.ms_per_frame],
+        "series": {name: [float(f"{v:.{DIGITS}g}") for v in values] for name, values in found.series.items()},
+    }
+
+
+def _frames(clip: QualityClip, with_map: bool) -> Iterator[tuple[Frame, U8 | None]]:
+    for i, t_us in enumerate(clip.t_us):
+        alpha = clip.opacity[i].astype(np.float32) / np.float32(255)
+        yield Frame(int(t_us), CAMERA, np.array(clip.render[i]), alpha), np.array(clip.sdmap[i]) if with_map else None

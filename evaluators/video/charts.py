@@ -1,0 +1,110 @@
+"""The quality charts as PNG: by frame index, and against time per frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+from evaluators.video.facts import FACTS, MS, PSNR, SSIM, WARP
+from evaluators.video.summary import TRUTH
+
+LABELS = {PSNR: "PSNR, dB", SSIM: "SSIM", WARP: "Warp L1"}
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
+COLUMNS = 2
+DPI = 110
+LEAST_BANDED = 5  # clips; the intervals of fewer hide the curves
+
+
+def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
+    """Draw every metric's mean over clips in windows of frames, with its 95 % band, and write a PNG."""
+    by_frame = summary["by_frame"]
+    metrics = [m for m in FACTS if any(m in windows for windows in by_frame.values())]
+    figure, panels = _panels(len(metrics))
+    for ax, metric in zip(panels, metrics, strict=True):
+        for arm, colour, dash in _styles(summary):
+            windows = by_frame[arm].get(metric)
+            if windows is None:
+                continue
+            x = [(a + b) / 2 for a, b in zip(windows["first"], windows["last"], strict=True)]
+            ax.plot(x, windows["mean"], color=colour, linestyle=dash, label=arm, linewidth=1.6)
+            if summary["clips"][arm] >= LEAST_BANDED:
+                ax.fill_between(x, windows["low"], windows["high"], color=colour, alpha=0.13, linewidth=0)
+        ax.set_xlabel("frame")
+        _finish(ax, metric)
+    _legend(figure, panels)
+    figure.savefig(path, dpi=DPI)
+
+
+def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
+    """Draw every metric's mean against the fixer's time per frame, both with 95 % intervals; arms without one are lines. PNG."""
+    arms = summary["arms"]
+    metrics = [m for m in (PSNR, SSIM, "perceptual-syn", "lpips_alex", WARP) if any(m in values for values in arms.values())]
+    figure, panels = _panels(len(metrics))
+    timed = [values[MS]["mean"] for values in arms.values() if MS in values]
+    for ax, metric in zip(panels, metrics, strict=True):
+        for i, (arm, colour, dash) in enumerate(_styles(summary)):
+            entry = arms[arm].get(metric)
+            if entry is None:
+                continue
+            if MS not in arms[arm]:
+                ax.axhline(entry["mean"], color=colour, linestyle=dash, label=f"{arm} (no fixer)", linewidth=1.4)
+                continue
+            x, y = arms[arm][MS], entry
+            marker = MARKERS[i % len(MARKERS)]
+            ax.errorbar(x["mean"], y["mean"], xerr=_arms(x), yerr=_arms(y), fmt=marker, color=colour, label=arm, capsize=2)
+        ax.set_xlabel("fixer, ms per frame")
+        if timed and max(timed) > 4 * max(min(timed), 1e-3):
+            ax.set_xscale("log")
+            ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            ax.xaxis.set_major_formatter(ScalarFormatter())
+            ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.margins(x=0.15, y=0.15)
+        _finish(ax, metric)
+    _legend(figure, panels)
+    figure.savefig(path, dpi=DPI)
+
+
+def _arms(entry: Mapping[str, Any]) -> list[list[float]] | None:
+    """Return how far an interval reaches below and above the mean, as matplotlib takes it."""
+    bounds = entry["ci95"]
+    return None if bounds is None else [[entry["mean"] - bounds[0]], [bounds[1] - entry["mean"]]]
+
+
+def _styles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return arm, colour and dashes: grey for what no fixer made."""
+    out, used = [], 0
+    for arm, values in summary["arms"].items():
+        if MS in values:
+            out.append((arm, f"C{used % 10}", "-"))
+            used += 1
+        else:
+            out.append((arm, "0.65" if arm == TRUTH else "0.25", ":" if arm == TRUTH else "--"))
+    return out
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    lines = -(-count // COLUMNS)
+    figure = Figure(figsize=(5.2 * COLUMNS, 3.1 * lines + 0.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = list(figure.subplots(lines, COLUMNS, squeeze=False).ravel())
+    for ax in panels[count:]:
+        ax.set_visible(False)
+    return figure, panels[:count]
+
+
+def _finish(ax: Axes, metric: str) -> None:
+    ax.set_ylabel(LABELS.get(metric, metric))
+    ax.set_title(f"{FACTS[metric].direction} is better", fontsize=8, loc="right", color="0.4")
+    ax.grid(visible=True, alpha=0.25)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _legend(figure: Figure, panels: list[Axes]) -> None:
+    handles = {label: handle for ax in panels for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 5), fontsize=9, frameon=False)

@@ -1,0 +1,66 @@
+"""Everything that is measured of one clip: values per frame, and their means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from alpasim_plugin.types import F64, U8
+from evaluators.video.facts import DRIFT, PSNR, SSIM, WARP, WARP_LATE
+from evaluators.video.perceptual import PictureDistance, picture_distances
+from evaluators.video.psnr import identical_frames, psnr_db
+from evaluators.video.ssim import ssim
+from evaluators.video.warp import late_window, warp_l1
+
+SETTLED = slice(50, 100)  # frames that the end of a long clip is held against
+END = 50  # frames at the end
+
+
+@dataclass(frozen=True)
+class ClipQuality:
+    """One clip's values: ``(T,)`` by metric and frame, Warp L1 ``(T - 1,)`` from the second frame on."""
+
+    series: Mapping[str, F64]
+    identical: int  # frames that equal the truth
+
+    @property
+    def means(self) -> dict[str, float]:
+        """One value a metric: the mean over the clip; the late window of Warp L1; the drift of clips that are long enough for it."""
+        out = {name: float(values.mean()) for name, values in self.series.items()}
+        if WARP in self.series:
+            pairs = self.series[WARP]
+            out[WARP_LATE] = float(pairs[late_window(len(pairs))].mean())
+        drift = drift_of(self.series.get(PSNR))
+        return out if drift is None else {**out, DRIFT: drift}
+
+
+def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, PictureDistance]) -> ClipQuality:
+    """Measure one clip.
+
+    Args:
+        made: ``(T, H, W, 3)``, at least two frames.
+        truth: The same frames as they should be; None measures what needs no truth.
+        networks: Perceptual distances by name.
+
+    Raises:
+        EvaluatorError: Videos that do not belong together.
+    """
+    series: dict[str, F64] = {}
+    if truth is not None:
+        series = {PSNR: psnr_db(made, truth), SSIM: ssim(made, truth)}
+        series |= {name: picture_distances(net, made, truth) for name, net in networks.items()}
+    series[WARP] = warp_l1(made)
+    return ClipQuality(series, 0 if truth is None else identical_frames(made, truth))
+
+
+def drift_of(psnr: F64 | None) -> float | None:
+    """Return the mean of the last 50 frames minus that of frames 50 to 100; None where the two would overlap.
+
+    Example:
+        >>> import numpy as np
+        >>> drift_of(np.concatenate([np.full(150, 30.0), np.full(50, 29.0)]))
+        -1.0
+    """
+    if psnr is None or len(psnr) < SETTLED.stop + END:
+        return None
+    return float(psnr[-END:].mean() - psnr[SETTLED].mean())

@@ -1,0 +1,22 @@
+"""What the numbers of the quality tables mean; known to `evaluators.metrics` once this package is loaded."""
+
+from __future__ import annotations
+
+from evaluators.metrics import MetricInfo, declare
+
+PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
+DRIFT = "drift_psnr_db"
+
+FACTS: dict[str, MetricInfo] = {
+    PSNR: MetricInfo("dB", "higher", "mean", "peak signal-to-noise ratio of frames, identical ones count as 100 dB"),
+    SSIM: MetricInfo("", "higher", "mean", "structural similarity of frames, 11x11 Gaussian, zero padded, per channel"),
+    "perceptual-syn": MetricInfo("", "lower", "mean", "perceptual distance by the feature network that comes with the package; not LPIPS"),
+    "lpips_alex": MetricInfo("", "lower", "mean", "LPIPS v0.1 with AlexNet"),
+    "lpips_vgg": MetricInfo("", "lower", "mean", "LPIPS v0.1 with VGG-16"),
+    WARP: MetricInfo("", "lower", "mean", "change from frame to frame beyond the video's own motion"),
+    WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
+    DRIFT: MetricInfo("dB", "higher", "mean", "PSNR of the last 50 frames minus that of frames 50 to 100"),
+    MS: MetricInfo("ms", "lower", "median", "time of the fixer per frame"),
+}
+for _name, _facts in FACTS.items():
+    declare(_name, _facts)
