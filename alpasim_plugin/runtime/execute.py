@@ -105,8 +105,8 @@ def _one_pool(
     in_flight: dict[Future[dict[str, Any]], Cell],
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     context = multiprocessing.get_context("spawn")
-    with _thread_environment(threads.per_worker):
-        pool = ProcessPoolExecutor(threads.workers, mp_context=context, initializer=_start_worker)
+    with thread_environment(threads.per_worker):
+        pool = ProcessPoolExecutor(threads.workers, mp_context=context, initializer=ignore_interrupts)
         waiting = iter(todo)
         try:
             while True:
@@ -131,13 +131,14 @@ def _take(cells: Iterator[Cell], count: int) -> list[Cell]:
     return [cell for _, cell in zip(range(count), cells, strict=False)]
 
 
-def _start_worker() -> None:
+def ignore_interrupts() -> None:
+    """Leave Ctrl-C to the parent of a worker process."""
     # Ctrl-C reaches the whole process group; the parent alone decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
-def _thread_environment(per_worker: int) -> Iterator[None]:
+def thread_environment(per_worker: int) -> Iterator[None]:
     """Set the thread variables that numerical libraries read when a worker imports them."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(per_worker)))
