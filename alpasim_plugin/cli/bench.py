@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline
+from alpasim_plugin.cli.quality import EPILOG as QUALITY_EXAMPLES
+from alpasim_plugin.cli.quality import quality
 from alpasim_plugin.gaussians.bench import bench_raster
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts.")
@@ -25,6 +27,7 @@ app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evalu
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
 app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
+app.command("quality", epilog=QUALITY_EXAMPLES)(quality)
 
 
 @app.command("raster", epilog="Example: `simrun bench raster --repeats 20`")

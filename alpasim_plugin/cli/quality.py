@@ -1,0 +1,236 @@
+"""``simrun bench quality``: fixers over recorded clips, open loop, against the frames that there were to see."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+
+from alpasim_plugin.cli.jobs import spread
+from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.card import fixer_card
+from alpasim_plugin.nets.checkpoints import file_sha256
+from alpasim_plugin.nets.lpips import TRUNKS
+from alpasim_plugin.nets.perceptual import NAME, shipped_weights
+from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistance, available, load_distance, weights_folder
+from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runtime.quality import RAW, Arm, QualityClip, measure, roll, row_key
+from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
+from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.video.charts import plot_by_frame, plot_speed
+from evaluators.video.sheet import sheet
+from evaluators.video.summary import TRUTH, summarise
+from evaluators.video.table import markdown
+
+DOING = "measuring quality"
+PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames that are shown, as shares of a clip
+EPILOG = """
+Examples:
+
+- `simrun bench quality data/pairs --split test --fixer 3dgs,onefixer --out runs/quality`
+
+- `simrun bench quality data/pairs --fixer 3dgs,v9=runs/v9/fixer.safetensors,two=onefixer@2 --set two:fixer.window=4 --jobs 2 --out runs/q`
+"""
+
+
+@dataclass(frozen=True)
+class Work:
+    """One clip under one arm, as it travels to a process."""
+
+    folder: Path  # of the sequence
+    arm: Arm
+    frames: int
+    seed: int
+    device: str
+    threads: int
+    networks: tuple[tuple[str, str], ...]  # perceptual distances, each with what identifies its weights
+    weights: Path | None
+    out: Path
+    pictured: bool
+
+    @property
+    def row_file(self) -> Path:
+        """Where the row is kept."""
+        return self.out / "clips" / self.arm.label / f"{self.folder.name}.json"
+
+    def picture_file(self, at: int) -> Path:
+        """Where a shown frame is kept."""
+        return self.out / "frames" / self.arm.label / f"{self.folder.name}_{at:04d}.png"
+
+
+def quality(
+    data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/training.md).")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for results; the same command continues there.")],
+    fixers: Annotated[str, typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE.")] = "3dgs",
+    split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test",
+    baseline: Annotated[str, typer.Option("--baseline", help="Arm that the others are compared with.")] = RAW,
+    frames: Annotated[int, typer.Option("--frames", min=2, help="First frames of every clip; shorter clips are taken whole.")] = 198,
+    clips: Annotated[int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="[LABEL:]fixer.key=value, of one arm or of all fixers.")] = None,
+    weights: Annotated[Path | None, typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}.")] = None,
+    pictures: Annotated[int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")] = 4,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")] = "cpu",
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Clips at a time, one thread each; times are then of a busy machine.")] = 1,
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads with one job.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Measure fixers on recorded clips: PSNR, SSIM, perceptual distances, Warp L1, drift and time, with 95 % intervals over clips.
+
+    Writes quality.json, quality.md, by-frame.png, speed.png and pictures side by side; rows of finished clips are kept.
+    """
+    del debug
+    arms = parse_arms(fixers, overrides or [])
+    if baseline not in {arm.label for arm in arms}:
+        raise InputError(DOING, f"--baseline {baseline}", f"arms {', '.join(a.label for a in arms)}", "name one of the arms")
+    networks = tuple((name, identity(name, weights)) for name in available(weights))
+    sequences = evenly(PairDataset(data, split).sequences, clips)
+    shown = {s.name for s in evenly(sequences, pictures)} if pictures else set()
+    used = threads if jobs == 1 else 1
+    todo = [
+        Work(s.folder, arm, frames, seed, device, used, networks, weights, out, s.name in shown)
+        for s in sequences
+        for arm in (*arms, Arm(TRUTH))
+    ]
+    console = Console(stderr=True)
+    for i, (work, row) in enumerate(spread(finish, todo, jobs), start=1):
+        if not as_json:
+            psnr = row["values"].get("psnr_db")
+            console.print(f"{i}/{len(todo)} {work.arm.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
+    summary = summarise([read_json(work.row_file)["row"] for work in todo], baseline)
+    summary["run"] = {
+        "data": str(data), "split": split, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
+        "fixers": {arm.label: arm.as_dict()["fixer"] for arm in arms}, "networks": dict(networks),
+        "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
+    }  # fmt: skip
+    write_results(summary, todo, out)
+    print(json.dumps(summary) if as_json else markdown(summary) + f"\nwrote {out / 'quality.json'}")
+
+
+def parse_arms(text: str, overrides: Sequence[str]) -> tuple[Arm, ...]:
+    """Return the arms that ``--fixer`` and ``--set`` name.
+
+    Raises:
+        InputError: A label twice, a fixer or key that is not known, or a setting for an arm that is not there.
+    """
+    common: list[str] = []
+    own: dict[str, list[str]] = {}
+    for given in overrides:
+        label, colon, rest = given.partition(":")
+        if colon and not label.startswith("fixer."):
+            own.setdefault(label, []).append(rest)
+        else:
+            common.append(given)
+    arms: dict[str, Arm] = {}
+    for part in (p.strip() for p in text.split(",") if p.strip()):
+        label, equals, named = part.partition("=")
+        fixer = named if equals else label
+        if label in arms or label == TRUTH or "/" in label:
+            found = f"label {label!r} is taken, or no name of a folder"
+            raise InputError(DOING, f"--fixer {text}", found, "write LABEL=NAME with labels of your own")
+        if fixer == RAW:
+            arms[label] = Arm(label)
+            continue
+        name, settings = bundle_fixer(fixer) if fixer.endswith(".safetensors") else (fixer, ())
+        arms[label] = Arm(label, fixer_card(name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
+    if own or not arms:
+        raise InputError(DOING, f"--set {next(iter(own), '')}", "no fixer of this label", f"the arms are {', '.join(arms) or 'none'}")
+    return tuple(arms.values())
+
+
+def evenly(sequences: Sequence[PairSequence], count: int | None) -> list[PairSequence]:
+    """Return at most ``count`` sequences, evenly chosen."""
+    if count is None or count >= len(sequences):
+        return list(sequences)
+    return [sequences[i] for i in np.linspace(0, len(sequences) - 1, count).round().astype(int)]
+
+
+def identity(name: str, folder: Path | None) -> str:
+    """Return what identifies the weights of a perceptual distance: the file's digest, or LPIPS's published ones, checked on loading."""
+    if name == NAME:
+        return file_sha256(shipped_weights())
+    plan = TRUNKS["alex" if name == "lpips_alex" else "vgg"]
+    return f"{plan.file} {plan.heads_sha256}"
+
+
+def finish(work: Work) -> dict[str, Any]:
+    """Bring one clip under one arm to its row, from disk where it is there already."""
+    sequence = PairSequence(work.folder)
+    clip = quality_clip(sequence).first(work.frames)
+    key = row_key(clip, work.arm, work.seed, work.device, dict(work.networks))
+    at = shown_frames(len(clip.t_us)) if work.pictured else ()
+    if work.row_file.is_file() and all(work.picture_file(i).is_file() for i in at):
+        stored = read_json(work.row_file)
+        if stored["key"] == key:
+            return dict(stored["row"])
+    torch.set_num_threads(work.threads)
+    cv2.setNumThreads(work.threads)
+    card = work.arm.card
+    fixer = None
+    if card is not None:
+        scene = str(sequence.info.get("scene_id", sequence.name))
+        fixer = make_fixer(card.name, card.settings, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
+    rolled = roll(clip, work.arm, fixer)
+    for i in at:
+        done, png = cv2.imencode(".png", cv2.cvtColor(rolled.video[i], cv2.COLOR_RGB2BGR))
+        assert done
+        write_bytes(work.picture_file(i), png.tobytes())
+    row = measure(clip, work.arm, rolled, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
+    write_json(work.row_file, {"key": key, "row": row})
+    return row
+
+
+def quality_clip(sequence: PairSequence) -> QualityClip:
+    """Return a sequence of pairs as a clip to measure on."""
+    clip = sequence.clip
+    return QualityClip(sequence.name, sequence.info, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
+
+
+def shown_frames(frames: int) -> tuple[int, ...]:
+    """Return the indices of the frames that are shown."""
+    return tuple(dict.fromkeys(int(share * (frames - 1)) for share in PICTURE_SHARES))
+
+
+def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> None:
+    """Write the summary, the table, the charts and the pictures."""
+    write_json(out / "quality.json", summary)
+    write_bytes(out / "quality.md", markdown(summary).encode())
+    plot_by_frame(summary, out / "by-frame.png")
+    plot_speed(summary, out / "speed.png")
+    shown: dict[Path, list[Work]] = {}
+    for work in done:
+        if work.pictured:
+            shown.setdefault(work.folder, []).append(work)
+    for folder, works in shown.items():
+        at = shown_frames(int(read_json(works[0].row_file)["row"]["frames"]))
+        columns = {work.arm.label: [_picture(work.picture_file(i)) for i in at] for work in works}
+        laid = sheet(columns, [f"frame {i}" for i in at])
+        done_, png = cv2.imencode(".png", cv2.cvtColor(laid, cv2.COLOR_RGB2BGR))
+        assert done_
+        write_bytes(out / "sheets" / f"{folder.name}.png", png.tobytes())
+
+
+def _picture(path: Path) -> Any:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise InputError(DOING, str(path), "no picture", "remove the clip's row and start the command again")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+@cache
+def _network(name: str, folder: Path | None) -> PictureDistance:
+    return load_distance(name, weights_folder(folder))
