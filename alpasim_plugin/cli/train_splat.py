@@ -18,11 +18,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.degrade import log_actors
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary, write_pictures
+from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.fit.view_files import read_views
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.types import Scenario
@@ -60,14 +60,15 @@ def splat(
     loaded = load_scenario(scenario)
     began = time.perf_counter()
     train, kept, start = _given(loaded, images, chosen) if images else _rendered(loaded, chosen, threads)
-    prepared_s = time.perf_counter() - began
+    prepared_s, cpu_s = time.perf_counter() - began, time.process_time()
     with _progress(chosen.steps) as report:
         model = fit(train, start, chosen, scene_id=loaded.scene_id, folder=out, report=report, device=device, threads=threads)
-    fitted_s = time.perf_counter() - began - prepared_s
+    fitted_s, cpu_s = time.perf_counter() - began - prepared_s, time.process_time() - cpu_s
     groups = {"train": train, "held_out": kept} | ({} if images else {"aside_2m": _aside(loaded, chosen, threads)})
     facts = {
         "scene_id": loaded.scene_id, "recipe": {"name": recipe, **asdict(chosen)}, "views": str(images or "rendered"),
-        "prepare_s": round(prepared_s, 2), "fit_s": round(fitted_s, 2), "threads": torch.get_num_threads(), "device": device,
+        "prepare_s": round(prepared_s, 2), "fit_s": round(fitted_s, 2), "fit_cpu_s": round(cpu_s, 2),
+        "threads": torch.get_num_threads(), "device": device,
     }  # fmt: skip
     metrics = _measure(model, groups, out, threads)
     model.save(out, facts)
@@ -96,7 +97,7 @@ def _rendered(scenario: Scenario, recipe: SplatRecipe, threads: int | None) -> t
     )
 
 
-def _given(scenario: Scenario, folder: Path, recipe: SplatRecipe) -> tuple[list[PosedView], list[PosedView], GaussianCloud]:
+def _given(scenario: Scenario, folder: Path, recipe: SplatRecipe) -> tuple[list[PosedView], list[PosedView], Start]:
     views, start = read_views(folder, partial(log_actors, scenario))
     if start is None:
         raise InputError(
@@ -104,7 +105,9 @@ def _given(scenario: Scenario, folder: Path, recipe: SplatRecipe) -> tuple[list[
             "name a PLY of points in transforms.json as 'ply_file_path' (structure from motion or LiDAR)",
         )  # fmt: skip
     train, kept = held_out(views, recipe.hold_out_every)
-    return train, kept, start
+    seen = {name for view in train for name in view.actors}
+    boxes = {actor.actor_id: actor.box for actor in scenario.actors if actor.actor_id in seen}
+    return train, kept, Start(start, start_in_boxes(boxes, recipe.actor_points, scenario.scene_id, recipe.seed))
 
 
 def _aside(scenario: Scenario, recipe: SplatRecipe, threads: int | None) -> list[PosedView]:

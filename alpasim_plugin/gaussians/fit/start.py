@@ -90,6 +90,16 @@ def start_from_depth(
     return Start(cloud_from_points(*_joined(rest), size), actors)
 
 
+def start_in_boxes(boxes: Mapping[str, Box], count: int, scene_id: str, seed: int) -> dict[str, GaussianCloud]:
+    """Return ``count`` grey Gaussians spread over each actor's box, in its frame: a start where no depth says where its surface is."""
+    clouds = {}
+    for name, box in boxes.items():
+        half = np.array([box.length_m, box.width_m, box.height_m]) / 2
+        points = stream(scene_id, seed, f"fit.start.{name}").uniform(-half, half, (count, 3))
+        clouds[name] = cloud_from_points(points, np.full((count, 3), 0.5))
+    return clouds
+
+
 def cloud_from_points(points: F64, rgb: F64, size: float = 1.0) -> GaussianCloud:
     """Return round Gaussians at points ``(N, 3)`` of colours ``(N, 3)`` 0..1.
 

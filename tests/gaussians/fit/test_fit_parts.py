@@ -17,6 +17,7 @@ from alpasim_plugin.gaussians.fit.model import SplatModel
 from alpasim_plugin.gaussians.fit.panorama import sky_of
 from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
 from alpasim_plugin.gaussians.fit.ssim_cpu import SsimTruth
+from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from alpasim_plugin.seeding import stream
 from tests.gaussians.fit.conftest import BOX, FAR, HEIGHT, WIDTH, Posed, actor_pose
@@ -205,6 +206,13 @@ def test_points_become_gaussians_as_large_as_their_distance() -> None:
     assert cloud.scales[2, 0] > 0.2
     assert np.allclose(cloud.sh[:, 0], dc_from_rgb([0.25] * 3))
     assert len(cloud_from_points(line[:1], np.zeros((1, 3)))) == 1
+
+
+def test_where_no_depth_is_known_an_actor_starts_all_over_its_box() -> None:
+    cloud = start_in_boxes({"car": BOX}, 500, "s", 0)["car"]
+    half = np.array([BOX.length_m, BOX.width_m, BOX.height_m]) / 2
+    assert np.all(np.abs(cloud.means) <= half)
+    assert np.all(np.abs(cloud.means).max(axis=0) > 0.9 * half)
 
 
 def test_the_panorama_shows_the_sky_that_the_views_saw(posed: Posed) -> None:
