@@ -30,15 +30,22 @@ app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
 app.command("quality", epilog=QUALITY_EXAMPLES)(quality)
 
 
-@app.command("raster", epilog="Example: `simrun bench raster --repeats 20`")
+@app.command("raster", epilog="Examples: `simrun bench raster --repeats 20`, `simrun bench raster --gradients`")
 def raster(
+    gradients: Annotated[bool, typer.Option("--gradients", help="Time the forward and backward pass of training instead.")] = False,
     repeats: Annotated[int, typer.Option("--repeats", min=3, help="Frames per row; medians are printed.")] = 15,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Time the CPU rasteriser on a random street and compare it with the float64 reference."""
+    """Time the CPU rasteriser on a random street and compare its image, or its gradients, with float64."""
     del debug
-    rows = [asdict(row) for row in bench_raster(repeats=repeats)]
+    if gradients:
+        # Imported on use: it loads torch.
+        from alpasim_plugin.gaussians.gradient_bench import bench_gradients
+
+        rows = [asdict(row) for row in bench_gradients(repeats=repeats)]
+    else:
+        rows = [asdict(row) for row in bench_raster(repeats=repeats)]
     if as_json:
         print(json.dumps(rows))
         return
