@@ -42,8 +42,11 @@ def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
 
 
 def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
-    """Draw every metric's mean against the fixer's time per frame, both with 95 % intervals; arms without one are lines. PNG."""
-    arms = summary["arms"]
+    """Draw every metric's mean against the fixer's time per frame and write a PNG; arms without a fixer are lines.
+
+    Bars are 95 % intervals: of the time, and of the difference from the baseline, clip by clip, which is what arms are compared by.
+    """
+    arms, paired, baseline = summary["arms"], summary["paired"], summary["baseline"]
     metrics = [m for m in (PSNR, SSIM, "perceptual-syn", "lpips_alex", WARP) if any(m in values for values in arms.values())]
     figure, panels = _panels(len(metrics))
     timed = [values[MS]["mean"] for values in arms.values() if MS in values]
@@ -57,8 +60,11 @@ def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
                 continue
             x, y = arms[arm][MS], entry
             marker = MARKERS[i % len(MARKERS)]
-            ax.errorbar(x["mean"], y["mean"], xerr=_arms(x), yerr=_arms(y), fmt=marker, color=colour, label=arm, capsize=2)
-        ax.set_xlabel("fixer, ms per frame")
+            pair = paired.get(arm, {}).get(metric)
+            reach = None if pair is None else _reach(pair["diff"], pair["ci95"])
+            times = _reach(x["mean"], x["ci95"])
+            ax.errorbar(x["mean"], y["mean"], xerr=times, yerr=reach, fmt=marker, color=colour, label=arm, capsize=2)
+        ax.set_xlabel(f"fixer, ms per frame (bars: 95 % of the difference from {baseline})", fontsize=9)
         if timed and max(timed) > 4 * max(min(timed), 1e-3):
             ax.set_xscale("log")
             ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -70,10 +76,9 @@ def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
     figure.savefig(path, dpi=DPI)
 
 
-def _arms(entry: Mapping[str, Any]) -> list[list[float]] | None:
-    """Return how far an interval reaches below and above the mean, as matplotlib takes it."""
-    bounds = entry["ci95"]
-    return None if bounds is None else [[entry["mean"] - bounds[0]], [bounds[1] - entry["mean"]]]
+def _reach(centre: float, bounds: list[float] | None) -> list[list[float]] | None:
+    """Return how far an interval reaches below and above its centre, as matplotlib takes it."""
+    return None if bounds is None else [[centre - bounds[0]], [bounds[1] - centre]]
 
 
 def _styles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
