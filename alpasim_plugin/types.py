@@ -205,11 +205,17 @@ class Environment:
 
 @dataclass(frozen=True)
 class Degradation:
-    """How the renderer ``3dgs`` differs from the scene as built. ``surrogate``: seeded stand-ins for a bad reconstruction."""
+    """How the renderer ``3dgs`` differs from the scene as built.
 
-    kind: Literal["surrogate", "none"] = "surrogate"
-    severity: float = 1.5  # scales all terms; 0 leaves the scene as built
-    onset_m: float = 0.1  # lateral distance from the logged path where the error starts to grow
+    ``reconstruction``: an under-trained model fitted to the frames of the logged drive. ``cycle``: a model fitted to frames seen from
+    aside, rendered on the path (OneFixer, App. A). ``surrogate``: seeded stand-ins, nothing is fitted. ``none``: the scene as built.
+    """
+
+    kind: Literal["reconstruction", "cycle", "surrogate", "none"] = "reconstruction"
+    share: float = 0.15  # of the fit's schedule, 0..1; reconstruction and cycle
+    shift_m: float = 1.0  # sideways, left positive, of the views that the cycle's model is fitted to
+    severity: float = 1.5  # scales all terms of the surrogate; 0 leaves the scene as built
+    onset_m: float = 0.1  # lateral distance from the logged path where the surrogate's error starts to grow
     full_m: float = 2.0  # lateral distance where it is full
 
 

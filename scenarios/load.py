@@ -229,7 +229,7 @@ def _environment(spec: ScenarioSpec) -> Environment:
 
 def _degradation(spec: ScenarioSpec) -> Degradation:
     d = spec.degradation
-    return Degradation(d.kind, d.severity, d.onset_m, d.full_m)
+    return Degradation(d.kind, d.share, d.shift_m, d.severity, d.onset_m, d.full_m)
 
 
 def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None:

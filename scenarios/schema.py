@@ -96,16 +96,31 @@ class LatencySpec(Part):
 class DegradationSpec(Part):
     """How the renderer 3dgs differs from the scene as built."""
 
-    kind: Literal["surrogate", "none"] = Field(default="surrogate", description="Seeded stand-ins for a bad reconstruction, or nothing.")
-    severity: NonNegative = Field(default=1.5, description="Scales all terms; 0 leaves the scene as built.")
-    onset_m: NonNegative = Field(default=0.1, description="Distance from the logged path where the error starts to grow.")
-    full_m: Positive = Field(default=2.0, description="Distance where it is full.")
+    kind: Literal["reconstruction", "cycle", "surrogate", "none"] = Field(
+        default="reconstruction",
+        description="A model fitted to the logged drive and stopped early; a model fitted to views from aside; seeded stand-ins; nothing.",
+    )
+    share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
+    shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
+    severity: NonNegative = Field(default=1.5, description="Surrogate: scales all terms; 0 leaves the scene as built.")
+    onset_m: NonNegative = Field(default=0.1, description="Surrogate: distance from the logged path where the error starts to grow.")
+    full_m: Positive = Field(default=2.0, description="Surrogate: distance where it is full.")
 
     @model_validator(mode="after")
-    def _ordered(self) -> DegradationSpec:
+    def _fitting(self) -> DegradationSpec:
+        for name in sorted(self.model_fields_set - {"kind"}):
+            kinds = [kind for kind, names in DEGRADATION_KEYS.items() if name in names]
+            if self.kind not in kinds:
+                found = f"{name} = {getattr(self, name)} with kind: {self.kind}"
+                raise ValueError(f"{found}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}")
         if self.full_m <= self.onset_m:
             raise ValueError(f"full_m = {self.full_m} is not beyond onset_m = {self.onset_m} | make full_m larger")
         return self
+
+
+DEGRADATION_KEYS = {
+    "reconstruction": ("share",), "cycle": ("share", "shift_m"), "surrogate": ("severity", "onset_m", "full_m"), "none": (),
+}  # fmt: skip
 
 
 class BackgroundSpec(Part):

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
+from alpasim_plugin.cli import train_pairs
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
@@ -21,12 +22,10 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clips import read_video, to_tensor
 from alpasim_plugin.training.pair_store import PairDataset
-from alpasim_plugin.training.pairs import PairRecipe, make_sequence
-from alpasim_plugin.training.scenes import DEFAULT_COUNTS, SPLITS, write_scenes
+from alpasim_plugin.training.scenes import DEFAULT_COUNTS, write_scenes
 from alpasim_plugin.training.trainer import Schedule, Trainer
 from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
 from alpasim_plugin.training.vae_quality import quality, round_trip
-from scenarios.load import load_scenario
 
 app = typer.Typer(no_args_is_help=True, help="Make training data and train networks.")
 Out = Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")]
@@ -37,6 +36,10 @@ app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 app.command("perceptual", epilog=PERCEPTUAL_EXAMPLE)(perceptual)
 app.command("splat", epilog=SPLAT_EXAMPLE)(splat)
+app.command("reconstructions", epilog=train_pairs.RECONSTRUCTIONS_EPILOG)(train_pairs.reconstructions)
+app.command("pairs", epilog=train_pairs.PAIRS_EPILOG)(train_pairs.pairs)
+app.command("pairs-sheet", epilog=train_pairs.SHEET_EPILOG)(train_pairs.pairs_sheet)
+app.command("import-pairs", epilog=train_pairs.IMPORT_EPILOG)(train_pairs.import_pairs)
 
 
 @app.callback()
@@ -55,24 +58,6 @@ def scenes(
     console = Console(stderr=True)
     for path in write_scenes(out, split, count or DEFAULT_COUNTS[split], duration_s):
         console.print(str(path))
-
-
-@app.command("pairs", epilog="Example: `simrun train pairs data/scenes --out data/pairs`")
-def pairs(
-    scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml.")],
-    out: Out,
-    split: Annotated[str, typer.Option("--split", help="Splits, comma-separated.")] = ",".join(SPLITS),
-    wander_m: Annotated[float, typer.Option("--wander-m", min=0.0, help="Largest distance from the logged path.")] = 1.5,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the paths beside the log.")] = 0,
-) -> None:
-    """Render pairs of damaged and clean frames with opacity, semantic map and poses; finished sequences are kept."""
-    console = Console(stderr=True)
-    recipe = PairRecipe(wander_m=wander_m)
-    for name in (s.strip() for s in split.split(",")):
-        for path in sorted((scenes / name).glob("*.yaml")):
-            family = path.stem.rsplit("_", 1)[0]
-            made = make_sequence(load_scenario(path), out / name / path.stem, recipe, seed, split=name, family=family)
-            console.print(f"{name}/{path.stem}{'' if made else ' (was there)'}")
 
 
 @app.command("vae", epilog="Example: `simrun train vae data/pairs --video drive.mp4 --out runs/vae --steps 4000`")

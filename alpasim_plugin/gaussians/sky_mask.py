@@ -9,6 +9,7 @@ beyond some 20 m.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,6 +20,14 @@ from alpasim_plugin.geometry import inverse
 from alpasim_plugin.types import F32
 
 
+@dataclass(frozen=True, eq=False)
+class SkyView:
+    """Where one logged camera saw sky: ``sky (H, W)`` float32, 1 where it did."""
+
+    camera: PinholeCamera
+    sky: F32
+
+
 class SkyMask:
     """What the nearest log view of a like direction saw of the sky.
 
@@ -26,7 +35,7 @@ class SkyMask:
         views: Of cameras that may look in different directions; without any, nothing is sky.
     """
 
-    def __init__(self, views: Sequence[LogView]) -> None:
+    def __init__(self, views: Sequence[LogView | SkyView]) -> None:
         self._views = tuple(views)
         T = np.array([inverse(view.camera.T_camera_world) for view in views]).reshape(-1, 4, 4)
         self._axes, self._eyes = T[:, :3, 2], T[:, :3, 3]  # (V, 3) world

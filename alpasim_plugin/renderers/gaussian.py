@@ -1,4 +1,4 @@
-"""Render Gaussian scenes: ``clean``, the scene as built, and ``3dgs``, its degraded reconstruction.
+"""Render Gaussian scenes: ``clean``, the scene as built, and the surrogate of a bad reconstruction of it.
 
 Rolling shutter is not modelled: a frame is rendered at its end pose. At 10 m/s and a read-out of 30 ms the ego moves 0.3 m during a frame,
 and no policy here uses more than the pose at the frame's time; the request carries both poses for renderers that do.
@@ -103,13 +103,6 @@ def _clean(scenario: Scenario, seed: int, device: str, threads: int | None) -> R
     return CleanRenderer(scenario, seed, device, threads)
 
 
-@RENDERERS.register("3dgs", "its degraded reconstruction: error grows with the distance from the logged path")
-def _3dgs(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-    if scenario.degradation.kind == "none" or scenario.degradation.severity == 0:
-        return CleanRenderer(scenario, seed, device, threads)
-    return SurrogateRenderer(scenario, seed, device, threads)
-
-
 def backend_of(device: str) -> Backend:
     """Return the rasteriser that serves a device.
 
@@ -129,7 +122,7 @@ def camera_at(request: RenderRequest) -> PinholeCamera:
 
 def scene_of(scenario: Scenario) -> SceneGraph:
     """Return the scenario's scene, built once per process."""
-    return _cached(f"scene:{scene_key(scenario)}", partial(_build, scenario))
+    return in_memory(f"scene:{scene_key(scenario)}", partial(_build, scenario))
 
 
 def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate, SkyMask, list[SceneNode], dict[float, SceneGraph]]:
@@ -142,7 +135,7 @@ def reconstruction_of(scenario: Scenario, scene: SceneGraph) -> tuple[Surrogate,
         views = log_views(scenario, scene)
         return Surrogate(scenario, views), SkyMask(views), ghosts, {}
 
-    return _cached(key, make)
+    return in_memory(key, make)
 
 
 def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:
@@ -203,7 +196,8 @@ def _build(scenario: Scenario) -> SceneGraph:
     return with_background(graph, cloud, scenario.background.T_world_file)
 
 
-def _cached(key: str, make: Callable[[], T]) -> T:
+def in_memory(key: str, make: Callable[[], T]) -> T:
+    """Return what is kept under a key in this process, made if it is not there; the least recently used goes first."""
     if key not in _cache:
         _cache[key] = make()
         while len(_cache) > 2 * CACHED_SCENES:

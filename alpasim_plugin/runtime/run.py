@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.renderers.reconstruction import model_key
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.execute import Threads, execute, thread_budget
 from alpasim_plugin.runtime.flips import write_flips
@@ -148,6 +149,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
                     "rates": asdict(s.rates),
                     "latency": asdict(s.latency),
                     "degradation": asdict(s.degradation),
+                    "reconstruction": model_key(s),
                     "notes": list(s.notes),
                 }
                 for name, s in plan.scenarios.items()

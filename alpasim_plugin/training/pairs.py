@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -18,10 +19,16 @@ from alpasim_plugin.geometry import interpolate, yaw_of
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.pair_store import SEQUENCE_FILE, Pair, write_sequence
-from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario
+from alpasim_plugin.types import F64, CameraSpec, Degradation, RenderRequest, Scenario
 from alpasim_plugin.world.ground import ground_pose
 
 DOING = "making training pairs"
+
+
+Draw = Literal["mixed", "as-set"]
+SHARES = (0.08, 0.24)  # of the fit's schedule, drawn for mixed sequences: renderers that a fixer meets differ in quality
+SHIFT_M = 1.0  # of the cycle render (paper, App. A); the side is drawn
+MOVING_M = 2.0  # an actor whose track is longer moves
 
 
 @dataclass(frozen=True)
@@ -31,13 +38,16 @@ class PairRecipe:
     Args:
         source: Renderer of the damaged frames.
         target: Renderer of the frames to be learned.
-        wander_m: Largest sideways distance from the logged path; the camera drifts smoothly within it.
+        degradation: ``mixed`` draws a reconstruction seen from beside the logged path or a cycle render seen from the path itself, by
+            halves; ``as-set`` takes what the scenario says.
+        wander_m: Largest sideways distance from the logged path; the camera drifts smoothly within it, except in cycle renders.
         interval_us: Time between frames.
         camera: Name of the scenario's camera; None takes the first.
     """
 
     source: str = "3dgs"
     target: str = "clean"
+    degradation: Draw = "mixed"
     wander_m: float = 1.5
     interval_us: int = 100_000
     camera: str | None = None
@@ -60,17 +70,31 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
     Raises:
         InputError: The scenario has no such camera.
     """
+    scenario = replace(scenario, degradation=draw_degradation(scenario, recipe, seed))
     info = {
         "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "split": split, "family": family,
-        "recipe": asdict(recipe),
+        "recipe": asdict(recipe), "degradation": asdict(scenario.degradation),
     }  # fmt: skip
     if _is_made(folder, info):
         return False
     camera = _camera(scenario, recipe.camera)
     times = range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
-    facts = {**info, "camera": {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}}
+    moving = [a.actor_id for a in scenario.actors if np.ptp(a.track.xyz, axis=0).max() > MOVING_M]
+    lens = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
+    facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
     write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads), len(times), facts)
     return True
+
+
+def draw_degradation(scenario: Scenario, recipe: PairRecipe, seed: int) -> Degradation:
+    """Return what the damaged frames of a sequence suffer from."""
+    if recipe.degradation == "as-set":
+        return scenario.degradation
+    rng = stream(scenario.scene_id, seed, "training.degradation")
+    is_cycle, side, share = rng.random() < 0.5, rng.random() < 0.5, round(float(rng.uniform(*SHARES)), 2)
+    if is_cycle:
+        return Degradation("cycle", share=share, shift_m=SHIFT_M if side else -SHIFT_M)
+    return Degradation("reconstruction", share=share)
 
 
 def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed: int, threads: int) -> Iterator[Pair]:
@@ -94,11 +118,12 @@ def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed
 def wander(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
     """Return a sideways offset for every frame ``(T,)``, metres, left positive: two slow waves of random size, at most ``wander_m``.
 
-    A fifth of the sequences stays on the logged path, where a reconstruction is best.
+    A fifth of the sequences stays on the logged path, where a reconstruction is best; so does every cycle render, which is damaged there.
     """
     rng = stream(scenario.scene_id, seed, "training.wander")
     t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
-    size = 0.0 if rng.random() < 0.2 else recipe.wander_m * np.sqrt(rng.uniform(0.05, 1.0))
+    on_path = rng.random() < 0.2 or scenario.degradation.kind == "cycle"
+    size = 0.0 if on_path else recipe.wander_m * np.sqrt(rng.uniform(0.05, 1.0))
     periods_s, phases = rng.uniform([6.0, 12.0], [12.0, 30.0]), rng.uniform(0, 2 * np.pi, 2)
     waves = np.sin(2 * np.pi * t_s[:, None] / periods_s + phases) @ np.array([0.35, 0.65])
     return np.asarray(size * waves)

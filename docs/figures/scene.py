@@ -1,4 +1,4 @@
-"""Measure the scenes and their degradation: PSNR against lateral offset, time per frame, visible Gaussians; draw docs/img/degradation.png.
+"""Measure the scenes and their surrogate degradation: PSNR against lateral offset, time per frame, visible Gaussians; draw docs/img/degradation.png.
 
     python docs/figures/scene.py [--speed] [SCENARIO ...]
 """
@@ -19,6 +19,7 @@ from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.types import F64, U8, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
 
+SURROGATE = ("degradation.kind=surrogate",)
 OFFSETS_M = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 SHOWN_M = (0.0, 1.0, 3.0)
 SHIPPED = ("smoke/straight", "smoke/curve", "urban/residential_parked", "highway/free_flow", "real/us101")
@@ -74,11 +75,11 @@ def figure(names: list[str]) -> None:
     """Draw clean and degraded views at growing offsets, and the curves of all scenarios."""
     curves = {}
     for name in names:
-        scenario = load_scenario(name)
+        scenario = load_scenario(name, overrides=SURROGATE)
         clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
         curves[Path(name).stem if "/" not in name or Path(name).exists() else name] = degradation_curve(scenario, clean, bad)
         print(name, " ".join(f"{m:g} m: {v:.1f} dB" for m, v in zip(OFFSETS_M, curves[next(reversed(curves))], strict=True)))
-    scenario = load_scenario(names[0])
+    scenario = load_scenario(names[0], overrides=SURROGATE)
     clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
     views = [requests(scenario, (480, 272), m, 6)[1] for m in SHOWN_M]
     columns = [np.concatenate([renderer.render(r).rgb for r in views], axis=1) for renderer in (clean, bad)]
@@ -104,7 +105,7 @@ def figure(names: list[str]) -> None:
 
 def speed(name: str, n: int = 24) -> None:
     """Print time per frame of both renderers, warm caches, frames along the whole log."""
-    scenario = load_scenario(name)
+    scenario = load_scenario(name, overrides=SURROGATE)
     for size in ((256, 144), (480, 272)):
         views = requests(scenario, size, 0.0, n)
         for kind in ("clean", "3dgs"):

@@ -97,7 +97,7 @@ def make_scenario(
         warmup_us=0,
         latency=Latency(),
         environment=environment or Environment(),
-        degradation=degradation or Degradation(),
+        degradation=degradation or Degradation("surrogate"),
         content_hash="",
     )
 

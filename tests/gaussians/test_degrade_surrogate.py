@@ -19,7 +19,7 @@ from alpasim_plugin.geometry import se2
 from alpasim_plugin.types import Degradation, Scenario
 from tests.gaussians.scene_maps import camera_spec, curve, parked, straight
 
-UNIT = Degradation(severity=1.0, onset_m=0.3, full_m=3.0)  # the amounts that the expectations below are written for
+UNIT = Degradation("surrogate", severity=1.0, onset_m=0.3, full_m=3.0)  # the amounts that the expectations below are written for
 SCENARIO = straight(degradation=UNIT)
 
 

@@ -87,7 +87,7 @@ def test_both_sides_of_the_path_are_bad(scenario: Scenario) -> None:
 
 def test_severity_zero_and_kind_none_render_the_clean_scene(scenario: Scenario) -> None:
     clean = make_renderer("clean", scenario).render(request(scenario, left_m=2.0))
-    for degradation in (Degradation(severity=0.0), Degradation(kind="none")):
+    for degradation in (Degradation("surrogate", severity=0.0), Degradation(kind="none")):
         other = replace(scenario, degradation=degradation)
         np.testing.assert_array_equal(make_renderer("3dgs", other).render(request(scenario, left_m=2.0)).rgb, clean.rgb)
 
@@ -95,7 +95,7 @@ def test_severity_zero_and_kind_none_render_the_clean_scene(scenario: Scenario) 
 def test_higher_severity_is_worse(scenario: Scenario) -> None:
     clean = make_renderer("clean", scenario)
     r = request(scenario, left_m=1.5)
-    worse = [replace(scenario, degradation=Degradation(severity=s)) for s in (0.3, 1.0, 2.0)]
+    worse = [replace(scenario, degradation=Degradation("surrogate", severity=s)) for s in (0.3, 1.0, 2.0)]
     values = [psnr(clean.render(r), make_renderer("3dgs", w).render(r)) for w in worse]
     assert values == sorted(values, reverse=True)
 
@@ -132,7 +132,7 @@ def test_rollout_seed_changes_what_wanders_but_not_the_scene(scenario: Scenario)
 
 
 def test_renderers_of_one_scenario_share_the_scene(scenario: Scenario) -> None:
-    assert scene_of(scenario) is scene_of(replace(scenario, degradation=Degradation(severity=0.2)))
+    assert scene_of(scenario) is scene_of(replace(scenario, degradation=Degradation("surrogate", severity=0.2)))
     assert scene_key(scenario) != scene_key(replace(scenario, seed=1))
     assert scene_key(scenario) != scene_key(replace(scenario, actors=()))
 

@@ -20,7 +20,7 @@ from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from scenarios.suite import expand
 
-SHORT = ("timing.duration_us=1200000",)
+SHORT = ("timing.duration_us=1200000", "degradation.kind=surrogate")
 
 
 class Heard:

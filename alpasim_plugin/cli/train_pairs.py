@@ -1,0 +1,170 @@
+"""``simrun train reconstructions | pairs | pairs-sheet | import-pairs``: what a fixer learns from."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.cli.jobs import spread
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.renderers.cache import cache_root
+from alpasim_plugin.renderers.reconstruction import KIND, ensure
+from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
+from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
+from alpasim_plugin.training.pair_import import PairSources, import_sequence
+from alpasim_plugin.training.pair_sheet import contact_sheet, measure_sequence, sheet, write_sheet
+from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.pairs import Draw, PairRecipe, make_sequence
+from alpasim_plugin.training.scenes import SPLITS
+from scenarios.load import load_scenario
+from scenarios.suite import ScenarioRef, expand
+
+Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Processes, one thread each.")]
+RECONSTRUCTIONS_EPILOG = "Example: `simrun train reconstructions suites/urban --jobs 2`"
+PAIRS_EPILOG = "Example: `simrun train pairs data/scenes --out data/pairs --jobs 2`"
+SHEET_EPILOG = "Example: `simrun train pairs-sheet data/pairs --out sheet`"
+IMPORT_EPILOG = (
+    "Example: `simrun train import-pairs data/pairs --name drive1 --rgb-input render.mp4 --rgb-gt log/ --opacity alpha.mp4 --sdmap map.mp4 "
+    "--poses poses.json`"
+)
+
+
+def reconstructions(
+    scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO...", help="Scenarios, suites or folders of them.")],
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
+    jobs: Jobs = 1,
+    again: Annotated[bool, typer.Option("--again", help="Fit those that are there as well.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Fit the reconstructions that the renderer 3dgs shows of scenarios, so that no run has to wait for them."""
+    del debug
+    refs = [ref for item in scenarios for ref in expand(item, overrides or ())]
+    console, rows = Console(stderr=True), []
+    for number, (ref, row) in enumerate(spread(_Fitted(again), refs, jobs), start=1):
+        rows.append({"path": ref.path, **row})
+        console.print(f"[{number}/{len(refs)}] {row['scene_id']}: {row['what']}", highlight=False, markup=False)
+    if as_json:
+        print(json.dumps(rows))
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    again: bool
+
+    def __call__(self, ref: ScenarioRef) -> dict[str, object]:
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides)
+        kind = scenario.degradation.kind
+        if kind not in ("reconstruction", "cycle"):
+            return {"scene_id": scenario.scene_id, "what": f"kind {kind} has nothing to fit", "folder": None, "seconds": 0.0}
+        recipe, began = recipe_of(scenario), time.perf_counter()
+        folder = cache_root() / KIND / reconstruction_key(scenario, recipe)
+        there = folder.exists() and not self.again
+        model, _ = ensure(scenario, recipe, None, again=self.again)
+        what = f"{len(model):,} Gaussians {'in' if there else 'fitted to'} {folder}"
+        return {"scene_id": scenario.scene_id, "what": what, "folder": str(folder), "seconds": round(time.perf_counter() - began, 2)}
+
+
+def pairs(
+    scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
+    split: Annotated[str, typer.Option("--split", help="Splits, comma-separated.")] = ",".join(SPLITS),
+    source: Annotated[str, typer.Option("--source", help="Renderer of the damaged frames.")] = "3dgs",
+    degradation: Annotated[
+        Draw, typer.Option("--degradation", help="mixed: reconstruction or cycle render, drawn; as-set: what each scenario says.")
+    ] = "mixed",
+    wander_m: Annotated[float, typer.Option("--wander-m", min=0.0, help="Largest distance from the logged path.")] = 1.5,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the degradation and of the path beside the log.")] = 0,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first so many scenes of each split.")] = None,
+    jobs: Jobs = 1,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Render pairs of damaged and clean frames with opacity, semantic map and poses; finished sequences are kept."""
+    del debug
+    work: list[_Scene] = []
+    for name in (s.strip() for s in split.split(",")):
+        files = sorted((scenes / name).glob("*.yaml"), key=lambda p: p.stem.rsplit("_", 1)[-1])[:count]
+        work += [_Scene(path, name) for path in files]
+    if not work:
+        raise InputError("making training pairs", str(scenes), f"no scenario in {split}", "make some with 'simrun train scenes'")
+    console, began = Console(stderr=True), time.perf_counter()
+    maker = _Maker(out, PairRecipe(source=source, degradation=degradation, wander_m=wander_m), seed)
+    for number, (scene, made) in enumerate(spread(maker, work, jobs), start=1):
+        note = "" if made else " (was there)"
+        line = f"[{number}/{len(work)}] {scene.split}/{scene.path.stem}{note}, {time.perf_counter() - began:.0f} s"
+        console.print(line, highlight=False, markup=False)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    path: Path
+    split: str
+
+
+@dataclass(frozen=True)
+class _Maker:
+    out: Path
+    recipe: PairRecipe
+    seed: int
+
+    def __call__(self, scene: _Scene) -> bool:
+        family = scene.path.stem.rsplit("_", 1)[0]
+        folder = self.out / scene.split / scene.path.stem
+        return make_sequence(load_scenario(scene.path), folder, self.recipe, self.seed, split=scene.split, family=family)
+
+
+def pairs_sheet(
+    data: Annotated[Path, typer.Argument(help="Folder of pairs: SPLIT/SEQUENCE.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.md and sheet.jpg; none writes neither.")] = None,
+    split: Annotated[str | None, typer.Option("--split", help="Splits, comma-separated; by default all there are.")] = None,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Measure pairs: counts, error, holes, light and map, and a picture of some; prints one JSON document."""
+    del debug
+    names = [s.strip() for s in split.split(",")] if split else sorted(p.name for p in data.glob("*") if any(p.glob("*/sequence.json")))
+    if not names:
+        raise InputError("measuring pairs", str(data), "no finished sequence", "make some with 'simrun train pairs'")
+    datasets = {name: PairDataset(data, name) for name in names}
+    facts = [measure_sequence(sequence, name) for name, dataset in datasets.items() for sequence in dataset.sequences]
+    document = sheet(facts)
+    if out is not None:
+        write_sheet(out, document, contact_sheet([s for dataset in datasets.values() for s in dataset.sequences]))
+    print(json.dumps(document, indent=1))
+
+
+def import_pairs(
+    out: Annotated[Path, typer.Argument(help="Folder of pairs to add to.")],
+    rgb_input: Annotated[Path, typer.Option("--rgb-input", help="Damaged renders: video, folder of pictures, or .npy.")],
+    rgb_gt: Annotated[Path, typer.Option("--rgb-gt", help="What there is to see, likewise.")],
+    opacity: Annotated[Path, typer.Option("--opacity", help="Opacity with the sky filled, white is opaque, likewise.")],
+    sdmap: Annotated[Path, typer.Option("--sdmap", help="Semantic map, likewise.")],
+    poses: Annotated[Path, typer.Option("--poses", help="T_world_camera of every frame, OpenCV axes: .npy (T, 4, 4) or JSON.")],
+    name: Annotated[str, typer.Option("--name", help="Name of the sequence.")],
+    split: Annotated[str, typer.Option("--split", help="train, val or test.")] = "train",
+    fps: Annotated[float, typer.Option("--fps", help="Frames per second, where the poses carry no times.")] = 10.0,
+    size: Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Scale all pictures to this size.")] = None,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Turn renders of your own reconstruction into a sequence of pairs, as long as its shortest channel."""
+    del debug
+    if split not in SPLITS or not name or Path(name).name != name or name.startswith("."):
+        asked = f"--split {split} --name {name}"
+        raise InputError("importing training pairs", asked, "no place for a sequence", "give train, val or test, and a plain name")
+    sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)
+    frames = import_sequence(sources, out / split / name, fps=fps, size=_size(size), facts={"split": split})
+    Console(stderr=True).print(f"{out / split / name}: {frames} frames", highlight=False, markup=False)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
+        raise InputError("importing training pairs", f"--size {text}", "no size", "give WIDTHxHEIGHT, for example 256x144")
+    return int(parts[0]), int(parts[1])

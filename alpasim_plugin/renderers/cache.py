@@ -1,0 +1,102 @@
+"""Keep what is costly to make in folders named by content: made once, whichever process asks first, and whole or not there.
+
+    $SIMRUN_CACHE or ~/.cache/simrun / KIND / KEY/        what was made
+                                           / KEY.lock     held by the process that makes it
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+
+T = TypeVar("T")
+
+
+def cache_root() -> Path:
+    """Return the folder of the cache: ``$SIMRUN_CACHE``, or ``~/.cache/simrun``."""
+    named = os.environ.get("SIMRUN_CACHE")
+    return Path(named).expanduser() if named else Path.home() / ".cache" / "simrun"
+
+
+def cached(kind: str, key: str, make: Callable[[Path], None], read: Callable[[Path], T], what: str, *, again: bool = False) -> T:
+    """Return what ``read`` finds under a key, made first if it is not there.
+
+    Several processes may ask at once: one makes it, the others wait. A folder that ``read`` refuses is made anew, with a warning.
+
+    Args:
+        kind: Sub-folder of the cache.
+        key: Name by content.
+        make: Fills an empty folder.
+        read: Reads a filled one.
+        what: What is made, for the lines on standard error.
+        again: Make it even if it is there.
+
+    Raises:
+        InfrastructureError: The cache cannot be written.
+        InputError: What was just made cannot be read.
+    """
+    folder = cache_root() / kind / key
+    if not again and folder.exists():
+        found = _readable(folder, read, what)
+        if found is not None:
+            return found
+    with _locked(folder.with_name(f"{key}.lock")):
+        found = None if again or not folder.exists() else _readable(folder, read, what, warn=False)
+        if found is None:
+            _make(folder, make, what)
+            found = read(folder)
+        return found
+
+
+def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = True) -> T | None:
+    try:
+        return read(folder)
+    except InputError as error:
+        if warn:
+            print(f"warning: {what} is damaged ({error.with_what}: {error.found}); making it again", file=sys.stderr, flush=True)
+        return None
+
+
+def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    print(f"{what} ...", file=sys.stderr, flush=True)
+    began = time.perf_counter()
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        make(partial)
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.replace(folder)
+    except OSError as error:
+        raise _refused(folder, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a lock that the system releases when its process ends, however it ends."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a")
+    except OSError as error:
+        raise _refused(path, error) from error
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _refused(path: Path, error: OSError) -> InfrastructureError:
+    return InfrastructureError(
+        "writing to the cache", str(path), error.strerror or str(error), "make room, or name a writable folder in SIMRUN_CACHE"
+    )

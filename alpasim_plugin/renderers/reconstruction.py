@@ -1,0 +1,110 @@
+"""The renderer ``3dgs``: a model fitted to the logged drive, or what the scenario's degradation names in its place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from alpasim_plugin.gaussians.build_actors import build_actor
+from alpasim_plugin.gaussians.builder import LIGHT, lit
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.nodes import Level, SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.sky_mask import SkyMask, SkyView
+from alpasim_plugin.renderers.base import RENDERERS
+from alpasim_plugin.renderers.cache import cached
+from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory
+from alpasim_plugin.renderers.reconstruction_files import read_model
+from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
+from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe, recipe_of
+from alpasim_plugin.types import Frame, Renderer, RenderRequest, Scenario
+
+KIND = "reconstructions"
+TILE_M = 24.0  # the background is culled in blocks of this size
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A reconstruction ready to be rendered."""
+
+    graph: SceneGraph
+    sky: SkyMask
+
+
+class ReconstructionRenderer:
+    """Render a reconstruction of the scenario's logged drive; it is fitted now if nobody has yet.
+
+    Attributes:
+        stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
+        self.scenario, self.seed, self.threads = scenario, seed, threads
+        self.backend = backend_of(device)
+        self.model = model_of(scenario, threads)
+        self.stats: Mapping[str, int] = {}
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render one frame at the shutter's end."""
+        camera = camera_at(request)
+        out = self.model.graph.render(camera, request.actors, self.threads, self.backend)
+        self.stats = out.stats
+        shown = np.maximum(out.alpha, self.model.sky.share(camera))
+        return Frame(request.t_us, request.camera.name, out.to_uint8(), shown, out.depth)
+
+
+@RENDERERS.register("3dgs", "a reconstruction of the logged drive: error grows with the distance from its path")
+def _3dgs(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
+    amount = scenario.degradation
+    if amount.kind == "none" or (amount.kind == "surrogate" and amount.severity == 0):
+        return CleanRenderer(scenario, seed, device, threads)
+    if amount.kind == "surrogate":
+        return SurrogateRenderer(scenario, seed, device, threads)
+    return ReconstructionRenderer(scenario, seed, device, threads)
+
+
+def model_of(scenario: Scenario, threads: int | None = None) -> Model:
+    """Return the scenario's reconstruction as a scene, read or fitted once per process.
+
+    Raises:
+        InputError: The scenario's degradation names no fit, or it has no camera to fit with.
+        InfrastructureError: The cache cannot be written.
+    """
+    recipe = recipe_of(scenario)
+    key = reconstruction_key(scenario, recipe)
+    return in_memory(f"reconstruction:{key}", lambda: scene_from(scenario, *ensure(scenario, recipe, threads)))
+
+
+def model_key(scenario: Scenario) -> str | None:
+    """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is fitted."""
+    if scenario.degradation.kind not in ("reconstruction", "cycle"):
+        return None
+    return reconstruction_key(scenario, recipe_of(scenario))
+
+
+def ensure(
+    scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None = None, *, again: bool = False
+) -> tuple[Reconstruction, list[SkyView]]:
+    """Return a reconstruction and its sky views from the cache; it is fitted first if it is not there, or if ``again``."""
+    from alpasim_plugin.renderers.reconstruction_build import build  # needs torch, which a cached reconstruction does not
+
+    key = reconstruction_key(scenario, recipe)
+    what = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
+    return cached(KIND, key, partial(build, scenario, recipe, threads), read_model, what, again=again)
+
+
+def scene_from(scenario: Scenario, model: Reconstruction, sky_views: Sequence[SkyView]) -> Model:
+    """Join a reconstruction's parts; actors that it lacks are spliced in from the scene as built (paper, App. A)."""
+    tile = np.floor(model.background.means[:, :2] / TILE_M).astype(np.int64)
+    background = nodes_by_tile("fit", [(0.0, model.background, tile[:, 1] * 1_000_003 + tile[:, 0])])
+    light = np.array(LIGHT[scenario.environment.sky])
+    actors = [
+        SceneNode(a.actor_id, "actor", (Level(0.0, model.actors[a.actor_id]),))
+        if a.actor_id in model.actors
+        else lit(build_actor(a, scenario.scene_id, scenario.seed), light)
+        for a in scenario.actors
+    ]
+    return Model(SceneGraph(background, actors, model.sky), SkyMask(sky_views))

@@ -1,0 +1,45 @@
+"""Fit the model behind the renderer ``3dgs`` to what the scenario's cameras saw along the log, or beside it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.fit.loop import fit
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import Start
+from alpasim_plugin.gaussians.fit.views import logged_views
+from alpasim_plugin.gaussians.sky_mask import SkyView
+from alpasim_plugin.renderers.gaussian import scene_of
+from alpasim_plugin.renderers.reconstruction_files import write_model
+from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe
+from alpasim_plugin.renderers.reconstruction_start import rough_start
+from alpasim_plugin.types import Scenario
+
+FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in
+
+
+def build(scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None, folder: Path) -> None:
+    """Fit a reconstruction and write it into an empty folder.
+
+    Points inside the boxes of actors never start a background Gaussian. Without ``fit_actors`` nothing explains the actors' pixels, as in
+    the second fit of the cycle render (paper, App. A, stage 2), where they are smeared over the background or lost.
+
+    Raises:
+        InputError: The scenario has no camera, or its views show nothing.
+    """
+    if not scenario.cameras:
+        raise InputError("fitting a reconstruction", f"scene {scenario.scene_id!r}", "no camera", "give the scenario a camera")
+    splat = recipe.splat
+    views = logged_views(scenario, scene_of(scenario), splat.views, splat.width, aside_m=recipe.aside_m, threads=threads)
+    boxes = {a.actor_id: a.box for a in scenario.actors}
+    start = rough_start(views, boxes, recipe, scenario.scene_id)
+    start = Start(start.background, start.actors if recipe.fit_actors else {})
+    fitted = fit(views, start, splat, scene_id=scenario.scene_id, threads=threads)
+    actors = {name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS}
+    sky_views = [SkyView(v.camera, v.sky.astype(np.float32)) for v in views if v.sky is not None]
+    facts = {"scene_id": scenario.scene_id, "recipe": asdict(recipe), "views": len(views)}
+    write_model(folder, Reconstruction(fitted.background, actors, fitted.sky), sky_views, facts)

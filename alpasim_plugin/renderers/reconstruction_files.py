@@ -1,0 +1,97 @@
+"""A reconstruction in the cache: the files of `Reconstruction.save`, where its views showed sky, and the hash of every file.
+
+    background.ply, actors/*.ply, sky.png, reconstruction.json
+    sky_views.npz       cameras of the views and, bit by bit, where they show sky
+    hashes.json         file name to SHA-256; written last
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.sky_mask import SkyView
+
+HASHES, SKY_VIEWS = "hashes.json", "sky_views.npz"
+
+
+def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView], facts: Mapping[str, Any]) -> None:
+    """Write a reconstruction and its sky views into an existing, empty folder.
+
+    Raises:
+        InputError, OSError: The disk refuses.
+    """
+    model.save(folder, facts)
+    bits = [np.packbits(view.sky > 0.5) for view in sky_views]
+    np.savez_compressed(
+        folder / SKY_VIEWS,
+        size=np.array([[v.camera.width, v.camera.height] for v in sky_views], dtype=np.int64).reshape(-1, 2),
+        K=np.array([v.camera.K for v in sky_views]).reshape(-1, 3, 3),
+        T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
+        sky=np.concatenate(bits) if bits else np.zeros(0, np.uint8),
+    )
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    hashes = {p.relative_to(folder).as_posix(): _hash(p) for p in files}
+    (folder / HASHES).write_text(json.dumps(hashes, indent=1) + "\n", encoding="utf-8")
+
+
+def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
+    """Read what `write_model` wrote; every file must have the hash it was written with.
+
+    Raises:
+        InputError: A file is missing or is another one than was written.
+    """
+    try:
+        hashes = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise _damaged(folder / HASHES, str(error)) from error
+    for name, expected in hashes.items():
+        try:
+            found = _hash(folder / name)
+        except OSError as error:
+            raise _damaged(folder / name, error.strerror or str(error)) from error
+        if found != expected:
+            raise _damaged(folder / name, "not the content that was written")
+    return Reconstruction.load(folder), _read_sky_views(folder / SKY_VIEWS)
+
+
+def model_hash(folder: Path) -> str:
+    """Return one hash of all files of a reconstruction, as they were written.
+
+    Raises:
+        OSError: It is not there.
+    """
+    return _hash(folder / HASHES)
+
+
+def _read_sky_views(path: Path) -> list[SkyView]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            sizes, Ks, Ts, bits = file["size"], file["K"], file["T_camera_world"], file["sky"]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise _damaged(path, str(error)) from error
+    views, first = [], 0
+    for (width, height), K, T in zip(sizes.tolist(), Ks, Ts, strict=True):
+        length = -(-width * height // 8)
+        sky = np.unpackbits(bits[first : first + length], count=width * height).reshape(height, width)
+        views.append(SkyView(PinholeCamera(width, height, K, T), sky.astype(np.float32)))
+        first += length
+    return views
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _damaged(path: Path, found: str) -> InputError:
+    return InputError("reading a reconstruction", str(path), found, "remove its folder; it is made again when it is needed")

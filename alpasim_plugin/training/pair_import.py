@@ -1,0 +1,173 @@
+"""Turn anyone's own renders into pairs: videos, folders of images or arrays of each channel, and the camera's poses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log.video_reader import VideoReader
+from alpasim_plugin.training.pair_store import Pair, write_sequence
+from alpasim_plugin.types import F64, U8
+
+DOING = "importing training pairs"
+PICTURES = (".png", ".jpg", ".jpeg")
+CHANNELS = ("rgb_input", "rgb_gt", "opacity", "sdmap")
+ORTHONORMAL = 1e-3  # how far from a rotation a pose may be, as files of few digits are
+
+
+@dataclass(frozen=True)
+class PairSources:
+    """Where the channels of one sequence lie.
+
+    Args:
+        rgb_input: What the damaged reconstruction shows: an mp4 file, a folder of .png or .jpg (in order of name), or a .npy array.
+        rgb_gt: What there is to see, likewise.
+        opacity: Accumulated opacity with the sky filled (OneFixer, App. A), white is opaque, likewise.
+        sdmap: Semantic map, likewise.
+        poses: Camera poses in the world, OpenCV axes: a .npy array ``(T, 4, 4)``, or JSON: a list of 4 x 4 matrices, or of
+            ``{"T_world_camera": [[...]], "t_us": 0}``.
+    """
+
+    rgb_input: Path
+    rgb_gt: Path
+    opacity: Path
+    sdmap: Path
+    poses: Path
+
+
+def import_sequence(
+    sources: PairSources, folder: Path, *, fps: float, size: tuple[int, int] | None = None, facts: Mapping[str, Any] | None = None
+) -> int:
+    """Write one sequence of pairs; it is as long as its shortest channel.
+
+    Args:
+        sources: The files; frame i of each belongs to pose i.
+        folder: ROOT/SPLIT/SEQUENCE; replaced if it exists.
+        fps: Frames per second, where the poses carry no times.
+        size: (width, height) to which every picture is scaled; None wants all channels of one size.
+        facts: Goes to sequence.json.
+
+    Returns:
+        Frames written.
+
+    Raises:
+        InputError: A file that cannot be read, poses that are none, a channel without frames, or channels of different size without
+            ``size``.
+    """
+    T, t_us = read_poses(sources.poses, fps)
+    named = {name: getattr(sources, name) for name in CHANNELS}
+    found = {name: (first, length) for name, path in named.items() for first, length in [_look(path)]}
+    if size is None:
+        shapes = {name: first.shape[1::-1] for name, (first, _) in found.items()}
+        if len(set(shapes.values())) > 1:
+            listed = ", ".join(f"{name} {w} x {h}" for name, (w, h) in shapes.items())
+            raise InputError(DOING, folder.name, f"channels of different size: {listed}", "give --size WIDTHxHEIGHT to scale them to one")
+    length = min(len(T), *(count for _, count in found.values()))
+    if length == 0:
+        raise InputError(DOING, folder.name, "no frame that every channel has", "give channels of the same drive")
+    counts = {**{name: count for name, (_, count) in found.items()}, "poses": len(T)}
+    info = {"family": "imported", **(facts or {}), "sources": {n: str(p) for n, p in named.items()}, "source_frames": counts}
+    write_sequence(folder, _pairs(named, T, t_us, length, size), length, info)
+    return length
+
+
+def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
+    """Return camera poses ``(T, 4, 4)`` in the world and their times, microseconds.
+
+    Raises:
+        InputError: Not a readable file of poses, or a matrix that is not rigid.
+    """
+    if fps <= 0:
+        raise InputError(DOING, "--fps", f"{fps}", "give a positive rate")
+    try:
+        if path.suffix == ".npy":
+            T, times = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64), None
+        else:
+            rows = json.loads(path.read_text(encoding="utf-8"))
+            with_times = bool(rows) and isinstance(rows[0], dict)
+            T = np.array([r["T_world_camera"] if with_times else r for r in rows], dtype=np.float64)
+            times = [int(r["t_us"]) for r in rows] if with_times and "t_us" in rows[0] else None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise InputError(DOING, str(path), found, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame") from error
+    if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T):
+        raise InputError(DOING, str(path), f"an array of shape {T.shape}", "give one 4 x 4 matrix a frame")
+    off = np.abs(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    bad = ~np.isfinite(T).all(axis=(1, 2)) | ~(off < ORTHONORMAL) | (np.linalg.det(np.nan_to_num(T[:, :3, :3])) < 0)
+    if bad.any():
+        found = f"pose {int(np.argmax(bad))} is no rotation and translation"
+        raise InputError(DOING, str(path), found, "give T_world_camera, metres, OpenCV axes")
+    if times is None:
+        times = [round(i / fps * 1e6) for i in range(len(T))]
+    if any(b <= a for a, b in pairwise(times)):
+        raise InputError(DOING, str(path), "times that do not increase", "sort the poses by time, or leave the times out")
+    return T, times
+
+
+def frames_of(path: Path) -> Iterator[U8]:
+    """Yield a channel's pictures ``(H, W, 3)`` one at a time.
+
+    Raises:
+        InputError: Nothing there, or not what this reads.
+    """
+    if path.is_dir():
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES)
+        if not files:
+            raise InputError(DOING, str(path), "a folder without pictures", f"put {', '.join(PICTURES)} there, named in order")
+        for file in files:
+            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+            if image is None:
+                raise InputError(DOING, str(file), "not a readable picture", "write it again")
+            yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
+    elif path.suffix == ".npy":
+        yield from _array_frames(path)
+    elif path.is_file():
+        with VideoReader(path) as video:
+            for frame in video:
+                yield frame.image
+    else:
+        raise InputError(DOING, str(path), "no such file or folder", "give a video, a folder of pictures or a .npy array")
+
+
+def _array_frames(path: Path) -> Iterator[U8]:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(DOING, str(path), str(error), "give a whole .npy array") from error
+    if array.dtype != np.uint8 or array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in (1, 3)):
+        raise InputError(DOING, str(path), f"{array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)")
+    for image in array:
+        colour = image if image.ndim == 3 else image[..., None]
+        yield np.ascontiguousarray(np.broadcast_to(colour, (*colour.shape[:2], 3)))
+
+
+def _look(path: Path) -> tuple[U8, int]:
+    """Return the first picture and how many there are; videos are read to their end, because only that tells."""
+    frames = frames_of(path)
+    first = next(frames, None)
+    if first is None:
+        raise InputError(DOING, str(path), "no frame", "give a channel with pictures")
+    return first, 1 + sum(1 for _ in frames)
+
+
+def _pairs(named: Mapping[str, Path], T: F64, t_us: list[int], length: int, size: tuple[int, int] | None) -> Iterator[Pair]:
+    streams = {name: frames_of(path) for name, path in named.items()}
+    for i in range(length):
+        images = {name: _scaled(next(stream), size) for name, stream in streams.items()}
+        opacity = cv2.cvtColor(images["opacity"], cv2.COLOR_RGB2GRAY)
+        yield Pair(images["rgb_input"], images["rgb_gt"], np.asarray(opacity, dtype=np.uint8), images["sdmap"], T[i], t_us[i])
+
+
+def _scaled(image: U8, size: tuple[int, int] | None) -> U8:
+    if size is None or image.shape[1::-1] == size:
+        return image
+    smaller = size[0] * size[1] < image.shape[0] * image.shape[1]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR), dtype=np.uint8)

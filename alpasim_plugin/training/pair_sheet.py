@@ -1,0 +1,186 @@
+"""Measure a folder of pairs: how many of what, how damaged, how much of the map shows, and a picture to look at."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.types import F64, U8
+
+EVERY = 5  # frames are measured this far apart: neighbours hardly differ
+PSNR_EDGES_DB = (0, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 100)
+HOLE_BELOW = 128  # of 255: more of such a pixel is missing than shown
+SSIM_SIGMA_PX, SSIM_K = 1.5, (0.01, 0.03)  # Wang et al. 2004
+ROWS, THUMB_WIDTH = 24, 192
+
+
+@dataclass(frozen=True)
+class SequenceFacts:
+    """Numbers of one sequence; means over the measured frames.
+
+    Attributes:
+        split, name, family, degradation: From its folder and sequence.json; ``imported`` where it says nothing.
+        frames: Frames that every channel has.
+        moving_actors: How many actors drive or walk; None where that is unknown.
+        psnr_db: Of rgb_input against rgb_gt, every measured frame.
+        ssim: Structural similarity of their grey values.
+        hole_share: Share of pixels that the reconstruction shows less than half of.
+        luminance: Mean of rgb_gt, 0..1.
+        map_share: Share of pixels on which the semantic map draws anything.
+        travel_m: Length of the camera's way.
+    """
+
+    split: str
+    name: str
+    family: str
+    degradation: str
+    frames: int
+    moving_actors: int | None
+    psnr_db: tuple[float, ...]
+    ssim: float
+    hole_share: float
+    luminance: float
+    map_share: float
+    travel_m: float
+
+
+def measure_sequence(sequence: PairSequence, split: str) -> SequenceFacts:
+    """Measure one sequence on every `EVERY`-th frame."""
+    clip, info = sequence.clip, sequence.info
+    index = range(0, len(clip), EVERY)
+    kind = info.get("degradation") or {}
+    return SequenceFacts(
+        split,
+        sequence.name,
+        str(info.get("family", "imported")),
+        str(kind.get("kind", "imported")) if isinstance(kind, Mapping) else str(kind),
+        len(clip),
+        info.get("moving_actors"),
+        tuple(psnr_db(clip.rgb_input[i], clip.rgb_gt[i]) for i in index),
+        _mean([ssim_grey(clip.rgb_input[i], clip.rgb_gt[i]) for i in index]),
+        _mean([float(np.mean(clip.opacity[i] < HOLE_BELOW)) for i in index]),
+        _mean([float(np.mean(clip.rgb_gt[i])) / 255 for i in index]),
+        _mean([float(np.mean(clip.sdmap[i].max(axis=-1) > 0)) for i in index]),
+        float(np.linalg.norm(np.diff(clip.T_world_camera[:, :3, 3], axis=0), axis=1).sum()),
+    )
+
+
+def psnr_db(a: U8, b: U8) -> float:
+    """Return the peak signal-to-noise ratio of two pictures, dB; 100 where they are equal."""
+    mse = float(np.mean((a.astype(np.float32) - b) ** 2))
+    return 100.0 if mse == 0 else min(100.0, float(10 * np.log10(255.0**2 / mse)))
+
+
+def ssim_grey(a: U8, b: U8) -> float:
+    """Return the mean structural similarity of two pictures' grey values (Wang et al. 2004), Gaussian window of 1.5 pixels."""
+    x, y = (cv2.cvtColor(np.ascontiguousarray(p), cv2.COLOR_RGB2GRAY).astype(np.float64) for p in (a, b))
+
+    def smooth(image: F64) -> F64:
+        return np.asarray(cv2.GaussianBlur(image, (11, 11), SSIM_SIGMA_PX))
+
+    mx, my = smooth(x), smooth(y)
+    c1, c2 = ((k * 255) ** 2 for k in SSIM_K)
+    vx, vy, cov = smooth(x * x) - mx * mx, smooth(y * y) - my * my, smooth(x * y) - mx * my
+    return float(np.mean((2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))))
+
+
+def sheet(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
+    """Return the statistics of many sequences as plain JSON: of all, by split, and every sequence."""
+    splits = sorted({f.split for f in facts})
+    return {
+        "measured_every": EVERY,
+        "all": _group(facts),
+        "splits": {split: _group([f for f in facts if f.split == split]) for split in splits},
+        "sequences": [{**asdict(f), "psnr_db": round(_mean(f.psnr_db), 2)} for f in facts],
+    }
+
+
+def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
+    values = np.concatenate([f.psnr_db for f in facts]) if facts else np.zeros(0)
+    counts, _ = np.histogram(values, PSNR_EDGES_DB)
+    out: dict[str, Any] = {
+        "sequences": len(facts),
+        "frames": sum(f.frames for f in facts),
+        "with_moving_actors": sum(bool(f.moving_actors) for f in facts),
+        "families": dict(sorted(Counter(f.family for f in facts).items())),
+        "degradations": dict(sorted(Counter(f.degradation for f in facts).items())),
+        "psnr_db": {"mean": _mean(values), "p05": _at(values, 5), "p50": _at(values, 50), "p95": _at(values, 95)},
+        "psnr_histogram": {"edges_db": list(PSNR_EDGES_DB), "frames": counts.tolist()},
+        "psnr_db_by_degradation": {
+            kind: _mean(np.concatenate([f.psnr_db for f in facts if f.degradation == kind]))
+            for kind in sorted({f.degradation for f in facts})
+        },
+    }
+    for name in ("ssim", "hole_share", "luminance", "map_share", "travel_m"):
+        out[name] = _mean([getattr(f, name) for f in facts])
+    return out
+
+
+def markdown(document: Mapping[str, Any]) -> str:
+    """Return the statistics as two Markdown tables: by split, and how many frames are how bad."""
+    columns = {**document["splits"], "all": document["all"]}
+    counted = ("sequences", "frames", "with_moving_actors")
+    rows = [[name.replace("_", " "), *(f"{c[name]:,}" for c in columns.values())] for name in counted]
+    for name in ("families", "degradations"):
+        rows += [[name, *(", ".join(f"{k} {v}" for k, v in c[name].items()) for c in columns.values())]]
+    spreads = ["{p05:.1f}, {mean:.1f}, {p95:.1f}".format(**c["psnr_db"]) for c in columns.values()]
+    rows.append(["PSNR of input, dB (5 %, mean, 95 %)", *spreads])
+    by_kind = [", ".join(f"{k} {v:.1f}" for k, v in c["psnr_db_by_degradation"].items()) for c in columns.values()]
+    rows.append(["PSNR by degradation, dB", *by_kind])
+    for name, title, form in (
+        ("ssim", "SSIM of input", "{:.3f}"), ("hole_share", "pixels missing", "{:.2%}"), ("luminance", "mean luminance", "{:.2f}"),
+        ("map_share", "pixels with map", "{:.1%}"), ("travel_m", "metres driven, mean", "{:.0f}"),
+    ):  # fmt: skip
+        rows.append([title, *(form.format(c[name]) for c in columns.values())])
+    head = ["", *columns]
+    table = [head, ["---"] * len(head), *rows]
+    edges = document["all"]["psnr_histogram"]["edges_db"]
+    bins = [f"{a} to {b}" for a, b in pairwise(edges)]
+    spread = [["PSNR, dB", *columns], ["---"] * len(head)]
+    spread += [[b, *(str(c["psnr_histogram"]["frames"][i]) for c in columns.values())] for i, b in enumerate(bins)]
+    text = ["\n".join("| " + " | ".join(row) + " |" for row in t) for t in (table, spread)]
+    return f"{text[0]}\n\nMeasured frames (every {document['measured_every']}th) by the PSNR of the input:\n\n{text[1]}\n"
+
+
+def contact_sheet(sequences: Sequence[PairSequence], rows: int = ROWS) -> U8:
+    """Return a picture ``(H, W, 3)``: one row a sequence, evenly chosen; input and truth early, in the middle and late, opacity and map."""
+    chosen = [sequences[i] for i in np.unique(np.linspace(0, len(sequences) - 1, min(rows, len(sequences))).round().astype(int))]
+    lines = []
+    for sequence in chosen:
+        clip = sequence.clip
+        tiles = [tile for i in (len(clip) // 10, len(clip) // 2, 9 * len(clip) // 10) for tile in (clip.rgb_input[i], clip.rgb_gt[i])]
+        middle = len(clip) // 2
+        tiles += [np.repeat(clip.opacity[middle][..., None], 3, axis=2), clip.sdmap[middle]]
+        lines.append(np.concatenate([_thumb(t) for t in tiles], axis=1))
+    width = max(line.shape[1] for line in lines)
+    return np.concatenate([np.pad(line, ((0, 2), (0, width - line.shape[1]), (0, 0))) for line in lines])
+
+
+def write_sheet(out: Path, document: Mapping[str, Any], picture: U8) -> None:
+    """Write ``sheet.md`` and ``sheet.jpg`` into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "sheet.md").write_text(markdown(document), encoding="utf-8")
+    cv2.imwrite(str(out / "sheet.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+
+
+def _thumb(image: U8) -> U8:
+    height = round(image.shape[0] * THUMB_WIDTH / image.shape[1])
+    return np.asarray(cv2.resize(np.ascontiguousarray(image), (THUMB_WIDTH, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _mean(values: Any) -> float:
+    array = np.asarray(values, dtype=np.float64)
+    return float(array.mean()) if array.size else float("nan")
+
+
+def _at(values: Any, percent: float) -> float:
+    array = np.asarray(values, dtype=np.float64)
+    return float(np.percentile(array, percent)) if array.size else float("nan")
