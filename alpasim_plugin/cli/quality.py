@@ -29,7 +29,7 @@ from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistanc
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.quality import RAW, Arm, QualityClip, measure, roll, row_key
 from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
-from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from alpasim_plugin.training.pair_store import SEQUENCE_FILE, PairDataset, PairSequence
 from evaluators.video.charts import plot_by_frame, plot_speed
 from evaluators.video.sheet import sheet
 from evaluators.video.summary import TRUTH, summarise
@@ -197,7 +197,8 @@ def finish(work: Work) -> dict[str, Any]:
 def quality_clip(sequence: PairSequence) -> QualityClip:
     """Return a sequence of pairs as a clip to measure on."""
     clip = sequence.clip
-    return QualityClip(sequence.name, sequence.info, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
+    written = (sequence.folder / SEQUENCE_FILE).stat().st_mtime_ns  # a sequence made again is another one, whatever it says of itself
+    return QualityClip(sequence.name, {**sequence.info, "written_ns": written}, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
 
 
 def shown_frames(frames: int) -> tuple[int, ...]:
