@@ -72,6 +72,7 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
         (GOOD + "log: {}\n", ":8:1", "0 sources", "give one of argoverse"),
         (GOOD + "cameras: []\n", ":8:1", "cameras = []", "at least 1"),
         (GOOD + "cameras: [{name: a}, {name: a}]\n", ":8:23", "duplicate camera name 'a'", "another name"),
+        (GOOD + "degradation: {share: 0.5, severity: 2}\n", ":8:1", "severity = 2.0 with kind: reconstruction", "say kind: surrogate, or"),
         (GOOD + "degradation: {kind: surrogate, onset_m: 4}\n", ":8:1", "full_m = 2.0 is not beyond onset_m = 4.0", "make full_m larger"),
         (GOOD + "environment: {sky: claer}\n", ":8:15", "environment.sky is 'claer'", "did you mean 'clear'?"),
         (GOOD + "background: {file: none.ply}\n", ":8:14", "none.ply does not exist", "correct the path"),

@@ -1,0 +1,195 @@
+"""The renderer 3dgs on a model fitted to the logged drive: tiny fits of a street, 64 x 36 pixels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.geometry import inverse
+from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache
+from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
+from alpasim_plugin.renderers.reconstruction_files import HASHES, read_model
+from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
+from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
+from alpasim_plugin.types import BackgroundFile, Behaviour, Degradation, Environment, Latency, Scenario
+from tests.gaussians.scene_maps import line, parked, road_lanes, straight, with_camera
+from tests.renderers.test_gaussian_renderers import psnr, request
+
+ACTORS = (parked("ahead", 19.0, -1.8), parked("never-seen", -30.0, -1.8))
+FITTED = Degradation("reconstruction", share=0.4)
+
+
+def street(degradation: Degradation = FITTED) -> Scenario:
+    """Give 1.4 s along a straight street with one actor in view and one behind the camera."""
+    around = Environment(buildings=0.0, trees_per_100m=5.0, poles_spacing_m=0.0)
+    scenario = with_camera(straight(actors=ACTORS, environment=around, degradation=degradation), 64, 36)
+    log = scenario.ego_log
+    return replace(scenario, ego_log=replace(log, t_us=log.t_us[:8], xyz=log.xyz[:8], quat=log.quat[:8]))
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("SIMRUN_CACHE", str(folder))
+        yield folder
+    clear_cache()
+
+
+@pytest.fixture(scope="module")
+def fitted(cache: Path) -> ReconstructionRenderer:
+    del cache
+    renderer = make_renderer("3dgs", street())
+    assert isinstance(renderer, ReconstructionRenderer)
+    return renderer
+
+
+def error_db(renderer: ReconstructionRenderer, left_m: float) -> float:
+    clean = make_renderer("clean", renderer.scenario)
+    requests = [request(renderer.scenario, i, left_m) for i in (1, 3, 6)]
+    return float(np.mean([psnr(clean.render(r), renderer.render(r)) for r in requests]))
+
+
+def test_frame_has_the_shapes_types_and_ranges_of_the_contract(fitted: ReconstructionRenderer) -> None:
+    frame = fitted.render(request(fitted.scenario, 4))
+    assert frame.rgb.shape == (36, 64, 3)
+    assert frame.rgb.dtype == np.uint8
+    assert frame.alpha is not None
+    assert frame.depth is not None
+    assert frame.alpha.shape == frame.depth.shape == (36, 64)
+    assert 0 <= frame.alpha.min() <= frame.alpha.max() <= 1
+    assert frame.alpha[:4].mean() > 0.97  # sky counts as shown
+    assert frame.alpha[24:].mean() > 0.6  # ground
+    assert 2.0 < frame.depth[-1, 32] < 9.0
+
+
+def test_it_shows_the_scene_well_on_the_path_and_worse_beside_it(fitted: ReconstructionRenderer) -> None:
+    on_path, beside = error_db(fitted, 0.0), error_db(fitted, 3.0)
+    assert on_path > 19
+    assert on_path > beside + 1
+
+
+def test_a_larger_share_of_the_schedule_fits_better(fitted: ReconstructionRenderer) -> None:
+    hasty = make_renderer("3dgs", street(Degradation("reconstruction", share=0.02)))
+    assert isinstance(hasty, ReconstructionRenderer)
+    assert error_db(fitted, 0.0) > error_db(hasty, 0.0) + 1
+
+
+def test_frames_do_not_depend_on_what_came_before_nor_on_threads(fitted: ReconstructionRenderer) -> None:
+    r = request(fitted.scenario, 4, 0.7)
+    fitted.render(request(fitted.scenario, 7))
+    first = fitted.render(r)
+    clear_cache()
+    for threads in (1, 2):  # of the rasteriser: the model comes from the disk
+        again = make_renderer("3dgs", fitted.scenario, seed=5, threads=threads).render(r)
+        np.testing.assert_array_equal(first.rgb, again.rgb)
+        np.testing.assert_array_equal(first.alpha, again.alpha)
+
+
+def test_actor_that_was_seen_is_fitted_and_one_never_seen_is_spliced_in(fitted: ReconstructionRenderer) -> None:
+    actors = fitted.model.graph.actors
+    assert len(actors["ahead"].levels) == 1
+    own = make_renderer("clean", fitted.scenario)
+    assert isinstance(own, CleanRenderer)
+    np.testing.assert_array_equal(actors["never-seen"].levels[0].cloud.means, own.scene.actors["never-seen"].levels[0].cloud.means)
+    r = request(fitted.scenario, 4)
+    for name in actors:
+        pose = np.eye(4)
+        pose[:3, 3] = (22.0, -1.8, 0.75)
+        with_actor, without = (fitted.render(replace(r, actors=a)) for a in ({name: pose}, {}))
+        changed = np.abs(with_actor.rgb.astype(int) - without.rgb).max(axis=2) > 20
+        assert changed.sum() > 12, name
+
+
+def test_actor_unknown_to_the_scene_is_an_error(fitted: ReconstructionRenderer) -> None:
+    with pytest.raises(RendererError, match="actor 'nobody' has no model"):
+        fitted.render(replace(request(fitted.scenario, 4), actors={"nobody": np.eye(4)}))
+
+
+def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
+    fitted: ReconstructionRenderer, cache: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scenario = fitted.scenario
+    folder = cache / KIND / reconstruction_key(scenario, recipe_of(scenario))
+    before = json.loads((folder / HASHES).read_text())
+    assert set(before) == {"background.ply", "actors/000.ply", "reconstruction.json", "sky.png", "sky_views.npz"}
+    data = bytearray((folder / "background.ply").read_bytes())
+    data[-10] ^= 255
+    (folder / "background.ply").write_bytes(data)
+    with pytest.raises(InputError, match="not the content that was written"):
+        read_model(folder)
+    ensure(scenario, recipe_of(scenario), threads=2)
+    assert "is damaged" in capfd.readouterr().err
+    assert json.loads((folder / HASHES).read_text()) == before
+
+
+def test_cycle_is_fitted_one_metre_aside_and_takes_all_actors_from_the_scene(cache: Path) -> None:
+    del cache
+    scenario = street(Degradation("cycle", share=0.1, shift_m=1.0))
+    renderer = make_renderer("3dgs", scenario)
+    assert isinstance(renderer, ReconstructionRenderer)
+    assert all(len(node.levels) > 1 for node in renderer.model.graph.actors.values())
+    _, views = ensure(scenario, recipe_of(scenario))
+    y = [inverse(view.camera.T_camera_world)[1, 3] for view in views]
+    np.testing.assert_allclose(y, -0.8, atol=1e-6)  # the log runs at y = -1.8
+
+
+def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else() -> None:
+    scenario = street()
+    key = reconstruction_key(scenario, recipe_of(scenario))
+    same = [
+        replace(scenario, latency=Latency("fixed", 100_000)),
+        replace(scenario, end_us=scenario.end_us - 500_000, content_hash="other"),
+        replace(scenario, actors=(replace(ACTORS[0], behaviour=Behaviour("idm")), ACTORS[1])),
+    ]
+    assert {reconstruction_key(s, recipe_of(s)) for s in same} == {key}
+    other_lanes = road_lanes(line((-60, 0), (220, 0)), "r", 1)
+    other = [
+        replace(scenario, seed=1),
+        replace(scenario, actors=ACTORS[:1]),
+        replace(scenario, actors=(parked("ahead", 19.5, -1.8), ACTORS[1])),
+        replace(scenario, lane_map=replace(scenario.lane_map, lanes=other_lanes)),
+        replace(scenario, environment=replace(scenario.environment, buildings=0.4)),
+        replace(scenario, degradation=replace(FITTED, share=0.5)),
+        replace(scenario, degradation=Degradation("cycle", share=0.4)),
+        with_camera(scenario, 96, 54),
+    ]
+    keys = [reconstruction_key(s, recipe_of(s)) for s in other]
+    assert len({key, *keys}) == len(other) + 1
+
+
+def test_key_follows_the_bytes_of_a_background_file_not_its_place(tmp_path: Path) -> None:
+    keys = []
+    for name, content in (("a", b"1"), ("b", b"1"), ("c", b"2")):
+        (tmp_path / name).write_bytes(content)
+        scenario = replace(street(), background=BackgroundFile(str(tmp_path / name), np.eye(4)))
+        keys.append(reconstruction_key(scenario, recipe_of(scenario)))
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_kind_of_degradation_chooses_the_renderer() -> None:
+    assert isinstance(make_renderer("3dgs", street(Degradation("surrogate"))), SurrogateRenderer)
+    for amount in (Degradation("none"), Degradation("surrogate", severity=0.0)):
+        assert type(make_renderer("3dgs", street(amount))) is CleanRenderer
+    with pytest.raises(InputError, match="say reconstruction or cycle"):
+        recipe_of(street(Degradation("surrogate")))
+
+
+def test_scene_without_a_camera_cannot_be_fitted(cache: Path) -> None:
+    del cache
+    with pytest.raises(InputError, match="no camera"):
+        make_renderer("3dgs", replace(street(), cameras=()))
+
+
+def test_longer_logs_and_more_cameras_get_more_views_points_and_steps() -> None:
+    short, scenario = recipe_of(street()).splat, straight(degradation=FITTED)
+    long, two = recipe_of(scenario).splat, recipe_of(replace(scenario, cameras=scenario.cameras * 2)).splat
+    for name in ("views", "points", "steps"):
+        assert getattr(short, name) < getattr(long, name) < getattr(two, name)
