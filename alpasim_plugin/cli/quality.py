@@ -198,7 +198,8 @@ def quality_clip(sequence: PairSequence) -> QualityClip:
     """Return a sequence of pairs as a clip to measure on."""
     clip = sequence.clip
     written = (sequence.folder / SEQUENCE_FILE).stat().st_mtime_ns  # a sequence made again is another one, whatever it says of itself
-    return QualityClip(sequence.name, {**sequence.info, "written_ns": written}, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
+    facts = {**sequence.info, "written_ns": written}
+    return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
 
 
 def shown_frames(frames: int) -> tuple[int, ...]:
