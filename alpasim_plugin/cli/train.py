@@ -15,6 +15,7 @@ from alpasim_plugin.cli import train_pairs
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
+from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_check
 from alpasim_plugin.cli.train_splat import EPILOG as SPLAT_EXAMPLE
 from alpasim_plugin.cli.train_splat import splat
 from alpasim_plugin.nets.latent_stats import LatentStats
@@ -35,6 +36,7 @@ EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensor
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 app.command("perceptual", epilog=PERCEPTUAL_EXAMPLE)(perceptual)
+app.command("perceptual-check", epilog=CHECK_EPILOG)(perceptual_check)
 app.command("splat", epilog=SPLAT_EXAMPLE)(splat)
 app.command("reconstructions", epilog=train_pairs.RECONSTRUCTIONS_EPILOG)(train_pairs.reconstructions)
 app.command("pairs", epilog=train_pairs.PAIRS_EPILOG)(train_pairs.pairs)
