@@ -15,6 +15,7 @@ from rich.console import Console
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.nets.picture_distance import distance_for_training
 from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.training.generator import GeneratorRecipe
 from alpasim_plugin.training.latent_clips import ClipForm
@@ -57,6 +58,9 @@ def train_fixer_command(
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are trained.")] = "onefixer-tiny",
+    metric_weights: Annotated[
+        Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
+    ] = None,
 ) -> None:
     """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
     if threads is not None:
@@ -68,9 +72,9 @@ def train_fixer_command(
     run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])
     distance: tuple[str, Distance] | None = None
     if any(stage.horizon for stage in chosen.stages):
-        from alpasim_plugin.nets.perceptual import NAME, load_perceptual
-
-        distance = NAME, load_perceptual().distance
+        name, measure = distance_for_training(metric_weights)
+        distance = name, measure.distance
+        console.print(f"perceptual term: {name}")
 
     def encoded(done: int, count: int) -> None:
         if done == count or done % 10 == 0:
