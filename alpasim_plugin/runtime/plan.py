@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.compose import card_of, parse_renderer
+from alpasim_plugin.renderers.reconstruction import model_key
+from alpasim_plugin.runtime.compose import BASE, card_of, parse_renderer
 from alpasim_plugin.types import Scenario
 from evaluators import EVALUATORS_VERSION
 from scenarios.load import load_scenario
@@ -109,12 +110,14 @@ def make_plan(
                 "give one of them another id, or name it once",
             )
         scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
+    models = {scene_id: model_key(scenario) for scene_id, scenario in scenarios.items()}  # what 3dgs shows, where it is fitted
     cells = []
     for scene_id, scenario in scenarios.items():
         for renderer in renderers:
             for policy in policies:
                 for seed in seeds:
                     shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
+                    shaped_by += [model] if (model := models[scene_id]) and parse_renderer(renderer).base == BASE else []
                     rollout_key = digest([*shaped_by, cards[renderer].as_dict()] if renderer in cards else shaped_by)
                     keys = rollout_key, score_key(rollout_key, options.preset)
                     cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], *keys))

@@ -88,6 +88,13 @@ def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other() -> None:
     assert keys(("onefixer",), ("tolerance_m=0.02", "tolerance_deg=0.1")) == [fixed]  # the defaults, said aloud
 
 
+def test_what_3dgs_shows_enters_the_keys_of_its_rollouts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = keys(("clean", "3dgs", "identity", "identity+clean"))
+    monkeypatch.setattr("alpasim_plugin.renderers.reconstruction_key.VERSION", 0)
+    after = keys(("clean", "3dgs", "identity", "identity+clean"))
+    assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, False, True]
+
+
 def test_weights_enter_the_key_by_their_content_and_not_by_their_time(tmp_path: Path) -> None:
     path = tmp_path / "net.safetensors"
     path.write_bytes(b"one")
