@@ -17,7 +17,7 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import U8, Frame
 
 SMALL_DIT = (
-    "weights.bundle=null",
+    "weights.bundle=null", "history=last-forward", "holes=render",
     "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5", "dit.text_width=7", "dit.context_width=9",
 )  # fmt: skip
 SIZE = (32, 48)  # height, width
