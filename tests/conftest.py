@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,14 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a core: threads of several
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 REPO = Path(__file__).resolve().parents[1]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep what tests fit out of the user's cache; workers inherit the folder."""
+    if "SIMRUN_CACHE" not in os.environ:
+        folder = tempfile.mkdtemp(prefix="simrun-tests-")
+        os.environ["SIMRUN_CACHE"] = folder
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -27,7 +27,7 @@ from scenarios.suite import expand
 from tests.runtime.test_certificate import BARE
 from tests.runtime.test_runs import Heard
 
-SHORT = ("timing.duration_us=1200000", "timing.warmup_us=200000", *BARE)
+SHORT = ("timing.duration_us=1200000", "timing.warmup_us=200000", "degradation.kind=surrogate", *BARE)
 CELL = "clean/lane-camera/smoke-lead_car/0"
 AT_US = 600_000
 
