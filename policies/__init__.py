@@ -6,6 +6,7 @@ from policies.base import POLICIES, make_policy
 from policies.conformance import Check, Report, canned_scenario, check_policy
 from policies.constant_velocity import ConstantVelocity
 from policies.lane_camera import LaneCamera
+from policies.learned import Learned
 from policies.log_replay import LogReplay
 from policies.pure_pursuit import PurePursuit
 
@@ -14,6 +15,7 @@ __all__ = [
     "Check",
     "ConstantVelocity",
     "LaneCamera",
+    "Learned",
     "LogReplay",
     "PurePursuit",
     "Report",

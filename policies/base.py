@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -52,6 +54,22 @@ def find_policy(name: str) -> tuple[Callable[..., Policy], bool]:
     """
     is_import = ":" in name and "://" not in name
     return (_import(name) if is_import else POLICIES.get(name)), is_import
+
+
+def loaded_by(name: str) -> str:
+    """Return the SHA-256 of the file that a policy loads by itself, named by its class in ``loads``; "" where it loads none.
+
+    Raises:
+        InputError: The name is unknown, the import fails, or the file is not there.
+    """
+    file: Path | None = getattr(find_policy(name)[0], "loads", None)
+    if file is None:
+        return ""
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        do = "install the package again, with its weights"
+        raise InputError("reading what a policy loads", f"policy {name!r}", str(error), do) from error
 
 
 def plan_times(t_us: int, horizon_s: float = PLAN_HORIZON_S) -> I64:

@@ -34,7 +34,7 @@ DOUBT_AT_M = 10.0
 OBSTACLE_RANGE_M = 48.0
 
 
-def front_camera(scenario: Scenario) -> CameraSpec:
+def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
     """Return the camera to look through: the first one with "front" in its name, else the first one that looks ahead.
 
     Raises:
@@ -44,7 +44,7 @@ def front_camera(scenario: Scenario) -> CameraSpec:
     for camera in sorted(ahead, key=lambda c: "front" not in c.name):
         return camera
     raise InputError(
-        "making the policy 'lane-camera'",
+        f"making the policy {policy!r}",
         f"scene {scenario.scene_id!r}",
         f"no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
         "add a front camera to the scenario or choose another policy",

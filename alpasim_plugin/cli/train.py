@@ -16,6 +16,7 @@ from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, tr
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
 from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_check
+from alpasim_plugin.cli.train_policy import POLICY_DATA_EPILOG, POLICY_EPILOG, policy, policy_data
 from alpasim_plugin.cli.train_splat import EPILOG as SPLAT_EXAMPLE
 from alpasim_plugin.cli.train_splat import splat
 from alpasim_plugin.nets.latent_stats import LatentStats
@@ -35,6 +36,8 @@ WIDTH, HEIGHT = 256, 144
 EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
+app.command("policy-data", epilog=POLICY_DATA_EPILOG)(policy_data)
+app.command("policy", epilog=POLICY_EPILOG)(policy)
 app.command("perceptual", epilog=PERCEPTUAL_EXAMPLE)(perceptual)
 app.command("perceptual-check", epilog=CHECK_EPILOG)(perceptual_check)
 app.command("splat", epilog=SPLAT_EXAMPLE)(splat)

@@ -15,6 +15,7 @@ from alpasim_plugin.renderers.reconstruction import model_key
 from alpasim_plugin.runtime.compose import BASE, card_of, parse_renderer
 from alpasim_plugin.types import Scenario
 from evaluators import EVALUATORS_VERSION
+from policies.base import loaded_by
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
@@ -110,6 +111,7 @@ def make_plan(
                 "give one of them another id, or name it once",
             )
         scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
+    contents = {policy: loaded_by(policy) for policy in policies}
     models = {scene_id: model_key(scenario) for scene_id, scenario in scenarios.items()}  # what 3dgs shows, where it is fitted
     cells = []
     for scene_id, scenario in scenarios.items():
@@ -118,6 +120,7 @@ def make_plan(
                 for seed in seeds:
                     shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
                     shaped_by += [model] if (model := models[scene_id]) and parse_renderer(renderer).base == BASE else []
+                    shaped_by += [content] if (content := contents[policy]) else []
                     rollout_key = digest([*shaped_by, cards[renderer].as_dict()] if renderer in cards else shaped_by)
                     keys = rollout_key, score_key(rollout_key, options.preset)
                     cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], *keys))

@@ -1,0 +1,154 @@
+"""Drive by a small network that was taught on clean frames: picture, speed and a navigation command in, trajectory out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F64, U8, Frame, Observation, Plan, Route, Scenario, SensorSpec
+from policies.base import POLICIES, plan_times, seconds
+from policies.lane_camera import front_camera
+from policies.lane_plan import N_SAMPLES, NOISE_SPEED, sampled, wander
+from policies.learned_command import COMMANDS, route_command
+from policies.learned_view import look, picture
+from policies.pure_pursuit import MIN_CRUISE_MPS
+
+WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
+EARLIER_US = 500_000  # the earlier frame shows how the others move
+EARLIEST_US = 700_000
+MAX_DOUBT_M, MAX_DOUBT_SPEED = 0.5, 0.15
+STANDS_MPS = 0.3
+
+
+class Learned:
+    """Ask a network for a path and a speed profile; drive a sample of its answer.
+
+    It reads two frames of one camera, 0.5 s apart, the car's speed, the first speed of the drive as the wanted one, and one of five
+    commands that are read off the route (`policies.learned_command`). Nothing else of the route reaches it: the place in the lane comes
+    from the pixels. It was taught on frames of the renderer ``clean`` alone.
+
+    Args:
+        scenario: Gives the camera, the scene's id for the random streams, and nothing else.
+        weights: File that ``simrun train policy`` wrote; None takes the shipped ones.
+        temperature: Scale of the network's own standard deviations when a plan is drawn; 0 drives the mean.
+
+    Raises:
+        InputError: No camera looks ahead, the weights are not there or not of this network, or the temperature is negative.
+    """
+
+    loads: ClassVar[Path] = WEIGHTS  # part of a rollout's content key
+
+    def __init__(self, scenario: Scenario, weights: Path | str | None = None, temperature: float = 1.0) -> None:
+        from policies.learned_net import knot_weights, load_net, path_grid  # torch is loaded only where it is needed
+
+        if not (np.isfinite(temperature) and temperature >= 0):
+            raise InputError("making the policy 'learned'", "temperature", f"{temperature}", "give 0 or a positive number")
+        self.camera = front_camera(scenario, "learned")
+        self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
+        self.scene_id, self.temperature = scenario.scene_id, float(temperature)
+        self.net = load_net(WEIGHTS if weights is None else Path(weights))
+        self.grid_m, self.weights = path_grid(), knot_weights()
+        self.reset(0, scenario.route)
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Forget everything of the drive before."""
+        self.seed, self.step, self.acted_us = seed, 0, 0
+        self.noise: F64 | None = None  # the samples' errors, which last for seconds
+        self.wanted_mps: float | None = None
+        self.views: deque[tuple[int, U8]] = deque()
+
+    def act(self, observation: Observation) -> Plan:
+        """Return a plan drawn from the network's answer to the newest frame.
+
+        Raises:
+            PolicyError: The observation has no frame of the camera, or one of another size.
+        """
+        frame = self._frame(observation)
+        if not self.views or frame.t_us > self.views[-1][0]:
+            self.views.append((frame.t_us, look(frame.rgb, self.camera)))
+        while self.views[0][0] < frame.t_us - EARLIEST_US:
+            self.views.popleft()
+        speed = max(observation.ego.speed_mps, 0.0)
+        if self.wanted_mps is None:
+            self.wanted_mps = max(speed, MIN_CRUISE_MPS)
+        command = route_command(observation.route_rig)
+        heading, faster, doubt = self._ask(speed, command)
+        times = plan_times(observation.t_us)
+        xy, yaw = self._mean(heading, faster, speed, seconds(times))
+        random = stream(self.scene_id, self.seed, "policy", self.step)
+        self.noise = wander(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
+        self.step, self.acted_us = self.step + 1, observation.t_us
+        aside_m, share = self.temperature * np.minimum(doubt, [MAX_DOUBT_M, MAX_DOUBT_SPEED])
+        drawn = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
+        plans = sampled(xy, yaw, drawn, float(aside_m))[1:] if self.temperature else [np.column_stack([xy, yaw])] * N_SAMPLES
+        debug: dict[str, Any] = {"command": command, "wanted_mps": self.wanted_mps}
+        debug.update(doubt_m=float(doubt[0]), doubt_speed=float(doubt[1]))
+        return Plan(observation.t_us, times, plans[0][:, :2].copy(), plans[0][:, 2].copy(), tuple(plans[1:]), debug)
+
+    def _ask(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
+        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the two doubts ``(2,)``."""
+        import torch
+
+        from policies.learned_net import SPEED_UNIT_MPS
+
+        t_us, now = self.views[-1]
+        earlier = min(self.views, key=lambda view: abs(t_us - EARLIER_US - view[0]))
+        real = t_us - earlier[0] > EARLIER_US // 2
+        assert self.wanted_mps is not None
+        state = [speed_mps / SPEED_UNIT_MPS, self.wanted_mps / SPEED_UNIT_MPS, float(real)]
+        threads = torch.get_num_threads()
+        if threads != 1:
+            torch.set_num_threads(1)  # the sums of a convolution must not depend on who else runs
+        try:
+            with torch.inference_mode():
+                seen = torch.from_numpy(picture(now, earlier[1] if real else now))[None]
+                answer = self.net(seen, torch.tensor([state]), torch.tensor([COMMANDS.index(command)]))
+        finally:
+            if threads != 1:
+                torch.set_num_threads(threads)
+        heading, faster, doubt = (part[0].double().numpy() for part in (answer.heading, answer.speed, answer.doubt))
+        return heading, faster, doubt
+
+    def _mean(self, heading: F64, faster: F64, speed_mps: float, t_s: F64) -> tuple[F64, F64]:
+        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the network's own answer."""
+        from policies.learned_net import TIMES_S
+
+        speeds = np.maximum(np.interp(t_s, [0.0, *TIMES_S], speed_mps + np.array([0.0, *faster])), 0.0)
+        speeds[speeds < STANDS_MPS * min(1.0, speed_mps)] = 0.0
+        progress = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(t_s))])
+        yaw = self.weights @ heading
+        middle = 0.5 * (yaw[1:] + yaw[:-1])
+        xy = np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)])
+        over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight on beyond the last knot
+        at = [np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)]
+        return np.stack([at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])], axis=1), at[2]
+
+    def _frame(self, observation: Observation) -> Frame:
+        frame = observation.frames.get(self.camera.name)
+        expected = (self.camera.height, self.camera.width, 3)
+        if frame is None or frame.rgb.shape != expected:
+            found = f"frames of {sorted(observation.frames)}" if frame is None else f"a frame of shape {frame.rgb.shape}"
+            raise PolicyError(
+                "planning by camera",
+                f"policy 'learned' at {observation.t_us} us",
+                f"{found}; needed is {self.camera.name!r} of shape {expected}",
+                "render the cameras that the policy names in `sensors`, at the scenario's size",
+            )
+        return frame
+
+
+class LearnedMean(Learned):
+    """The same network at temperature 0."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__(scenario, temperature=0.0)
+
+
+POLICIES.register("learned", "a network taught on clean frames: one front camera, its speed, a command such as left-ahead")(Learned)
+POLICIES.register("learned-mean", "the same network, driven by its mean answer: every seed drives alike")(LearnedMean)

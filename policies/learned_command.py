@@ -1,0 +1,44 @@
+"""What the navigation says to the learned policy: one of five words, read off the shape of the route ahead."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+
+from alpasim_plugin.geometry import wrap_angle
+from alpasim_plugin.types import F64
+
+Command = Literal["keep", "left-ahead", "left-now", "right-ahead", "right-now"]
+COMMANDS: tuple[Command, ...] = get_args(Command)
+
+TURN_RADIUS_M = 28.0  # a tighter bend is a turn and is announced; a wider one is the road's own
+AHEAD_M, NOW_M = 40.0, 6.0
+
+
+def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
+    """Return the command for a route ahead ``(20, 3)`` in the rig frame, NaN where it ends.
+
+    A turn is a stretch of two route segments on which the route bends tighter than `TURN_RADIUS_M`. The nearest one within `AHEAD_M` is
+    announced, with "now" from `NOW_M` before it. Where in the lane the route lies cannot be read from the answer.
+
+    Args:
+        route_rig: As in `Observation`.
+        late_m: How much later the navigation is than it should be; negative: earlier.
+    """
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    if len(points) < 4:
+        return "keep"
+    step = np.diff(points, axis=0)
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    length = np.hypot(step[:, 0], step[:, 1])
+    bend = wrap_angle(heading[2:] - heading[:-2]) / np.maximum(0.5 * (length[2:] + length[:-2]) + length[1:-1], 1e-6)
+    begins_m = np.cumsum(length)[:-2] + late_m
+    turns = np.flatnonzero((np.abs(bend) > 1.0 / TURN_RADIUS_M) & (begins_m < AHEAD_M))
+    if len(turns) == 0:
+        return "keep"
+    first = int(turns[0])
+    now = begins_m[first] < NOW_M
+    if bend[first] > 0:
+        return "left-now" if now else "left-ahead"
+    return "right-now" if now else "right-ahead"

@@ -1,0 +1,211 @@
+"""The learned policy: what it looks at, what it is told, and that it drives by its pixels."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.geometry import inverse, se2, transform_points
+from alpasim_plugin.types import EgoState, Observation
+from policies import check_policy, make_policy
+from policies.conformance import STRAIGHT, observations
+from policies.learned import WEIGHTS, Learned
+from policies.learned_command import route_command
+from policies.learned_net import KNOTS_M, LearnedNet, knot_weights, lay_out, load_net, path_grid, save_net
+from policies.learned_view import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, look, view_map
+from policies.painted_road import Line, PaintedRoad, pinhole_camera
+from tests.policies.policy_world import CAMERA, observe, scenario_with
+
+ROAD = PaintedRoad()
+
+
+# --- the view ---------------------------------------------------------------------------------------------------------
+
+
+def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera() -> None:
+    point = np.array([20.0, -3.0, 0.4])
+    for camera in (pinhole_camera(), pinhole_camera(hfov_deg=50.0, pitch_deg=6.0), pinhole_camera(width=1280, height=720)):
+        for turn in (-0.1, 0.0, 0.1):
+            in_camera = transform_points(inverse(camera.T_rig_camera), point[None])[0]
+            pixel = camera.K @ in_camera
+            view = np.linalg.inv(view_map(camera, turn)) @ pixel
+            ahead = se2(0.0, 0.0, turn)[:3, :3].T @ (point - camera.T_rig_camera[:3, 3])
+            wanted = [WIDTH / 2 - FOCAL_PX * ahead[1] / ahead[0], HORIZON_ROW - FOCAL_PX * ahead[2] / ahead[0]]
+            np.testing.assert_allclose(view[:2] / view[2], wanted, atol=1e-9)
+
+
+def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view() -> None:
+    road, pose = PaintedRoad(lines=(Line(1.75), Line(-1.75)), road_m=(-4.0, 4.0)), ROAD.pose(0.0, 0.4)
+    views = []
+    sizes = ({}, {"pitch_deg": 5.0}, {"width": 1024, "height": 576})
+    for camera in (pinhole_camera(hfov_deg=80.0, **size) for size in sizes):
+        views.append(look(road.image(camera, pose), camera)[24:60, 10:-10].astype(float))
+        assert look(road.image(camera, pose), camera).shape == (HEIGHT, WIDTH, 3)
+    for other in views[1:]:
+        assert np.abs(other - views[0]).mean() < 6.0
+        assert np.corrcoef(other.ravel(), views[0].ravel())[0, 1] > 0.95
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def route_with_turn(after_m: float, radius_m: float, left: bool, aside_m: float = 0.0) -> np.ndarray:
+    s = 80 / 19 * np.arange(20)
+    arc = np.clip((s - after_m) / radius_m, 0.0, np.pi / 2)
+    beyond = np.maximum(s - after_m - radius_m * np.pi / 2, 0.0)
+    x = np.minimum(s, after_m) + radius_m * np.sin(arc)
+    y = radius_m * (1 - np.cos(arc)) + beyond
+    return np.stack([x, (y if left else -y) + aside_m, np.zeros(20)], axis=1)
+
+
+@pytest.mark.parametrize("left", [True, False])
+def test_turn_is_announced_and_then_due(left: bool) -> None:
+    word = "left" if left else "right"
+    assert route_command(route_with_turn(25.0, 10.0, left)) == f"{word}-ahead"
+    assert route_command(route_with_turn(3.0, 10.0, left)) == f"{word}-now"
+    assert route_command(route_with_turn(60.0, 10.0, left)) == "keep"
+
+
+@pytest.mark.parametrize("radius_m", [1e6, 200.0, 50.0])
+def test_bend_of_the_road_itself_is_no_turn(radius_m: float) -> None:
+    assert route_command(route_with_turn(10.0, radius_m, left=True)) == "keep"
+
+
+def test_command_says_nothing_about_the_place_in_the_lane() -> None:
+    for after_m in (3.0, 25.0):
+        words = {route_command(route_with_turn(after_m, 12.0, True, aside_m)) for aside_m in (-1.5, -0.3, 0.0, 1.5)}
+        assert len(words) == 1
+
+
+def test_route_that_is_over_or_absent_gives_keep() -> None:
+    route = route_with_turn(3.0, 10.0, True)
+    route[3:] = np.nan
+    assert route_command(route) == "keep"
+    assert route_command(np.full((20, 3), np.nan)) == "keep"
+
+
+# --- the network ------------------------------------------------------------------------------------------------------
+
+
+def test_headings_of_a_circle_lay_out_the_circle() -> None:
+    heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
+    points, yaw = lay_out(heading, torch.from_numpy(knot_weights()))
+    s = path_grid()
+    np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
+    np.testing.assert_allclose(points[0].numpy(), 40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1), atol=2e-3)
+
+
+def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path: Path) -> None:
+    net = LearnedNet(3)
+    path = tmp_path / "net.safetensors"
+    save_net(net, path, {})
+    for name, value in load_net(path).state_dict().items():
+        torch.testing.assert_close(value, net.state_dict()[name], atol=1e-3, rtol=1e-3)
+    with pytest.raises(InputError, match="no such file"):
+        Learned(scenario_with(), weights=tmp_path / "absent")
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match="not a whole safetensors file"):
+        Learned(scenario_with(), weights=path)
+    del net.word
+    save_net(net, path, {})
+    with pytest.raises(InputError, match=r"first word\.weight"):
+        Learned(scenario_with(), weights=path)
+
+
+# --- the policy -------------------------------------------------------------------------------------------------------
+
+
+def drive(policy: Learned, seed: int = 0) -> list[np.ndarray]:
+    policy.reset(seed, policy_route())
+    return [np.column_stack([p.xy, p.yaw]) for p in (policy.act(o) for o in seen())]
+
+
+def seen() -> list[Observation]:
+    return list(observations(STRAIGHT, {CAMERA.name: CAMERA}))
+
+
+def policy_route():
+    return scenario_with().route
+
+
+def test_it_keeps_the_contract() -> None:
+    report = check_policy("learned")
+    assert report.ok, str(report)
+
+
+def test_seeds_drive_differently_and_a_seed_alike() -> None:
+    policy = Learned(scenario_with())
+    first, again, other = drive(policy, 1), drive(policy, 1), drive(policy, 2)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    apart = max(np.abs(a - b).max() for a, b in zip(first, other, strict=True))
+    assert 0.01 < apart < 8.0
+    aside = max(np.abs(a[:, 1] - b[:, 1]).max() for a, b in zip(first, other, strict=True))
+    assert aside < 2.5
+
+
+def test_temperature_zero_is_the_mean_for_every_seed() -> None:
+    policy = make_policy("learned-mean", scenario_with())
+    assert isinstance(policy, Learned)
+    for a, b in zip(drive(policy, 1), drive(policy, 2), strict=True):
+        np.testing.assert_array_equal(a, b)
+    warm = Learned(scenario_with(), temperature=1.0)
+    many = np.mean([drive(warm, seed)[-1] for seed in range(10)], axis=0)
+    np.testing.assert_allclose(many[:, :2], drive(policy)[-1][:, :2], atol=1.2)
+    for bad in (-1.0, float("nan")):
+        with pytest.raises(InputError, match="temperature"):
+            Learned(scenario_with(), temperature=bad)
+
+
+def test_number_of_threads_does_not_change_a_bit() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = drive(Learned(scenario_with()))
+        torch.set_num_threads(2)
+        two = drive(Learned(scenario_with()))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_plan_follows_the_pixels_and_not_the_route() -> None:
+    policy = Learned(scenario_with(), temperature=0.0)
+    observation = seen()[0]
+    plan = policy.act(observation)
+    beside = Observation(**{**observation.__dict__, "route_rig": observation.route_rig + np.array([0.0, 0.9, 0.0])})
+    policy.reset(0, policy_route())
+    np.testing.assert_array_equal(plan.xy, policy.act(beside).xy)
+    shifted = observe(np.roll(observation.frames[CAMERA.name].rgb, 16, axis=1), EgoState(observation.t_us, np.eye(4), 10.0))
+    policy.reset(0, policy_route())
+    assert policy.act(shifted).xy[20, 1] < plan.xy[20, 1] - 0.3
+
+
+def test_wrong_frame_is_refused() -> None:
+    policy = Learned(scenario_with())
+    with pytest.raises(PolicyError, match=r"shape \(10, 10, 3\)"):
+        policy.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
+
+
+@pytest.mark.slow
+def test_answer_takes_at_most_ten_milliseconds_on_one_thread() -> None:
+    torch.set_num_threads(1)
+    policy, took = Learned(scenario_with()), []
+    for _ in range(10):
+        policy.reset(0, policy_route())
+        for observation in seen():
+            began = time.thread_time()
+            policy.act(observation)
+            took.append(time.thread_time() - began)
+    assert np.median(took) < 0.010
+
+
+def test_shipped_weights_are_small() -> None:
+    assert WEIGHTS.stat().st_size <= 1_200_000
