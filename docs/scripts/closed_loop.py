@@ -1,0 +1,73 @@
+"""Drive the held-out scenes behind three renderers and put the tables into docs/results.md.
+
+    python docs/scripts/closed_loop.py SCENES [RUNS] [--seeds N] [--policies learned,lane-camera] [--set KEY=VALUE]...
+
+SCENES is the folder of test scenes that ``simrun train scenes --split test`` wrote; RUNS (default: runs/closed-loop) keeps the run folders, so a
+second call continues an interrupted first one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from results import DOCS, number, replace, simrun
+
+RENDERERS = ("clean", "3dgs", "onefixer")
+SHOWN = ("collision_at_fault", "offroad", "offroad_or_collision_at_fault", "route_distance_m", "progress", "min_distance_to_obstacle_m")
+
+
+def paired_cell(entry: dict[str, Any] | None, rate: bool) -> str:
+    """Write a paired difference with its interval over scenes and its p-value."""
+    if not entry or entry["diff"] is None:
+        return "-"
+    scale, digits = (100.0, 1) if rate else (1.0, 3)
+    bounds = "" if entry["ci95"] is None else f" [{scale * entry['ci95'][0]:+.{digits}f}, {scale * entry['ci95'][1]:+.{digits}f}]"
+    p = "" if entry["p_value"] is None else f", p {entry['p_value']:.3f}"
+    return f"{scale * entry['diff']:+.{digits}f}{bounds}{p}"
+
+
+def table(summary: dict[str, Any]) -> str:
+    """Return metrics x renderers, with the paired differences of the others from 3dgs."""
+    lines = ["| metric | " + " | ".join(RENDERERS) + " | clean - 3dgs | onefixer - 3dgs |", "|---" * (len(RENDERERS) + 3) + "|"]
+    for metric in SHOWN:
+        entries = [summary["metrics"][name][metric] for name in RENDERERS]
+        rate = entries[0]["unit"] == ""
+        unit = " (%)" if rate else f" ({entries[0]['unit']})" if entries[0]["unit"] else ""
+        pairs = [paired_cell(summary["paired"].get(name, {}).get(metric), rate) for name in ("clean", "onefixer")]
+        lines.append(f"| `{metric}`{unit} | " + " | ".join([number(e, rate) for e in entries] + pairs) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run what is not there yet and fill in the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path)
+    parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
+    parser.add_argument("--seeds", default="5")
+    parser.add_argument("--policies", default="learned,lane-camera")
+    parser.add_argument("--set", dest="settings", action="append", default=[])
+    given = parser.parse_args()
+    scenes = sorted(str(path) for path in given.scenes.glob("*.yaml"))
+    if not scenes:
+        sys.exit(f"no scenes in {given.scenes}: run 'simrun train scenes --split test' first")
+    parts = []
+    for policy in given.policies.split(","):
+        settings = [word for value in given.settings for word in ("--set", value)]
+        options = ["--renderer", ",".join(RENDERERS), "--baseline", "3dgs", "--policy", policy, "--seeds", given.seeds, *settings]
+        try:
+            summary = simrun(given.runs / policy, *options, "--resume", *scenes)
+        except subprocess.CalledProcessError as error:
+            if error.returncode not in (1, 3):  # a verdict against a renderer, or none, is a result
+                raise
+            sys.exit(f"{policy}: exit code {error.returncode}; see {given.runs / policy}")
+        parts.append(f"**{policy}**: {len(scenes)} scenes x {given.seeds} seeds\n\n{table(summary)}")
+    page = DOCS / "results.md"
+    page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
+
+
+if __name__ == "__main__":
+    main()
