@@ -9,15 +9,27 @@ second call continues an interrupted first one.
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-from results import DOCS, number, replace, simrun
+from results import DOCS, number, replace
 
+VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
 RENDERERS = ("clean", "3dgs", "onefixer")
 SHOWN = ("collision_at_fault", "offroad", "offroad_or_collision_at_fault", "route_distance_m", "progress", "min_distance_to_obstacle_m")
+
+
+def drive(out: Path, arguments: list[str]) -> dict[str, Any]:
+    """Run simrun and return its summary; a verdict, good, bad or open, is a result."""
+    command = [sys.executable, "-m", "alpasim_plugin.cli.main", *arguments, "--out", str(out)]
+    code = subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode
+    if code not in (0, *VERDICTS):
+        sys.exit(f"exit code {code}; see {out}")
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
+    return summary
 
 
 def paired_cell(entry: dict[str, Any] | None, rate: bool) -> str:
@@ -58,12 +70,7 @@ def main() -> None:
     for policy in given.policies.split(","):
         settings = [word for value in given.settings for word in ("--set", value)]
         options = ["--renderer", ",".join(RENDERERS), "--baseline", "3dgs", "--policy", policy, "--seeds", given.seeds, *settings]
-        try:
-            summary = simrun(given.runs / policy, *options, "--resume", *scenes)
-        except subprocess.CalledProcessError as error:
-            if error.returncode not in (1, 3):  # a verdict against a renderer, or none, is a result
-                raise
-            sys.exit(f"{policy}: exit code {error.returncode}; see {given.runs / policy}")
+        summary = drive(given.runs / policy, [*options, "--resume", *scenes])
         parts.append(f"**{policy}**: {len(scenes)} scenes x {given.seeds} seeds\n\n{table(summary)}")
     page = DOCS / "results.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
