@@ -2,8 +2,8 @@
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--seeds N] [--policies learned,lane-camera] [--set KEY=VALUE]...
 
-SCENES is the folder of test scenes that ``simrun train scenes --split test`` wrote; RUNS (default: runs/closed-loop) keeps the run folders, so a
-second call continues an interrupted first one.
+SCENES is the folder of test scenes that ``simrun train scenes --split test`` wrote; RUNS (default: runs/closed-loop) keeps the run folders,
+so a second call continues an interrupted first one.
 """
 
 from __future__ import annotations

@@ -115,7 +115,8 @@ def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straigh
 
 @pytest.mark.parametrize("mode", ["speculative", "chunk"])
 def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road: Scenario, mode: str) -> None:
-    small = ("weights.bundle=null", "dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random", "uses_map=false")
+    sizes = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32")
+    small = ("weights.bundle=null", *sizes, "untrained=random", "uses_map=false")
 
     def network() -> Blend:
         return make_fixer("onefixer", fixer_settings("onefixer", small), scene_id="straight-road", threads=1)  # type: ignore[return-value]
