@@ -1,4 +1,4 @@
-"""Measure the scenes and their surrogate degradation: PSNR by lateral offset, time a frame, visible Gaussians; draw docs/img/degradation.png.
+"""Measure the scenes and their surrogate degradation: PSNR by lateral offset, time a frame, Gaussians; draw docs/img/degradation.png.
 
     python docs/figures/scene.py [--speed] [SCENARIO ...]
 """
