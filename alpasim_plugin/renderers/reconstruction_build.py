@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.fit.loop import fit
@@ -38,8 +41,20 @@ def build(scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None,
     boxes = {a.actor_id: a.box for a in scenario.actors}
     start = rough_start(views, boxes, recipe, scenario.scene_id)
     start = Start(start.background, start.actors if recipe.fit_actors else {})
-    fitted = fit(views, start, splat, scene_id=scenario.scene_id, threads=threads)
+    with _one_torch_thread():
+        fitted = fit(views, start, splat, scene_id=scenario.scene_id, threads=threads)
     actors = {name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS}
     sky_views = [SkyView(v.camera, v.sky.astype(np.float32)) for v in views if v.sky is not None]
     facts = {"scene_id": scenario.scene_id, "recipe": asdict(recipe), "views": len(views)}
     write_model(folder, Reconstruction(fitted.background, actors, fitted.sky), sky_views, facts)
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Let torch sum in one order, so that the model is the same on any number of cores; its share of a fit is too small to divide."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
