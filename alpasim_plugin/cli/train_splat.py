@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary, write_pictures
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.fit.view_files import read_views
+from alpasim_plugin.gaussians.workers import thread_count
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.types import Scenario
 from scenarios.load import load_scenario
@@ -39,7 +40,7 @@ def splat(
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
     recipe: Annotated[Literal["full", "under-trained"], typer.Option("--recipe", help="Amounts and schedule to begin from.")] = "full",
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Updates; the schedule stretches with them.")] = None,
-    gaussians: Annotated[int | None, typer.Option("--gaussians", min=1, help="Most Gaussians.")] = None,
+    gaussians: Annotated[int | None, typer.Option("--gaussians", min=1, help="Gaussians at which densification stops.")] = None,
     views: Annotated[int | None, typer.Option("--views", min=1, help="Views rendered along the log, held-out ones included.")] = None,
     width: Annotated[int | None, typer.Option("--width", min=16, help="Pixels across of rendered views.")] = None,
     images: Annotated[
@@ -47,15 +48,15 @@ def splat(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of start, order and splits.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="cuda needs gsplat.")] = "cpu",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads; by default all cores.")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print metrics.json on stdout.")] = False,
 ) -> None:
     """Fit 3D Gaussians to posed views of a scenario: background, actors as rigid nodes, sky.
 
     Writes background.ply, actors/*.ply, sky.png, reconstruction.json, metrics.json and pictures of held-out views (truth left).
     """
-    if threads is not None:
-        torch.set_num_threads(threads)
+    # Tensors here are small: threads of torch gain little and, where other work shares the cores, wait for each other most of the time.
+    torch.set_num_threads(1)
     chosen = _recipe(recipe, steps, gaussians, views, width, seed)
     loaded = load_scenario(scenario)
     began = time.perf_counter()
@@ -68,7 +69,7 @@ def splat(
     facts = {
         "scene_id": loaded.scene_id, "recipe": {"name": recipe, **asdict(chosen)}, "views": str(images or "rendered"),
         "prepare_s": round(prepared_s, 2), "fit_s": round(fitted_s, 2), "fit_cpu_s": round(cpu_s, 2),
-        "threads": torch.get_num_threads(), "device": device,
+        "threads": thread_count(threads), "device": device,
     }  # fmt: skip
     metrics = _measure(model, groups, out, threads)
     model.save(out, facts)

@@ -22,7 +22,7 @@ class SplatRecipe:
         points: Gaussians of the background at the start, drawn from the views' depth.
         actor_points: Most Gaussians of an actor at the start.
         start_size: Of the Gaussians at the start, in distances to their neighbours.
-        cap: Most Gaussians; densification stops there, the largest screen gradients first.
+        cap: Where densification stops, the largest screen gradients first; a start with more is not cut.
         hold_out_every: Every such view is kept for measuring (the eighth, as is usual); 0 trains on all.
         sh_degree: Highest degree of view-dependent colour, reached by one degree every ``sh_share`` of the steps.
         sh_share: See ``sh_degree``.
