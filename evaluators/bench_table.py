@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+import evaluators.video.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
 from evaluators.aggregate.summary import aggregate
 from evaluators.metrics import METRICS
 

@@ -79,7 +79,7 @@ def test_bad_values_are_named_with_their_place(override: str, words: tuple[str, 
 
 
 def test_only_the_tiny_autoencoder_sees_the_render() -> None:
-    assert "only the tiny autoencoder" in refusal("vae.kind=wan")
+    assert "only the tiny autoencoder" in refusal("weights.bundle=null", "vae.kind=wan")
 
 
 def test_a_bundle_and_parts_do_not_go_together() -> None:
