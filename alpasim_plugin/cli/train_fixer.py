@@ -54,6 +54,9 @@ def train_fixer_command(
     stride: Annotated[int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")] = 24,
     lr: Annotated[float, typer.Option("--lr", min=1e-7, help="Highest learning rate.")] = 2e-4,
     ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged weights.")] = 0.99,
+    source_share: Annotated[
+        float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions trained at t = 1, where a rollout starts.")
+    ] = 0.35,
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
@@ -66,7 +69,7 @@ def train_fixer_command(
     if threads is not None:
         torch.set_num_threads(threads)
     chosen, console, began = variant_of(variant), Console(stderr=True), time.time()
-    recipe = GeneratorRecipe(clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed)
+    recipe = GeneratorRecipe(clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share)
     settings = onefixer_settings(fixer).model_copy(update={"window": recipe.window, "history": "finalise"})
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
     run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])

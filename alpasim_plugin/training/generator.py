@@ -172,8 +172,8 @@ class GeneratorTask:
 def diffusion_forcing(net: CosmosCausalDiT, s: Sample, text: Tensor, recipe: GeneratorRecipe, index: int) -> Tensor:
     """Return the error of the velocity where every position has a noise level of its own and is history to those after it.
 
-    The levels are those that a deployed generator meets: the source (t = 1), the level of the cache write, and anything between. In half of
-    the clips the source is the mixed one (Eq. 1), in half it is noise.
+    The levels are those that a deployed generator meets: the source (t = 1), the level of the cache write, and anything between. In three
+    of four clips the source is the mixed one (Eq. 1), in the fourth it is noise.
     """
     rng = stream("training", recipe.seed, "generator.levels", index)
     kind = torch.from_numpy(rng.random(tuple(s.t.shape)))
