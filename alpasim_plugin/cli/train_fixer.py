@@ -55,7 +55,7 @@ def train_fixer_command(
     lr: Annotated[float, typer.Option("--lr", min=1e-7, help="Highest learning rate.")] = 2e-4,
     ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged weights.")] = 0.99,
     source_share: Annotated[
-        float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions trained at t = 1, where a rollout starts.")
+        float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions at t = 1, the start of a rollout.")
     ] = 0.35,
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")] = None,
