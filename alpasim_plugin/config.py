@@ -64,9 +64,7 @@ def apply_overrides(document: Document, overrides: Sequence[str], doing: str = "
 def _load(path: Path, doing: str, chain: tuple[Path, ...]) -> Document:
     resolved = path.resolve()
     if resolved in chain:
-        raise InputError(
-            doing, str(path), f"extends itself through {' -> '.join(str(p) for p in chain)}", "break the cycle of extends"
-        )
+        raise InputError(doing, str(path), f"extends itself through {' -> '.join(str(p) for p in chain)}", "break the cycle of extends")
     raw = _read(path, doing)
     data, marks = parse(raw.decode("utf-8"), str(path), doing)
     sources: list[tuple[str, str]] = []

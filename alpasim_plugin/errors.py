@@ -27,9 +27,7 @@ class SimrunError(Exception):
         self.doing, self.with_what, self.found, self.do_this = doing, with_what, found, do_this
 
     def __str__(self) -> str:
-        return (
-            f"error: {self.doing}\n   with: {self.with_what}\n  found: {self.found}\n     do: {self.do_this}"
-        )
+        return f"error: {self.doing}\n   with: {self.with_what}\n  found: {self.found}\n     do: {self.do_this}"
 
     def as_dict(self) -> dict[str, str]:
         """Return the four parts and the failure class, for ``--json`` and manifests."""

@@ -152,9 +152,7 @@ def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
 def trajectory_from_poses(t_us: npt.ArrayLike, poses: npt.ArrayLike) -> Trajectory:
     """Build a trajectory from times ``(T,)`` and transforms ``(T, 4, 4)``."""
     matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
-    return Trajectory(
-        np.asarray(t_us, dtype=np.int64), matrices[:, :3, 3].copy(), quat_from_matrix(matrices[:, :3, :3])
-    )
+    return Trajectory(np.asarray(t_us, dtype=np.int64), matrices[:, :3, 3].copy(), quat_from_matrix(matrices[:, :3, :3]))
 
 
 def offset_trajectory(trajectory: Trajectory, T_body_other: F64) -> Trajectory:

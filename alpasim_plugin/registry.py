@@ -42,9 +42,7 @@ class Registry(Generic[T]):
 
         def add(factory: Callable[..., T]) -> Callable[..., T]:
             if name in self._builtin:
-                raise InputError(
-                    f"registering a {self.kind}", f"name {name!r}", "that name is taken", "choose another name"
-                )
+                raise InputError(f"registering a {self.kind}", f"name {name!r}", "that name is taken", "choose another name")
             self._builtin[name] = factory
             self._help[name] = help_text or (factory.__doc__ or "").strip().split("\n")[0]
             return factory

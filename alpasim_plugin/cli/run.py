@@ -42,9 +42,7 @@ Examples:
 
 
 def run(
-    scenarios: Annotated[
-        list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")
-    ],
+    scenarios: Annotated[list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")],
     renderer: Annotated[str, typer.Option("--renderer", help="Renderers, comma-separated; `onefixer`, or `FIXER+RENDERER`.")] = "3dgs",
     policy: Annotated[str, typer.Option("--policy", help="Policies, comma-separated; `package.module:Class` works too.")] = "lane-camera",
     seeds: Annotated[str, typer.Option("--seeds", help="How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",

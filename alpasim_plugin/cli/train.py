@@ -119,5 +119,3 @@ def vae_quality(
         gt = to_tensor(read_video(path, WIDTH, HEIGHT, first_share))[None]
         rows.append({"clip": path.stem, "from": "latent", **asdict(quality(round_trip(model, gt), gt))})
     print(json.dumps({"weights": weights, "split": split, "rows": rows}, indent=1))
-
-

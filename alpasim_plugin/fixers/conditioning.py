@@ -153,5 +153,3 @@ def _shapes(static: Triangles, faces: Triangles, pose: F64, lens: KernelCamera, 
         if count <= len(room):
             return int(count), room
         _room.shapes = np.empty((count + count // 4, SHAPE))
-
-

@@ -69,9 +69,7 @@ class BlockPipeline:
         recorder: Makes recordings; None takes CUDA graphs on a GPU unless the settings say ``graphs: off``, and nothing elsewhere.
     """
 
-    def __init__(
-        self, networks: Networks, settings: OneFixerSettings, stage: Stage = no_clock, recorder: Recorder | None = None
-    ) -> None:
+    def __init__(self, networks: Networks, settings: OneFixerSettings, stage: Stage = no_clock, recorder: Recorder | None = None) -> None:
         self.networks, self.settings, self.stage = networks, settings, stage
         self.schedule = from_names(settings.steps)
         if recorder is None and settings.graphs != "off" and networks.device.type == "cuda":

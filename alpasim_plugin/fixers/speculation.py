@@ -38,9 +38,7 @@ class Tally:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and, in metres and degrees, what the forecasts missed and what was shown all the same."""
-        counts = {
-            name: getattr(self, name) for name in ("frames", "blocks", "foretold", "hits", "exact", "drafts", "redrafts")
-        }
+        counts = {name: getattr(self, name) for name in ("frames", "blocks", "foretold", "hits", "exact", "drafts", "redrafts")}
         return counts | {"forecast_error": _spread(self.forecasts), "shown_error": _spread(self.shown)}
 
 

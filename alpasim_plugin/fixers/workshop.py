@@ -78,9 +78,7 @@ class Workshop:
             except SimrunError:
                 raise
             except Exception as error:
-                raise FixerError(
-                    DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
-                ) from error
+                raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
         self._own_stages(before, getattr(fixer, "spent_ms", {}))
         problem = _problem(frames, fixed)
         if problem:

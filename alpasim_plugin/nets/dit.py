@@ -210,9 +210,7 @@ class CosmosCausalDiT(nn.Module):
         if window is None:
             do = "give the number of latents to hold, or keeps_graph=True"
             raise InputError("making a rolling cache", "window", "None: a fixed buffer needs a length", do)
-        return RollingCache(
-            self.rope, self.sizes.blocks, self.sizes.heads, batch, height, width, window, sink, self.device, self.dtype
-        )
+        return RollingCache(self.rope, self.sizes.blocks, self.sizes.heads, batch, height, width, window, sink, self.device, self.dtype)
 
     def encode_text(self, text: Tensor) -> TextContext:
         """Project a prompt ``(B or 1, tokens, text_width)`` and make every block's keys and values of it, once."""

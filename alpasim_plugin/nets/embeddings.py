@@ -67,9 +67,7 @@ class PatchEmbed(nn.Module):
         return layer
 
 
-def embed_latents(
-    embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None
-) -> Tensor:
+def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None) -> Tensor:
     """Embed latents together with their masks.
 
     A mask that is None is zero everywhere, so its columns of the embedding are skipped.

@@ -38,9 +38,7 @@ class BlockCache(ABC):
 
     keeps_graph: bool = False
 
-    def __init__(
-        self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device
-    ) -> None:
+    def __init__(self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device) -> None:
         doing = "making a cache for a causal network"
         if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
             found = f"batch {batch}, latent size {height} x {width}"
@@ -201,9 +199,7 @@ class GraphCache(BlockCache):
 
     keeps_graph = True
 
-    def __init__(
-        self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device
-    ) -> None:
+    def __init__(self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device) -> None:
         super().__init__(rope, batch, height, width, window, sink, device)
         self._kept: dict[int, list[tuple[Tensor, Tensor]]] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
         self._open: dict[int, tuple[Tensor, Tensor]] = {}

@@ -113,9 +113,7 @@ class _Dispatch(TorchDispatchMode):
         self.ledger, self.paused = ledger, False
         self._alive: dict[int, tuple[StorageWeakRef, int]] = {}
 
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None) -> Any:
         out = func(*args, **(kwargs or {}))
         self._watch(out, (args, kwargs))
         name = func._schema.name.removeprefix("aten::")

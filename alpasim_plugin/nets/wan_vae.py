@@ -38,6 +38,7 @@ class Coder(nn.Module):
         self.middle = nn.ModuleList([ResidualBlock(middle, middle), FrameAttention(middle), ResidualBlock(middle, middle)])
         self.head = nn.ModuleList([ChannelNorm(head[0]), nn.SiLU(), CausalConv(*head)])
 
+
 class Encoder(Coder):
     """Frames to means and log-variances of the latent."""
 

@@ -1,7 +1,7 @@
 """Keep what is costly to make in folders named by content: made once, whichever process asks first, and whole or not there.
 
-    $SIMRUN_CACHE or ~/.cache/simrun / KIND / KEY/        what was made
-                                           / KEY.lock     held by the process that makes it
+$SIMRUN_CACHE or ~/.cache/simrun / KIND / KEY/        what was made
+                                       / KEY.lock     held by the process that makes it
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A reconstruction in the cache: the files of `Reconstruction.save`, where its views showed sky, and the hash of every file.
 
-    background.ply, actors/*.ply, sky.png, reconstruction.json
-    sky_views.npz       cameras of the views and, bit by bit, where they show sky
-    hashes.json         file name to SHA-256; written last
+background.ply, actors/*.ply, sky.png, reconstruction.json
+sky_views.npz       cameras of the views and, bit by bit, where they show sky
+hashes.json         file name to SHA-256; written last
 """
 
 from __future__ import annotations

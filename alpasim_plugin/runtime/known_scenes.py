@@ -93,5 +93,3 @@ def _from_scenario(one: Scenario) -> LoggedScene:
     return LoggedScene(
         one.scene, one.source, one.content_hash, one.notes, one.actors, one.world_origin, one.start_us, one.end_us, one.warmup_us
     )
-
-

@@ -88,9 +88,7 @@ def make_plan(
     """
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
         if not values or len(set(values)) != len(values):
-            raise InputError(
-                "planning a run", f"{what}s {list(values)}", "none, or one of them twice", f"name every {what} once"
-            )
+            raise InputError("planning a run", f"{what}s {list(values)}", "none, or one of them twice", f"name every {what} once")
     same = [str(parse_renderer(name)) for name in renderers]
     if len(set(same)) != len(same):
         raise InputError("planning a run", f"renderers {list(renderers)}", f"they stand for {same}", "name every renderer once")

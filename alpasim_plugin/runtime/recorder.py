@@ -171,4 +171,3 @@ class Recorder:
         if self._writer is None:
             raise RuntimeError("Recorder.start was not called")
         return self._writer
-

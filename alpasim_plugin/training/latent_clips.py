@@ -2,7 +2,8 @@
 
     FOLDER/DIGEST/SEQUENCE-INFO.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
 
-Clips of a sequence start ``stride`` frames apart, once as they are and once mirrored. Each is encoded from its own first frame on, as a
+Clips of a sequence start ``stride`` frames apart, once as they are and once mirrored, with another class's colours on the map's cars (see
+`map_colours`). Each is encoded from its own first frame on, as a
 rollout that starts there would be. DIGEST covers the autoencoder's weights and the form of the clips, INFO what
 the sequence says of itself.
 """
@@ -26,7 +27,9 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.sampling import opacity_mask
 from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.clips import to_tensor
+from alpasim_plugin.training.map_colours import OTHERS, recolour_boxes
 from alpasim_plugin.training.pair_store import PairSequence
 
 F16 = npt.NDArray[np.float16]
@@ -41,10 +44,12 @@ class ClipForm:
     Args:
         latents: N, latents of a clip: ``1 + 4 (N - 1)`` frames.
         stride: Frames between starts.
+        recolour: Whether the mirrored clips show the map's cars in another class's colours.
     """
 
     latents: int = 12
     stride: int = 24
+    recolour: bool = True
 
     @property
     def frames(self) -> int:
@@ -135,13 +140,17 @@ def encode_sequence(sequence: PairSequence, vae: TinyVAE, form: ClipForm) -> F16
     if not starts:
         found = f"{len(sequence.clip)} frames, a clip has {form.frames}"
         raise InputError(DOING, str(sequence.folder), found, "make longer sequences, or train on fewer latents")
-    return np.stack([_encode(sequence, vae, start, form.frames, mirrored) for start in starts for mirrored in (False, True)])
+    return np.stack([_encode(sequence, vae, start, form, mirrored) for start in starts for mirrored in (False, True)])
 
 
 @torch.inference_mode()
-def _encode(sequence: PairSequence, vae: TinyVAE, start: int, frames: int, mirrored: bool) -> F16:
-    cut = sequence.clip.cut(start, frames)
-    videos = torch.stack([to_tensor(x, mirrored) for x in (cut.rgb_input, cut.rgb_gt, cut.sdmap)])
+def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mirrored: bool) -> F16:
+    cut = sequence.clip.cut(start, form.frames)
+    sdmap = cut.sdmap
+    if mirrored and form.recolour:
+        rng = stream(sequence.name, 0, "training.map_colours", start)
+        sdmap = recolour_boxes(sdmap, OTHERS[int(rng.integers(len(OTHERS)))])
+    videos = torch.stack([to_tensor(x, mirrored) for x in (cut.rgb_input, cut.rgb_gt, sdmap)])
     mask = opacity_mask((to_tensor(cut.opacity[..., None], mirrored)[None] + 1) / 2)
     z = vae.encode(videos)
     return np.asarray(torch.cat([z.flatten(0, 1), mask[0]]).half().numpy())

@@ -148,5 +148,3 @@ def measure(task: PolicyTask, every: int = 1, batch: int = 64) -> dict[str, floa
             off = (aside[:, DOUBT_AT], turned[:, DOUBT_AT], faster.abs().mean(1))
             sums += [*(float(x.abs().sum()) for x in off), len(aside)]
     return {"aside_16m_m": sums[0] / sums[3], "heading_16m_rad": sums[1] / sums[3], "speed_mps": sums[2] / sums[3], "lessons": sums[3]}
-
-

@@ -208,5 +208,3 @@ def read_lessons(root: Path, split: str) -> Sequence[Lessons]:
     if not folders:
         raise InputError(READING, str(root / split), "no finished scene", "make some with 'simrun train policy-data'")
     return [lessons for lessons in map(Lessons, folders) if len(lessons)]
-
-

@@ -131,8 +131,10 @@ def _quintic(p0: F64, yaw0: float, p1: F64, yaw1: float, tangent_m: float, t: F6
     m1 = tangent_m * np.array([np.cos(yaw1), np.sin(yaw1)])
     span = p1[:2] - p0[:2]
     xy = p0[:2] + blend * span + start[:, None] * m0 + end[:, None] * m1
-    return xy, d_blend * span + d_start[:, None] * m0 + d_end[:, None] * m1, (
-        dd_blend * span + dd_start[:, None] * m0 + dd_end[:, None] * m1
+    return (
+        xy,
+        d_blend * span + d_start[:, None] * m0 + d_end[:, None] * m1,
+        (dd_blend * span + dd_start[:, None] * m0 + dd_end[:, None] * m1),
     )
 
 

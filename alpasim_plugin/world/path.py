@@ -92,6 +92,4 @@ def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
     d, dd = spline(fine, 1), spline(fine, 2)
     speed2 = d[:, 0] ** 2 + d[:, 1] ** 2
     line = spline(fine)
-    return Path(
-        arc_lengths(line), line, np.unwrap(np.arctan2(d[:, 1], d[:, 0])), (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed2**1.5
-    )
+    return Path(arc_lengths(line), line, np.unwrap(np.arctan2(d[:, 1], d[:, 0])), (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed2**1.5)

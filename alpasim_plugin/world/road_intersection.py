@@ -79,9 +79,7 @@ def build_intersection(
     return _connect_all(draft, name, element, arms, exit_pose)
 
 
-def _connect_all(
-    draft: MapDraft, name: str, element: Intersection, arms: list[Arm], exit_pose: tuple[float, float, float]
-) -> Junction:
+def _connect_all(draft: MapDraft, name: str, element: Intersection, arms: list[Arm], exit_pose: tuple[float, float, float]) -> Junction:
     forward: dict[int, str] = {}
     forward_next: dict[int, int] = {}
     backward: dict[int, str] = {}

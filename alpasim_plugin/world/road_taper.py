@@ -12,9 +12,7 @@ from alpasim_plugin.world.road_elements import Profile
 from alpasim_plugin.world.road_strip import Joint, MapDraft, Strip, add_sides, build_strip, make_lines, reverse
 
 
-def build_taper(
-    draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint | None
-) -> tuple[Strip, str]:
+def build_taper(draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint | None) -> tuple[Strip, str]:
     """Add a straight stretch with one slanting lane beside (and running into, or out of) the outermost straight one.
 
     The slanting lane keeps its full width and overlaps its neighbour, as merging lanes do in surveyed maps: its edges meet the

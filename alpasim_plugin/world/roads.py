@@ -132,9 +132,7 @@ def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersect
         raise InputError("building a road", name, "two intersections without a road between them", "put a straight between them")
     n = tip.profile.forward
     forward = tuple(str(f) for f in tip.forward[:n])
-    junction = build_intersection(
-        draft, name, tip.pose, element, tip.profile, tip.joint, forward, tuple(str(b) for b in tip.backward)
-    )
+    junction = build_intersection(draft, name, tip.pose, element, tip.profile, tip.joint, forward, tuple(str(b) for b in tip.backward))
     tip.pose, tip.joint, tip.junction, tip.strip = junction.pose, junction.joint, junction, None
     tip.forward, tip.backward = (), ()
     return Stretch(junction.forward, junction.forward_next, junction.backward)

@@ -64,9 +64,7 @@ def track_on_path(path: Path, t_us: I64, s_m: F64, box: Box, offset_m: npt.Array
     return Trajectory(t_us[keep], xyz[keep], quat_from_yaw(yaw[keep]))
 
 
-def cut_in_track(
-    path_from: Path, path_to: Path, t_us: I64, s_m: F64, box: Box, at_us: int, change_us: int
-) -> Trajectory:
+def cut_in_track(path_from: Path, path_to: Path, t_us: I64, s_m: F64, box: Box, at_us: int, change_us: int) -> Trajectory:
     """Return the track of a lane change: quintic in time between two neighbouring paths.
 
     Args:
