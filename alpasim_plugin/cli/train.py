@@ -13,6 +13,8 @@ from rich.console import Console
 
 from alpasim_plugin.cli import train_pairs
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
+from alpasim_plugin.cli.train_painter import EPILOG as PAINTER_EXAMPLE
+from alpasim_plugin.cli.train_painter import painter
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
 from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_check
@@ -35,6 +37,7 @@ WIDTH, HEIGHT = 256, 144
 
 EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
+app.command("painter", epilog=PAINTER_EXAMPLE)(painter)
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 app.command("policy-data", epilog=POLICY_DATA_EPILOG)(policy_data)
 app.command("policy", epilog=POLICY_EPILOG)(policy)

@@ -78,6 +78,10 @@ class LatentClip(NamedTuple):
         cut = self.sequence.clip.cut(self.start, end)
         return to_tensor(cut.rgb_input, self.mirrored), (to_tensor(cut.opacity[..., None], self.mirrored) + 1) / 2
 
+    def clean(self, end: int) -> Tensor:
+        """Return the clean frames ``(3, end, H, W)`` in [-1, 1] of the clip's first ``end``."""
+        return to_tensor(self.sequence.clip.cut(self.start, end).rgb_gt, self.mirrored)
+
 
 class LatentClips:
     """All clips of some sequences, as latents.

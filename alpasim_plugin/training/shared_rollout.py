@@ -141,6 +141,28 @@ def losses(
     return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, seen)
 
 
+@torch.no_grad()
+def roll_out(
+    net: CosmosCausalDiT,
+    z_r: Tensor,
+    z_map: Tensor,
+    m: Tensor,
+    eps: Tensor,
+    eps_context: Tensor,
+    text: Tensor | TextContext,
+    *,
+    block_latents: int = 2,
+    window: int | None = 12,
+) -> Tensor:
+    """Return the generator's own predictions of whole clips ``(B, C, N, H, W)``, as it makes them when deployed; see `Sample`."""
+    t = torch.ones(z_r.shape[0], z_r.shape[2])
+    sample = Sample(z_r, z_r, z_map, m, eps, eps_context, t, t, z_r.shape[2] - 1)
+    rollout = _Rollout(net, sample, text, Objectives("own", 0), block_latents, window)
+    made = rollout.history()
+    assert made is not None, "own history"
+    return made
+
+
 class _Rollout:
     """One batch on its way through the generator; the methods are the equations, the attributes what they share."""
 

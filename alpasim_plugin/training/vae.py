@@ -87,16 +87,16 @@ class VaeTask:
         parts: dict[str, Tensor] = {}
         if batch.pairs is not None:
             z, noisy = self._latents(batch.pairs.target, index, 0)
-            parts["latent"] = self._error(self.vae.decode(noisy, clamp=False), batch.pairs.target)
+            parts["latent"] = picture_error(self.vae.decode(noisy, clamp=False), batch.pairs.target, r.edge_weight)
             painted = self.vae.decode(noisy, render=batch.pairs.render, opacity=batch.pairs.opacity, clamp=False)
-            parts["render"] = self._error(painted, batch.pairs.target)
+            parts["render"] = picture_error(painted, batch.pairs.target, r.edge_weight)
             parts["spread"] = 1e-3 * (z.var(dim=(0, 2, 3, 4)).clamp_min(1e-6).log() ** 2).mean()
         if batch.video is not None:
             _, noisy = self._latents(batch.video, index, 1)
-            parts["video"] = self._error(self.vae.decode(noisy, clamp=False), batch.video)
+            parts["video"] = picture_error(self.vae.decode(noisy, clamp=False), batch.video, r.edge_weight)
         if batch.side is not None:
             _, noisy = self._latents(batch.side, index, 2)
-            parts["side"] = r.side_weight * self._error(self.vae.decode(noisy, clamp=False), batch.side)
+            parts["side"] = r.side_weight * picture_error(self.vae.decode(noisy, clamp=False), batch.side, r.edge_weight)
         total = torch.stack(list(parts.values())).sum()
         return total, {name: float(value.detach()) for name, value in parts.items()}
 
@@ -105,12 +105,13 @@ class VaeTask:
         noise = stream("training", self.recipe.seed, f"vae.noise.{which}", index).standard_normal(z.shape, dtype="float32")
         return z, z + self.recipe.latent_noise * torch.from_numpy(noise).to(z)
 
-    def _error(self, made: Tensor, wanted: Tensor) -> Tensor:
-        """Return a smooth absolute error of values and, weighted, of their differences along rows, columns and frames."""
-        d = made - wanted
-        value = torch.sqrt(d * d + 1e-4).mean()
-        edges = [F.smooth_l1_loss(x, torch.zeros_like(x), beta=0.02) for x in (d.diff(dim=-1), d.diff(dim=-2), d.diff(dim=-3))]
-        return value + self.recipe.edge_weight * torch.stack(edges).sum()
+
+def picture_error(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:
+    """Return a smooth absolute error of values and, weighted, of their differences along rows, columns and frames."""
+    d = made - wanted
+    value = torch.sqrt(d * d + 1e-4).mean()
+    edges = [F.smooth_l1_loss(x, torch.zeros_like(x), beta=0.02) for x in (d.diff(dim=-1), d.diff(dim=-2), d.diff(dim=-3))]
+    return value + edge_weight * torch.stack(edges).sum()
 
 
 def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

@@ -38,9 +38,7 @@ def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circl
 
 
 @settings(deadline=None, max_examples=60)
-@given(
-    speed=st.floats(-10, 40), steer=st.floats(-0.55, 0.55), yaw=st.floats(-4, 4), drive=st.floats(-3, 3), seconds=st.floats(0.001, 2.0)
-)
+@given(speed=st.floats(-10, 40), steer=st.floats(-0.55, 0.55), yaw=st.floats(-4, 4), drive=st.floats(-3, 3), seconds=st.floats(0.001, 2.0))
 def test_any_held_command_matches_the_closed_solution(speed: float, steer: float, yaw: float, drive: float, seconds: float) -> None:
     start = BicycleState(1e5, -2e5, yaw, speed, steer)
     end = step(start, Command(steer, drive), seconds, VEHICLE)

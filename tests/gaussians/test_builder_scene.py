@@ -212,5 +212,3 @@ def test_file_background_is_scaled_turned_and_cut_into_blocks(street: tuple[Scen
     assert sum(len(n.levels[0].cloud) for n in graph.background) == len(cloud)
     assert len(graph.background) > 1
     assert set(graph.actors) == set(street[1].actors)
-
-

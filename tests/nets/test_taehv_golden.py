@@ -61,9 +61,7 @@ def test_full_width_network_from_the_weight_formula(numbers: Any) -> None:
     weights = _formula_weights(TinyDecoder(16, config["decoder_widths"]).state_dict(), config)
     decoder = TinyDecoder.from_state_dict(weights)
     z = numbers[1]["in.fullwidth.latent"].transpose(1, 2)
-    torch.testing.assert_close(
-        decoder(z), numbers[1]["out.fullwidth.decode_parallel"].transpose(1, 2) * 2 - 1, atol=TOLERANCE, rtol=0
-    )
+    torch.testing.assert_close(decoder(z), numbers[1]["out.fullwidth.decode_parallel"].transpose(1, 2) * 2 - 1, atol=TOLERANCE, rtol=0)
 
 
 def _formula_weights(due: dict[str, Tensor], config: dict[str, Any]) -> dict[str, Tensor]:

@@ -89,9 +89,7 @@ def test_untrained_round_trip_of_a_smooth_clip_is_close_and_of_noise_is_blurred(
 def test_full_opacity_is_as_none_and_zero_opacity_keeps_no_detail() -> None:
     untrained, video = TinyVAE.random(SIZES), clip(5, 16, 16)
     z, cover = untrained.encode(video), torch.ones(1, 1, 5, 16, 16)
-    torch.testing.assert_close(
-        untrained.decode(z, render=video, opacity=cover), untrained.decode(z, render=video), atol=1e-6, rtol=0
-    )
+    torch.testing.assert_close(untrained.decode(z, render=video, opacity=cover), untrained.decode(z, render=video), atol=1e-6, rtol=0)
     torch.testing.assert_close(untrained.decode(z, render=video, opacity=0 * cover), untrained.decode(z), atol=1e-6, rtol=0)
 
 

@@ -87,5 +87,3 @@ def close_loop(
 def to_world(plan: Plan, T_world_rig: F64) -> Trajectory:
     xyz = transform_points(T_world_rig, np.column_stack([plan.xy, np.zeros(len(plan.xy))]))
     return Trajectory(plan.times_us, xyz, quat_from_yaw(plan.yaw + yaw_of(T_world_rig)))
-
-

@@ -163,5 +163,3 @@ def test_every_shipped_policy_has_a_line_of_help() -> None:
     names = POLICIES.names()
     assert {"log-replay", "constant-velocity", "pure-pursuit", "lane-camera"} <= set(names)
     assert all(len(text) > 10 for text in names.values())
-
-

@@ -73,8 +73,10 @@ def vector_map():
     lanes = [lane(1, -20, 40, 0, successors=(2, 999)), lane(2, 40, 200, 0), lane(3, -20, 200, 4, lane_type="BIKE")]
     return {
         "lane_segments": {str(k["id"]): k for k in lanes},
-        "drivable_areas": {"7": {"id": 7, "area_boundary": line((-20, -8), (90, -8), (90, 8), (-20, 8))},
-                           "8": {"id": 8, "area_boundary": line((90.02, -8), (200, -8), (200, 8), (90.02, 8))}},
+        "drivable_areas": {
+            "7": {"id": 7, "area_boundary": line((-20, -8), (90, -8), (90, 8), (-20, 8))},
+            "8": {"id": 8, "area_boundary": line((90.02, -8), (200, -8), (200, 8), (90.02, 8))},
+        },
         "pedestrian_crossings": {"9": {"id": 9, "edge1": line((58, -8), (58, 8)), "edge2": line((62, -8), (62, 8))}},
     }
 

@@ -105,9 +105,7 @@ def test_what_cannot_be_read_is_named(sources: PairSources, tmp_path: Path, chan
     assert not (tmp_path / "pairs").exists()
 
 
-def test_command_imports_and_refuses_names_that_are_paths(
-    sources: PairSources, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_imports_and_refuses_names_that_are_paths(sources: PairSources, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = [word for name, path in vars(sources).items() for word in (f"--{name.replace('_', '-')}", str(path))]
     command = ["train", "import-pairs", str(tmp_path / "pairs"), *options]
     assert run_command([*command, "--name", "drive", "--split", "test", "--size", "24x16"]) == 0

@@ -70,8 +70,7 @@ def test_matching_agrees_with_trying_every_assignment():
     costs = [_local_costs(index, p, heading, index.containing(p)) for p in path]
     best = min(
         product(*costs),
-        key=lambda names: sum(c[n] for c, n in zip(costs, names, strict=True))
-        + sum(_change_cost(index, a, b) for a, b in pairwise(names)),
+        key=lambda names: sum(c[n] for c, n in zip(costs, names, strict=True)) + sum(_change_cost(index, a, b) for a, b in pairwise(names)),
     )
     assert match_lanes(index, path, heading) == tuple(dict.fromkeys(best))
 

@@ -1,0 +1,198 @@
+"""Adapt the decoder to the generator that feeds it.
+
+The autoencoder learned to decode latents of clean frames. A generator's latents err in ways of their own: a small transformer's from token
+to token, which shows as a grid. The decoder sees the render beside them, so it can learn which of the two to believe. It is trained on the
+generator's own rollouts, with encoder and generator frozen, on the error of pictures and a perceptual distance.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.clips import GROUP, SIDE
+from alpasim_plugin.nets.dit import CosmosCausalDiT
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
+from alpasim_plugin.training.perceptual_term import Distance, frames_of
+from alpasim_plugin.training.shared_rollout import roll_out
+from alpasim_plugin.training.trainer import Loss
+from alpasim_plugin.training.vae import picture_error
+
+
+@dataclass(frozen=True)
+class PainterRecipe:
+    """What a batch holds and what counts.
+
+    Args:
+        clips: Clips of a batch, whole in time.
+        rows, columns: Crop in latents of 8 pixels.
+        edge_weight: See `vae.picture_error`.
+        perceptual_weight: Of the perceptual distance of one latent's frames.
+        seed: Of draws.
+    """
+
+    clips: int = 2
+    rows: int = 10
+    columns: int = 16
+    edge_weight: float = 0.3
+    perceptual_weight: float = 0.1
+    seed: int = 0
+
+
+class Rollouts:
+    """A generator's own predictions over training clips, made once and kept as float16: FOLDER/DIGEST/INDEX.npy.
+
+    Args:
+        clips: Training clips.
+        net: Frozen generator.
+        block_latents, window: As at deployment.
+        folder: Keeps them; what is there already is read.
+        report: Called with the number of clips done and in all.
+    """
+
+    def __init__(
+        self,
+        clips: LatentClips,
+        net: CosmosCausalDiT,
+        block_latents: int,
+        window: int,
+        folder: Path,
+        report: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.clips = clips
+        self.digest = _digest(net.state_dict(), clips, block_latents, window)
+        self._folder = folder / self.digest
+        self._folder.mkdir(parents=True, exist_ok=True)
+        text = torch.zeros(1, 1, net.sizes.text_width)
+        for index in range(len(clips)):
+            path = self._path(index)
+            if not path.exists():
+                clip = clips[index]
+                name = f"{clip.sequence.name}.{clip.start}.{clip.mirrored}"
+                eps, context = (
+                    torch.from_numpy(stream(name, 0, f"training.rollout.{what}").standard_normal((1, *clip.z_0.shape), dtype=np.float32))
+                    for what in ("eps", "context")
+                )
+                z_r, m, z_map = (z[None] for z in (clip.z_r, clip.m, clip.z_map))
+                z = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=block_latents, window=window)
+                _save(path, z[0].half().numpy())
+            if report is not None:
+                report(index + 1, len(clips))
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, index: int) -> tuple[LatentClip, Tensor]:
+        """Return a clip and the generator's latents of it ``(C, N, H/8, W/8)`` float32."""
+        return self.clips[index], torch.from_numpy(np.load(self._path(index)).astype(np.float32))
+
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{index:06d}.npy"
+
+
+@dataclass(frozen=True)
+class PainterBatch:
+    """Latents ``(B, C, N, h, w)``, the render, its opacity and the clean frames ``(B, c, 1 + 4 (N - 1), 8h, 8w)``, and a position."""
+
+    z: Tensor
+    render: Tensor
+    opacity: Tensor
+    clean: Tensor
+    w: int
+
+
+class PainterTask:
+    """Batches and loss of the decoder, for `Trainer`; sets what of the autoencoder is trained.
+
+    Args:
+        vae: Its decoder is trained.
+        rollouts: What it decodes.
+        recipe: What a batch holds.
+        distance: Frozen perceptual distance, with its name; None for none.
+
+    Raises:
+        InputError: A crop larger than the clips.
+    """
+
+    def __init__(self, vae: TinyVAE, rollouts: Rollouts, recipe: PainterRecipe, distance: tuple[str, Distance] | None = None) -> None:
+        size = tuple(rollouts[0][1].shape[2:])
+        if recipe.rows > size[0] or recipe.columns > size[1]:
+            found = f"a crop of {recipe.rows} x {recipe.columns} latents from {size[0]} x {size[1]}"
+            raise InputError("setting up the decoder's training", "its crop", found, "choose a smaller crop")
+        self.vae, self.rollouts, self.recipe, self.distance = vae, rollouts, recipe, distance
+        vae.requires_grad_(False)
+        vae.decoder.requires_grad_(True)
+        vae.latents_per_pass = None  # one pass a clip is faster; results differ by rounding only
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Identify data and recipe."""
+        return {
+            "clips": len(self.rollouts), "rollouts": self.rollouts.digest, "recipe": asdict(self.recipe),
+            "distance": self.distance[0] if self.distance else "none",
+        }  # fmt: skip
+
+    def batch(self, index: int) -> PainterBatch:
+        """Make batch ``index``: a function of the index and the recipe's seed alone."""
+        r = self.recipe
+        rng = stream("training", r.seed, "painter.clips", index)
+        drawn = [self._crop(rng) for _ in range(r.clips)]
+        z, render, opacity, clean = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+        return PainterBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
+
+    def loss(self, batch: PainterBatch, index: int) -> Loss:
+        """Return the loss of a batch and its parts."""
+        made = self.vae.decode(batch.z, render=batch.render, opacity=batch.opacity, clamp=False)
+        parts = {"picture": picture_error(made, batch.clean, self.recipe.edge_weight)}
+        if self.distance is not None and self.recipe.perceptual_weight:
+            frames = slice(max(1 + GROUP * (batch.w - 1), 0), 1 + GROUP * batch.w)
+            distance = self.distance[1](frames_of(made[:, :, frames]), frames_of(batch.clean[:, :, frames])).mean()
+            parts["perceptual"] = self.recipe.perceptual_weight * distance
+        numbers = {name: float(value.detach()) for name, value in parts.items()}
+        numbers["psnr_db"] = psnr_db(made.detach(), batch.clean)
+        numbers["render_psnr_db"] = psnr_db(batch.render, batch.clean)
+        return torch.stack(list(parts.values())).sum(), numbers
+
+    def _crop(self, rng: np.random.Generator) -> tuple[Tensor, ...]:
+        clip, z = self.rollouts[int(rng.integers(len(self.rollouts)))]
+        top, left = (
+            int(rng.integers(have - want + 1)) for have, want in zip(z.shape[2:], (self.recipe.rows, self.recipe.columns), strict=True)
+        )
+        rows, columns = slice(top, top + self.recipe.rows), slice(left, left + self.recipe.columns)
+        pixels = [slice(s.start * SIDE, s.stop * SIDE) for s in (rows, columns)]
+        end = 1 + GROUP * (z.shape[1] - 1)
+        render, opacity = clip.frames(end)
+        videos = [x[:, :, pixels[0], pixels[1]] for x in (render, opacity, clip.clean(end))]
+        return (z[:, :, rows, columns], *videos)
+
+
+def psnr_db(made: Tensor, wanted: Tensor) -> float:
+    """Return the peak signal-to-noise ratio of frames in [-1, 1], made ones cut to that range, in decibels."""
+    error = (made.clamp(-1, 1) - wanted).double().square().mean() / 4
+    return float(-10 * torch.log10(error.clamp_min(1e-12)))
+
+
+def _save(path: Path, array: npt.NDArray[np.float16]) -> None:
+    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
+    with partial.open("wb") as file:
+        np.save(file, array)
+    partial.replace(path)
+
+
+def _digest(weights: Mapping[str, Tensor], clips: LatentClips, block_latents: int, window: int) -> str:
+    out = hashlib.blake2b(f"{clips.digest} {len(clips)} {block_latents} {window}".encode(), digest_size=8)
+    for key, value in sorted(weights.items()):
+        out.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return out.hexdigest()
