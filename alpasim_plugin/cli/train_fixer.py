@@ -57,6 +57,9 @@ def train_fixer_command(
     source_share: Annotated[
         float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions at t = 1, the start of a rollout.")
     ] = 0.35,
+    channels: Annotated[
+        Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: as they show in pixels, or all alike.")
+    ] = "amplitude",
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
@@ -69,7 +72,9 @@ def train_fixer_command(
     if threads is not None:
         torch.set_num_threads(threads)
     chosen, console, began = variant_of(variant), Console(stderr=True), time.time()
-    recipe = GeneratorRecipe(clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share)
+    recipe = GeneratorRecipe(
+        clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share, channels=channels
+    )
     settings = onefixer_settings(fixer).model_copy(update={"window": recipe.window, "history": "finalise"})
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
     run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,8 +19,9 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
 from alpasim_plugin.training.perceptual_term import DecodedDistance, Distance
-from alpasim_plugin.training.shared_rollout import T_SOURCE, Objectives, Perceptual, Sample, losses
+from alpasim_plugin.training.shared_rollout import T_SOURCE, Objectives, Perceptual, Sample, losses, weighed
 from alpasim_plugin.training.trainer import Loss
+from alpasim_plugin.training.vae import channel_amplitudes
 from alpasim_plugin.training.variants import BASE, Variant
 
 MAP_KEY = "additional_patch_embedding.proj.1.weight"
@@ -42,6 +43,7 @@ class GeneratorRecipe:
         seed: Of draws and noise.
         source_share: ``base`` only: share of positions that are trained at t = 1, where the deployed generator starts.
         context_share: ``base`` only: share of positions that are trained at the level of a history.
+        channels: How channels weigh in flow matching: ``amplitude`` as `vae.channel_amplitudes` says, ``equal`` all alike, as in the paper.
     """
 
     clips: int = 4
@@ -54,6 +56,7 @@ class GeneratorRecipe:
     seed: int = 0
     source_share: float = 0.35
     context_share: float = 0.2
+    channels: Literal["amplitude", "equal"] = "amplitude"
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ class GeneratorTask:
         self._distance: Distance | None = distance[1] if distance else None
         self.text = torch.zeros(1, 1, net.sizes.text_width)
         self.block = 1 if not variant.history else recipe.block_latents
+        self.channel_weights = channel_amplitudes(vae) if recipe.channels == "amplitude" else None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -140,14 +144,15 @@ class GeneratorTask:
     def loss(self, batch: GeneratorBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         if self.variant.name == BASE:
-            loss = diffusion_forcing(self.net, batch.sample, self.text, self.recipe, index)
+            loss = diffusion_forcing(self.net, batch.sample, self.text, self.recipe, index, self.channel_weights)
             return loss, {"flow": float(loss.detach())}
         perceptual: Perceptual | None = None
         if self._distance is not None and batch.render is not None:
             perceptual = DecodedDistance(self.vae, self._distance, batch.sample.z_0, batch.render, batch.opacity)
         objectives = self.objectives(index)
         made = losses(
-            self.net, batch.sample, self.text, objectives, perceptual, block_latents=self.block, window=self.recipe.window
+            self.net, batch.sample, self.text, objectives, perceptual,
+            block_latents=self.block, window=self.recipe.window, channel_weights=self.channel_weights,
         )  # fmt: skip
         parts = {"flow": made.flow, "perceptual": made.perceptual}
         numbers = {name: float(value.detach()) for name, value in parts.items() if value is not None}
@@ -169,7 +174,9 @@ class GeneratorTask:
         return torch.stack([render[..., pixels] for render, _ in both]), torch.stack([opacity[..., pixels] for _, opacity in both])
 
 
-def diffusion_forcing(net: CosmosCausalDiT, s: Sample, text: Tensor, recipe: GeneratorRecipe, index: int) -> Tensor:
+def diffusion_forcing(
+    net: CosmosCausalDiT, s: Sample, text: Tensor, recipe: GeneratorRecipe, index: int, channel_weights: Tensor | None = None
+) -> Tensor:
     """Return the error of the velocity where every position has a noise level of its own and is history to those after it.
 
     The levels are those that a deployed generator meets: the source (t = 1), the level of the cache write, and anything between. In three
@@ -184,7 +191,7 @@ def diffusion_forcing(net: CosmosCausalDiT, s: Sample, text: Tensor, recipe: Gen
     z_t = interpolant(s.z_0, z_1, t[:, None, :, None, None])
     v = net(z_t, T_SOURCE * t, text, s.z_map, block_latents=recipe.block_latents, window=recipe.window)
     error: Tensor = v - (z_1 - s.z_0)
-    return error.square().mean()
+    return weighed(error.square(), channel_weights).mean()
 
 
 def widen_map(weights: Mapping[str, Tensor], channels: int, latent_channels: int = 16) -> dict[str, Tensor]:

@@ -109,6 +109,7 @@ def losses(
     *,
     block_latents: int = 2,
     window: int | None = 12,
+    channel_weights: Tensor | None = None,
 ) -> Losses:
     """Return the objectives of one batch of clips, all on the same rollout.
 
@@ -119,6 +120,7 @@ def losses(
         objectives: Which terms.
         perceptual: Decodes the predictions causally and compares position w with the clean frames; needed if ``objectives.horizon``.
         block_latents, window: As at deployment, in latents.
+        channel_weights: ``(C,)`` of the flow-matching error, mean 1; None weighs all channels alike. Its minimum does not depend on them.
 
     Raises:
         InputError: A perceptual term without its function, or w outside the clip.
@@ -130,7 +132,7 @@ def losses(
         raise InputError("training on a shared rollout", f"w = {sample.w}", f"{n} latents", "sample w within the clip")
     rollout = _Rollout(net, sample, text, objectives, block_latents, window)
     history = rollout.history()
-    flow = None if objectives.flow is None else rollout.flow_matching(history)
+    flow = None if objectives.flow is None else rollout.flow_matching(history, channel_weights)
     seen: tuple[Tensor, ...] = ()
     perc = None
     if objectives.horizon:
@@ -139,6 +141,11 @@ def losses(
         perc = perceptual(torch.cat([rollout.cut(z, b) for z, b in zip(seen, rollout.blocks, strict=False)], dim=2), sample.w)
     terms = [term for term in (flow, None if perc is None else objectives.weight * perc) if term is not None]
     return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, seen)
+
+
+def weighed(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
+    """Return squared errors ``(B, C, ...)`` times the weights ``(C,)`` of their channels."""
+    return squares if channel_weights is None else squares * channel_weights.view(1, -1, *[1] * (squares.ndim - 2))
 
 
 @torch.no_grad()
@@ -194,7 +201,7 @@ class _Rollout:
         v = self.net.step(self.z_1[:, :, b], T_SOURCE, self.text, self.condition[:, :, b], cache, write=False)
         return flow_step(self.z_1[:, :, b], v)
 
-    def flow_matching(self, history: Tensor | None) -> Tensor:
+    def flow_matching(self, history: Tensor | None, channel_weights: Tensor | None = None) -> Tensor:
         """Return the mean error of the velocity over all positions, each at its random time, given the history."""
         assert history is not None
         s, cache, errors = self.s, self._new_cache(), []
@@ -202,7 +209,7 @@ class _Rollout:
         z_t = interpolant(s.z_0, self.z_1, t)
         for b in self.blocks:
             v = self.net.step(z_t[:, :, b], T_SOURCE * s.t[:, b], self.text, self.condition[:, :, b], cache, write=False)
-            errors.append((v - (self.z_1 - s.z_0)[:, :, b]).square().mean(dim=(0, 1, 3, 4)))
+            errors.append(weighed((v - (self.z_1 - s.z_0)[:, :, b]).square(), channel_weights).mean(dim=(0, 1, 3, 4)))
             self._write(history[:, :, b], b, cache)
         return torch.cat(errors).mean()
 
