@@ -158,6 +158,19 @@ def test_history_of_every_kind_is_what_its_name_says(net: CosmosCausalDiT) -> No
     torch.testing.assert_close(near, clean, atol=0, rtol=0)
 
 
+def test_channel_weights_weigh_the_error_of_channels_and_nothing_else(net: CosmosCausalDiT) -> None:
+    s, ones = sample(), torch.ones(16)
+    with torch.no_grad():
+        plain = losses(net, s, TEXT, Objectives(horizon=0)).flow
+        parts = [losses(net, s, TEXT, Objectives(horizon=0), channel_weights=16.0 * torch.eye(16)[c]).flow for c in range(16)]
+        alike = losses(net, s, TEXT, Objectives(horizon=0), channel_weights=ones).flow
+    assert plain is not None
+    assert alike is not None
+    torch.testing.assert_close(alike, plain)
+    torch.testing.assert_close(torch.stack([p for p in parts if p is not None]).mean(), plain)
+    assert len({round(float(p), 6) for p in parts if p is not None}) > 8
+
+
 def test_without_the_map_its_values_do_not_matter(net: CosmosCausalDiT) -> None:
     s, other = sample(), replace(sample(), z_map=noise("other map", 1, 16, N, H, W))
     with torch.no_grad():

@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clips import ClipSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.training.trainer import Schedule, Trainer
-from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
+from alpasim_plugin.training.vae import VaeRecipe, VaeTask, channel_amplitudes, measure_stats
 from alpasim_plugin.training.vae_quality import quality, round_trip
 
 from .pair_files import make
@@ -70,3 +72,17 @@ def test_stats_of_random_latents_are_those_of_their_sample() -> None:
 def test_round_trip_pads_and_crops_any_size() -> None:
     video = torch.zeros(1, 3, 6, 20, 30)
     assert round_trip(TinyVAE.random(), video).shape == video.shape
+
+
+def test_channel_amplitudes_are_what_an_error_of_a_channel_does_to_pixels() -> None:
+    vae = TinyVAE.random(TinySizes(16, 16, 16, 16, 16))
+    weights = channel_amplitudes(vae)
+    assert float(weights.mean()) == pytest.approx(1.0)
+    assert torch.equal(weights, channel_amplitudes(vae))
+    assert weights.requires_grad is False
+    # Untrained, the picture is linear in the latents: a channel whose unit is five times as large shows five times as strongly.
+    assert int(weights.argmax()) == 0, "brightness"
+    vae.stats = LatentStats([0.0] * 16, [*[1.0] * 3, 5.0, *[1.0] * 12], stored=True)
+    louder = channel_amplitudes(vae)
+    torch.testing.assert_close(louder[3] / louder[0], 5 * weights[3] / weights[0], atol=0.0, rtol=1e-3)
+    torch.testing.assert_close(louder[4] / louder[0], weights[4] / weights[0], atol=0.0, rtol=1e-3)
