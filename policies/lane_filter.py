@@ -80,9 +80,7 @@ def predict(lane: LaneState, forward_m: float, left_m: float, turn_rad: float) -
     mean[WIDTH] = MEAN_WIDTH_M + (mean[WIDTH] - MEAN_WIDTH_M) * np.exp(-abs(d) / WIDTH_MEMORY_M)
     noise = DRIFT_PER_SQRT_M**2 * abs(d) + np.array([0.003, 0.0005, 0, 0, 0]) ** 2
     cov = transition @ lane.cov @ transition.T + np.diag(noise)
-    return replace(
-        lane, mean=mean, cov=cov, left_m=0.0, right_m=0.0, seen_to_m=max(lane.seen_to_m - d, 0.0), blind_m=lane.blind_m + abs(d)
-    )
+    return replace(lane, mean=mean, cov=cov, left_m=0.0, right_m=0.0, seen_to_m=max(lane.seen_to_m - d, 0.0), blind_m=lane.blind_m + abs(d))
 
 
 def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:

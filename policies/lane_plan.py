@@ -99,9 +99,7 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     return Blend(make_path(fused, PATH_M, speed_mps), float(1.0 - lane_share[at_10]), leaves)
 
 
-def progress_behind(
-    speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float
-) -> F64:
+def progress_behind(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float) -> F64:
     """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance to what is ahead.
 
     Intelligent driver model (Treiber, Hennecke, Helbing 2000), the thing ahead continuing at its speed.

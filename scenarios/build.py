@@ -30,6 +30,7 @@ from scenarios.ways import Bump, EgoWay, LaneChange, ego_way
 TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's foresight does not see them freeze
 DEFAULT_DURATION_US = 8_000_000
 
+
 @dataclass(frozen=True)
 class Built:
     """A built road with its traffic."""

@@ -86,9 +86,7 @@ def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -
         raise files.fail(path, f"obstacle id {ids.most_common(1)[0][0]} twice", "give each obstacle its own id")
     notes = [f"{n} obstacles {why} and were left out" for why, n in sorted(skipped.items())]
     notes += [
-        f"{len(found)} {tag} elements were left out"
-        for tag in ("environmentObstacle", "phantomObstacle")
-        if (found := root.findall(tag))
+        f"{len(found)} {tag} elements were left out" for tag in ("environmentObstacle", "phantomObstacle") if (found := root.findall(tag))
     ]
     return tuple(obstacles), tuple(notes)
 

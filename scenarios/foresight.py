@@ -74,7 +74,6 @@ class ScriptTable:
         keep = np.flatnonzero(self.present[i])
         return bodies_from(self.xy[i, keep], self.yaw[i, keep], [self.boxes[k] for k in keep], self.velocity[i, keep])
 
-
     def rows(self, t_us: int) -> I64:
         """Return the grid rows of now and of the look-ahead."""
         rows = (t_us + np.round(TIMES_S * 1e6).astype(np.int64)) // self.step_us

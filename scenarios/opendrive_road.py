@@ -153,9 +153,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
 
     def lane(one: Element, start_m: float) -> OdrLane:
         mark = one.find("roadMark")
-        links = {
-            tag: tuple(_integer(files, here, e, "id") for e in one.findall(f"link/{tag}")) for tag in ("successor", "predecessor")
-        }
+        links = {tag: tuple(_integer(files, here, e, "id") for e in one.findall(f"link/{tag}")) for tag in ("successor", "predecessor")}
         return OdrLane(
             _integer(files, here, one, "id"), one.get("type", "none"), cubics(one, "width", "sOffset", start_m),
             cubics(one, "border", "sOffset", start_m), links["successor"], links["predecessor"],

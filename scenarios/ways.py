@@ -70,9 +70,7 @@ def ego_way(road: Road, lane: int, changes: Sequence[LaneChange] = (), bumps: Se
     return EgoWay(smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins))
 
 
-def _change(
-    road: Road, parts: list[F64], chain: list[tuple[str, int]], change: LaneChange
-) -> tuple[list[F64], list[tuple[str, int]]]:
+def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: LaneChange) -> tuple[list[F64], list[tuple[str, int]]]:
     lengths = np.array([arc_lengths(p)[-1] for p in parts])
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
     first = int(np.searchsorted(begin, change.at_m, side="right")) - 1

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
 import sys
 import traceback
+from pathlib import Path
 
 import typer
 
 from alpasim_plugin.cli import bench, compare, doctor, fork, gate, listing, refine, report, run, score, train
-from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.errors import InputError, SimrunError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -46,8 +48,17 @@ def with_verb(args: list[str]) -> list[str]:
         ['run', '--renderer', 'clean', 'smoke/straight']
         >>> with_verb(["list", "renderers"])
         ['list', 'renderers']
+
+    Raises:
+        InputError: A word that is no file and nearly a verb.
     """
-    return ["run", *args] if args and args[0] not in VERBS + OWN_OPTIONS else args
+    if not args or args[0] in VERBS + OWN_OPTIONS:
+        return args
+    near = [] if args[0].startswith("-") or Path(args[0]).exists() else difflib.get_close_matches(args[0], VERBS, 1, 0.7)
+    if near:
+        found = f"neither a verb nor a scenario; {near[0]} is one"
+        raise InputError("reading the command line", args[0], found, f"type 'simrun {near[0]}', or 'simrun --help' for all verbs")
+    return ["run", *args]
 
 
 def run_command(args: list[str]) -> int:

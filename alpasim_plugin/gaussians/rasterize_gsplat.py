@@ -87,11 +87,17 @@ def require_gsplat(device: str = "cuda") -> Any:
         import gsplat
     except ImportError as error:
         raise RendererError(
-            _DOING, "the package gsplat", f"it does not import ({error})", "pip install 'alpasim-onefixer[gpu]', or choose backend='cpu'"
+            _DOING,
+            "the package gsplat",
+            f"it does not import ({error})",
+            "pip install 'alpasim-onefixer[gpu]', or choose --device cpu (backend='cpu' in code)",
         ) from error
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise RendererError(
-            _DOING, f"device {device!r}", "torch sees no CUDA device", "run on a machine with an NVIDIA GPU, or choose backend='cpu'"
+            _DOING,
+            f"device {device!r}",
+            "torch sees no CUDA device",
+            "run on a machine with an NVIDIA GPU, or choose --device cpu (backend='cpu' in code)",
         )
     cloud = GaussianCloud([[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3)))  # type: ignore[arg-type]
     K = np.array([[20.0, 0, 8.5], [0, 20, 8.5], [0, 0, 1]])
@@ -101,13 +107,13 @@ def require_gsplat(device: str = "cuda") -> Any:
     except Exception as error:
         raise RendererError(
             _DOING, "a test image of one Gaussian", f"{type(error).__name__}: {error}",
-            "check that gsplat's CUDA kernels match torch and the driver, or choose backend='cpu'",
+            "check that gsplat's CUDA kernels match torch and the driver, or choose --device cpu (backend='cpu' in code)",
         ) from error  # fmt: skip
     centre = (float(out.alpha[8, 8]), float(out.rgb[8, 8, 0]), float(out.depth[8, 8]))
     if not np.allclose(centre, (0.9, 0.45, 5.0), atol=0.01):
         raise RendererError(
             _DOING, "a test image of one Gaussian", f"alpha, red and depth {centre} at its centre instead of (0.9, 0.45, 5.0)",
-            "install a gsplat build that matches this GPU, or choose backend='cpu'",
+            "install a gsplat build that matches this GPU, or choose --device cpu (backend='cpu' in code)",
         )  # fmt: skip
     return gsplat
 
@@ -129,7 +135,10 @@ def rasterize_gsplat(
     """
     if lod_px:
         raise InputError(
-            _DOING, f"lod_px={lod_px}", "gsplat has no level of detail of this meaning", "leave lod_px at 0, or choose backend='cpu'"
+            _DOING,
+            f"lod_px={lod_px}",
+            "gsplat has no level of detail of this meaning",
+            "leave lod_px at 0, or choose --device cpu (backend='cpu' in code)",
         )
     gsplat = require_gsplat(device)
     cloud.require_drawable(_DOING)

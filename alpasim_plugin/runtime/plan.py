@@ -87,8 +87,10 @@ def make_plan(
         InputError: A scenario is bad, two scenarios share an id, or a name is given twice.
     """
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
-        if not values or len(set(values)) != len(values):
-            raise InputError("planning a run", f"{what}s {list(values)}", "none, or one of them twice", f"name every {what} once")
+        twice = sorted({str(value) for value in values if list(values).count(value) > 1})
+        if not values or twice:
+            found = f"{', '.join(twice)} twice" if twice else "none"
+            raise InputError("planning a run", f"{what}s {', '.join(map(str, values)) or '(none)'}", found, f"name every {what} once")
     same = [str(parse_renderer(name)) for name in renderers]
     if len(set(same)) != len(same):
         raise InputError("planning a run", f"renderers {list(renderers)}", f"they stand for {same}", "name every renderer once")

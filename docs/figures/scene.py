@@ -1,6 +1,6 @@
 """Measure the scenes and their surrogate degradation: PSNR by lateral offset, time a frame, Gaussians; draw docs/img/degradation.png.
 
-    python docs/figures/scene.py [--speed] [SCENARIO ...]
+python docs/figures/scene.py [--speed] [SCENARIO ...]
 """
 
 from __future__ import annotations

@@ -138,9 +138,7 @@ def table(rows: dict[tuple[str, float], Sequence[Row]]) -> str:
     for (kind, left_m), measured in rows.items():
         mean = [np.mean([getattr(r, name) for r in measured], axis=0) for name in Row.__dataclass_fields__]
         bands = " / ".join(f"{share:.0%}" for share in mean[3])
-        lines.append(
-            f"| {kind} | {left_m:g} m | {mean[0]:.1f} | {mean[1]:.3f} | {mean[2]:.0%} | {bands} | {mean[4]:.1%} | {mean[5]:.1f} |"
-        )
+        lines.append(f"| {kind} | {left_m:g} m | {mean[0]:.1f} | {mean[1]:.3f} | {mean[2]:.0%} | {bands} | {mean[4]:.1%} | {mean[5]:.1f} |")
     return "\n".join(lines)
 
 

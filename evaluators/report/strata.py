@@ -165,9 +165,7 @@ class _Steps:
         return np.asarray(values[np.isin(times, self.t_us[group == k])])
 
 
-def _split(
-    title: str, note: str, axis: str, unit: str, labels: Sequence[str], steps: list[_Steps], groups: list[I64], run: Run
-) -> Strata:
+def _split(title: str, note: str, axis: str, unit: str, labels: Sequence[str], steps: list[_Steps], groups: list[I64], run: Run) -> Strata:
     strata_found = []
     for k, label in enumerate(labels):
         bins = []

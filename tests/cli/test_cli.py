@@ -45,7 +45,9 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[str], str]]:
         "baseline that is not run": ([*GOOD, "--baseline", "3dgs", *scene], "--baseline 3dgs"),
         "bad seeds": ([*GOOD, "--seeds", "a,b", *scene], "--seeds a,b"),
         "no seeds": ([*GOOD, "--seeds", "0", *scene], "--seeds 0"),
-        "renderer named twice": (["--renderer", "clean,clean", "--policy", "log-replay", *scene], "one of them twice"),
+        "misspelt verb": (["scroe", "drive.asl"], "simrun score"),
+        "seed named twice": ([*GOOD, "--seeds", "1,2,1", *scene], "1 twice"),
+        "renderer named twice": (["--renderer", "clean,clean", "--policy", "log-replay", *scene], "clean twice"),
         "override of an unknown key": ([*GOOD, "--set", "rats.camera_us=1", *scene], "rates"),
         "camera period that is no multiple": ([*GOOD, "--set", "rates.camera_us=150001", *scene], "multiple"),
         "one-frame scene": ([*GOOD, "--set", "timing.duration_us=1", *scene], "duration_us"),
@@ -72,6 +74,9 @@ SITUATIONS = (
     "override of an unknown key",
     "camera period that is no multiple",
     "one-frame scene",
+    "no camera for the policy",
+    "misspelt verb",
+    "seed named twice",
 )
 
 
