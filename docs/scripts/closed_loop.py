@@ -1,9 +1,9 @@
 """Drive the held-out scenes behind three renderers and put the tables into docs/results.md.
 
-    python docs/scripts/closed_loop.py SCENES [RUNS] [--seeds N] [--policies learned,lane-camera] [--set KEY=VALUE]...
+    python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:2] [--set KEY=VALUE]...
 
 SCENES is the folder of test scenes that ``simrun train scenes --split test`` wrote; RUNS (default: runs/closed-loop) keeps the run folders,
-so a second call continues an interrupted first one.
+so a second call continues an interrupted first one. Behind a policy's name stands its number of seeds.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 from results import DOCS, number, replace
 
 VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
@@ -54,24 +55,44 @@ def table(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def families(rows: list[dict[str, Any]]) -> str:
+    """Return how many rollouts of each family of scenes left the road or were at fault in a contact, by renderer."""
+    names = sorted({family(row) for row in rows})
+    lines = ["| left the road or at fault, rollouts | " + " | ".join(RENDERERS) + " |", "|---" * (len(RENDERERS) + 1) + "|"]
+    for name in names:
+        cells = []
+        for renderer in RENDERERS:
+            events = [row["offroad_or_collision_at_fault"] for row in rows if family(row) == name and row["renderer"] == renderer]
+            cells.append(f"{sum(1 for event in events if event)} of {len(events)}")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def family(row: dict[str, Any]) -> str:
+    """Return the family in a scene's name: SPLIT-FAMILY-NUMBER."""
+    return str(row["scene"]).split("-")[1].replace("_", " ")
+
+
 def main() -> None:
     """Run what is not there yet and fill in the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
-    parser.add_argument("--seeds", default="5")
-    parser.add_argument("--policies", default="learned,lane-camera")
+    parser.add_argument("--policies", default="learned:5,lane-camera:5")
     parser.add_argument("--set", dest="settings", action="append", default=[])
     given = parser.parse_args()
     scenes = sorted(str(path) for path in given.scenes.glob("*.yaml"))
     if not scenes:
         sys.exit(f"no scenes in {given.scenes}: run 'simrun train scenes --split test' first")
+    settings = [word for value in given.settings for word in ("--set", value)]
     parts = []
-    for policy in given.policies.split(","):
-        settings = [word for value in given.settings for word in ("--set", value)]
-        options = ["--renderer", ",".join(RENDERERS), "--baseline", "3dgs", "--policy", policy, "--seeds", given.seeds, *settings]
-        summary = drive(given.runs / policy, [*options, "--resume", *scenes])
-        parts.append(f"**{policy}**: {len(scenes)} scenes x {given.seeds} seeds\n\n{table(summary)}")
+    for name in given.policies.split(","):
+        policy, _, seeds = name.partition(":")
+        options = ["--renderer", ",".join(RENDERERS), "--baseline", "3dgs", "--policy", policy, "--seeds", seeds or "5", *settings]
+        summary = drive(given.runs / policy, [*options, "--images", "none", "--resume", *scenes])
+        rows = pq.read_table(given.runs / policy / "rollouts.parquet").to_pylist()
+        head = f"**{policy}**: {len(scenes)} scenes x {seeds or '5'} seeds"
+        parts.append("\n\n".join((head, table(summary), families(rows))))
     page = DOCS / "results.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
 
