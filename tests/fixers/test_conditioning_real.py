@@ -64,7 +64,9 @@ def test_projection_equals_the_reader_s(clip, shared_data):
         np.testing.assert_allclose(table * camera.A[0][0], exact, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["cross_right_120fov", "front_wide_120fov", "rear_left_70fov"])
+@pytest.mark.parametrize(
+    "name", ["front_wide_120fov", *(pytest.param(name, marks=pytest.mark.slow) for name in ("cross_right_120fov", "rear_left_70fov"))]
+)
 def test_published_conditioning_videos_hold_our_colours(shared_data, name):
     """Nearly every drawn pixel of renders that a network was trained with is one of the palette's colours times a fade."""
     flat = [rgb for key, rgb in COLOURS.items() if key not in ("intersection", "road_island", "buffer_zone")]

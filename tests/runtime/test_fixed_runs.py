@@ -54,6 +54,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp_path: Path) -> None:
     run(plan_of(), tmp_path, workers=2)
     assert comparable(tmp_path) == comparable(finished)

@@ -122,6 +122,7 @@ def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
     assert len(list(tmp_path.rglob(MANIFEST))) == 6
 
 
+@pytest.mark.slow
 def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path: Path) -> None:
     """A file-size limit stands in for a full disk: the system refuses the same writes with an error of the same kind."""
     code = (

@@ -45,7 +45,7 @@ def test_a_recording_is_recognised_and_loaded_as_it_is(shared_data: Path, kind: 
     assert len(s.route.xyz) > 1
 
 
-@pytest.mark.parametrize("kind", ["argoverse", "commonroad"])
+@pytest.mark.parametrize("kind", [pytest.param("argoverse", marks=pytest.mark.slow), "commonroad"])
 def test_a_file_can_let_recorded_traffic_react_or_vanish(shared_data: Path, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "scene.yaml"
     source = shared_data / FOLDERS[kind]
