@@ -95,6 +95,7 @@ def test_real_human_is_inside_the_drivable_areas_in_every_frame(real):
     assert shapely.contains_xy(surface, poses_[:, :2, 3]).sum() == 156
 
 
+@pytest.mark.slow
 def test_real_least_gap_in_the_plane_of_the_ego(real):
     """The published figures are taken in the ego's own xy plane; nobody touches the ego."""
     facts, _, _, log = real
