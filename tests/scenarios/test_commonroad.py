@@ -349,8 +349,6 @@ def test_real_file(shared_data, name):
 
 def test_shipped_file(repo):
     path = repo / "scenarios" / "data" / "USA_US101-3_3_T-1.xml"
-    if not path.is_file():
-        pytest.skip("the shipped file is not in this checkout")
     check_file(path, FACTS["USA_US101-3_3_T-1"])
     log = check_log(path, FACTS["USA_US101-3_3_T-1"])
     assert log.scene_id == "commonroad-USA_US101-3_3_T-1"
