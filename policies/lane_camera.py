@@ -8,11 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, CameraSpec, Frame, Observation, Plan, Route, Scenario, SensorSpec
 from policies.base import POLICIES, plan_times, seconds
+from policies.camera_frame import camera_frame
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
 from policies.lane_plan import NOISE_SPEED, Blend, RouteGuess, blend, guess_from_route, progress_behind, sampled, spread_m, wander
@@ -91,7 +92,7 @@ class LaneCamera:
         Raises:
             PolicyError: The observation has no frame of the camera, or one of another size.
         """
-        frame = self._frame(observation)
+        frame = camera_frame(observation, self.camera, "lane-camera")
         route = self._navigation(smooth_line(route_points(observation.route_rig))) if has_route(observation.route_rig) else None
         speed = observation.ego.speed_mps
         if self.cruise_mps is None:
@@ -126,19 +127,6 @@ class LaneCamera:
         step = np.gradient(route, axis=0)
         normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
         return np.asarray(route + self.navigation_error_m * normal)
-
-    def _frame(self, observation: Observation) -> Frame:
-        frame = observation.frames.get(self.camera.name)
-        expected = (self.camera.height, self.camera.width, 3)
-        if frame is None or frame.rgb.shape != expected:
-            found = f"frames of {sorted(observation.frames)}" if frame is None else f"a frame of shape {frame.rgb.shape}"
-            raise PolicyError(
-                "planning by camera",
-                f"policy 'lane-camera' at {observation.t_us} us",
-                f"{found}; needed is {self.camera.name!r} of shape {expected}",
-                "render the cameras that the policy names in `sensors`, at the scenario's size",
-            )
-        return frame
 
     def _look(self, frame: Frame, pose: F64, route: F64 | None, pose_now: F64, speed: float) -> None:
         """Bring lane, road colour and obstacle up to a new frame."""

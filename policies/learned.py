@@ -9,10 +9,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, U8, Frame, Observation, Plan, Route, Scenario, SensorSpec
+from alpasim_plugin.types import F64, U8, Observation, Plan, Route, Scenario, SensorSpec
 from policies.base import POLICIES, plan_times, seconds
+from policies.camera_frame import camera_frame
 from policies.lane_camera import front_camera
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, sampled, wander
 from policies.learned_command import COMMANDS, route_command
@@ -69,7 +70,7 @@ class Learned:
         Raises:
             PolicyError: The observation has no frame of the camera, or one of another size.
         """
-        frame = self._frame(observation)
+        frame = camera_frame(observation, self.camera, "learned")
         if not self.views or frame.t_us > self.views[-1][0]:
             self.views.append((frame.t_us, look(frame.rgb, self.camera)))
         while self.views[0][0] < frame.t_us - EARLIEST_US:
@@ -128,19 +129,6 @@ class Learned:
         over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight on beyond the last knot
         at = [np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)]
         return np.stack([at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])], axis=1), at[2]
-
-    def _frame(self, observation: Observation) -> Frame:
-        frame = observation.frames.get(self.camera.name)
-        expected = (self.camera.height, self.camera.width, 3)
-        if frame is None or frame.rgb.shape != expected:
-            found = f"frames of {sorted(observation.frames)}" if frame is None else f"a frame of shape {frame.rgb.shape}"
-            raise PolicyError(
-                "planning by camera",
-                f"policy 'learned' at {observation.t_us} us",
-                f"{found}; needed is {self.camera.name!r} of shape {expected}",
-                "render the cameras that the policy names in `sensors`, at the scenario's size",
-            )
-        return frame
 
 
 class LearnedMean(Learned):

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.clips import to_tensor
 from alpasim_plugin.training.map_colours import OTHERS, recolour_boxes
 from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.training.whole import save_array
 
 F16 = npt.NDArray[np.float16]
 DOING = "encoding training clips"
@@ -130,11 +130,7 @@ class LatentClips:
         info = hashlib.blake2b(json.dumps(sequence.info, sort_keys=True).encode(), digest_size=4).hexdigest()
         path = self._folder / f"{sequence.name}-{info}.npy"
         if not path.exists():
-            encoded = encode_sequence(sequence, vae, self.form)
-            partial = path.with_name(f"{path.name}.{os.getpid()}.part")
-            with partial.open("wb") as file:
-                np.save(file, encoded)
-            partial.replace(path)
+            save_array(path, encode_sequence(sequence, vae, self.form))
         return np.asarray(np.load(path, mmap_mode="r"))
 
 

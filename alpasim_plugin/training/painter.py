@@ -8,14 +8,12 @@ generator's own rollouts, with encoder and generator frozen, on the error of pic
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -29,6 +27,7 @@ from alpasim_plugin.training.perceptual_term import Distance, frames_of
 from alpasim_plugin.training.shared_rollout import roll_out
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.training.vae import picture_error
+from alpasim_plugin.training.whole import save_array
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class Rollouts:
                 )
                 z_r, m, z_map = (z[None] for z in (clip.z_r, clip.m, clip.z_map))
                 z = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=block_latents, window=window)
-                _save(path, z[0].half().numpy())
+                save_array(path, z[0].half().numpy())
             if report is not None:
                 report(index + 1, len(clips))
 
@@ -182,13 +181,6 @@ def psnr_db(made: Tensor, wanted: Tensor) -> float:
     """Return the peak signal-to-noise ratio of frames in [-1, 1], made ones cut to that range, in decibels."""
     error = (made.clamp(-1, 1) - wanted).double().square().mean() / 4
     return float(-10 * torch.log10(error.clamp_min(1e-12)))
-
-
-def _save(path: Path, array: npt.NDArray[np.float16]) -> None:
-    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
-    with partial.open("wb") as file:
-        np.save(file, array)
-    partial.replace(path)
 
 
 def _digest(weights: Mapping[str, Tensor], clips: LatentClips, block_latents: int, window: int) -> str:

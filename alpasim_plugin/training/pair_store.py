@@ -14,8 +14,6 @@ Channels may differ in length; a sequence is as long as its shortest one.
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -24,7 +22,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.training.whole import whole_folder
 from alpasim_plugin.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"
@@ -157,19 +156,10 @@ def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapp
         InputError: No frame, or frames of changing size.
         InfrastructureError: The disk refuses.
     """
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with whole_folder(folder, "writing training pairs") as partial:
         count = _write_arrays(partial, frames, length)
         document = {**info, "frames": count}
         (partial / SEQUENCE_FILE).write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.replace(folder)
-    except OSError as error:
-        raise InfrastructureError("writing training pairs", str(folder), str(error), "make room, or choose another folder") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _write_arrays(folder: Path, frames: Iterable[Pair], length: int) -> int:

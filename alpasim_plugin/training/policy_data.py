@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -13,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import inverse, quat_from_yaw, se3
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.policy_expert import SIGHT_M, leader_on, taught_path, taught_speeds
 from alpasim_plugin.training.policy_practice import Moment, Practice, practice_drives
+from alpasim_plugin.training.whole import whole_folder
 from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Route, Scenario
 from alpasim_plugin.world.route import route_in_rig
 from policies.lane_camera import front_camera
@@ -91,19 +90,10 @@ def make_lessons(scenario: Scenario, folder: Path, recipe: LessonRecipe, seed: i
     camera = wide_camera(front_camera(scenario))
     arrays = _lessons(scenario, camera, recipe, seed, threads)
     facts = {"K": camera.K.tolist(), "T_rig_camera": camera.T_rig_camera.tolist(), "lessons": len(arrays["frame"])}
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with whole_folder(folder, "writing lessons") as partial:
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
         (partial / LESSONS_FILE).write_text(json.dumps({**info, **facts}, indent=1) + "\n", encoding="utf-8")
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.replace(folder)
-    except OSError as error:
-        raise InfrastructureError("writing lessons", str(folder), str(error), "make room, or choose another folder") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     return True
 
 
