@@ -114,7 +114,7 @@ def quality(
     summary = summarise([read_json(work.row_file)["row"] for work in todo], baseline)
     summary["run"] = {
         "data": str(data), "split": split, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
-        "fixers": {arm.label: arm.as_dict()["fixer"] for arm in arms}, "networks": dict(networks),
+        "fixers": {arm.label: arm.card and arm.card.as_dict() for arm in arms}, "networks": dict(networks),
         "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
     }  # fmt: skip
     write_results(summary, todo, out)

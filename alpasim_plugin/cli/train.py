@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,6 +20,7 @@ from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_c
 from alpasim_plugin.cli.train_policy import POLICY_DATA_EPILOG, POLICY_EPILOG, policy, policy_data
 from alpasim_plugin.cli.train_splat import EPILOG as SPLAT_EXAMPLE
 from alpasim_plugin.cli.train_splat import splat
+from alpasim_plugin.cli.training_options import Progress, RunFolder, Seed, Steps
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
@@ -32,7 +32,6 @@ from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
 from alpasim_plugin.training.vae_quality import quality, round_trip
 
 app = typer.Typer(no_args_is_help=True, help="Make training data and train networks.")
-Out = Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")]
 WIDTH, HEIGHT = 256, 144
 
 EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
@@ -57,7 +56,7 @@ def train() -> None:
 
 @app.command("scenes", epilog="Example: `simrun train scenes --out data/scenes --split train --count 120`")
 def scenes(
-    out: Out,
+    out: RunFolder,
     split: Annotated[Literal["train", "val", "test"], typer.Option("--split", help="Which split.")] = "train",
     count: Annotated[int | None, typer.Option("--count", min=1, help="Scenes; by default 120, 20 and 60.")] = None,
     duration_s: Annotated[float, typer.Option("--duration-s", min=1.0, help="Length of every drive.")] = 9.9,
@@ -71,11 +70,11 @@ def scenes(
 @app.command("vae", epilog="Example: `simrun train vae data/pairs --video drive.mp4 --out runs/vae --steps 4000`")
 def vae(
     data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
-    out: Out,
+    out: RunFolder,
     video: Annotated[list[Path] | None, typer.Option("--video", help="Driving video to learn from as well. Repeatable.")] = None,
     video_share: Annotated[float, typer.Option("--video-share", min=0.1, max=1.0, help="Only the first share of every video.")] = 1.0,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 4000,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
+    steps: Steps = 4000,
+    seed: Seed = 0,
     init: Annotated[Path | None, typer.Option("--init", help="Weights to start from.")] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose autoencoder sizes are trained.")] = "onefixer-tiny",
 ) -> None:
@@ -85,19 +84,14 @@ def vae(
     videos = [read_video(path, WIDTH, HEIGHT, 0.0, video_share) for path in video or ()]
     task = VaeTask(model, dataset.sequences, videos, VaeRecipe(seed=seed, video_clips=1 if videos else 0))
     trainer = Trainer(model, out, Schedule(steps), task.batch, task.loss, task.facts)
-    console, began = Console(stderr=True), time.time()
-
-    def report(step: int, numbers: object) -> None:
-        if step % 50 == 0:
-            console.print(f"{step}/{steps} {time.time() - began:.0f} s {json.dumps(numbers)}")
-
-    trainer.run(report)
+    progress = Progress(steps, every=50)
+    trainer.run(progress.update)
     model.load_state_dict(trainer.averaged())
     clips = [to_tensor(s.clip.rgb_gt[:97])[None] for s in dataset.sequences]
     mean, std = measure_stats(model, clips)
     model.stats = LatentStats((mean * model.stats.std + model.stats.mean).tolist(), (std * model.stats.std).tolist(), stored=True)
     model.save(out / "vae.safetensors", {"made_by": "simrun train vae", "steps": str(steps), "seed": str(seed)})
-    console.print(f"wrote {out / 'vae.safetensors'}")
+    progress.wrote(out / "vae.safetensors")
 
 
 @app.command("vae-quality", epilog="Example: `simrun train vae-quality runs/vae/vae.safetensors data/pairs --split val --video drive.mp4`")

@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
 import typer
-from rich.console import Console
 
+from alpasim_plugin.cli.training_options import (
+    Clips,
+    Latents,
+    MetricWeights,
+    Pairs,
+    PeakLr,
+    Progress,
+    RunFolder,
+    Seed,
+    Steps,
+    Stride,
+    Threads,
+    use_threads,
+)
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets.picture_distance import distance_for_training
 from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.training.generator import GeneratorRecipe
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.memory import measure_memory, memory_table
-from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.trainer import Schedule
 from alpasim_plugin.training.variants import VARIANTS, variant_of
 
 PRECISIONS: Mapping[str, torch.dtype | None] = {"fp32": None, "bf16": torch.bfloat16}
-Updates = Annotated[int, typer.Option("--steps", min=1, help="Updates in all: the budget.")]
 
 
 def onefixer_settings(name: str) -> OneFixerSettings:
@@ -41,18 +51,18 @@ def onefixer_settings(name: str) -> OneFixerSettings:
 
 
 def train_fixer_command(
-    data: Annotated[Path, typer.Argument(help="Folder of pairs; its split 'train' is learned from.")],
+    data: Pairs,
     vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae').")],
-    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command continues there.")],
+    out: RunFolder,
     variant: Annotated[str, typer.Option("--variant", help=f"One of {', '.join(VARIANTS)}.")] = "V9",
     init: Annotated[Path | None, typer.Option("--init", help="Weights to start from: a run's fixer.safetensors, or a transformer.")] = None,
-    steps: Updates = 400,
-    clips: Annotated[int, typer.Option("--clips", min=1, help="Clips side by side.")] = 4,
+    steps: Steps = 400,
+    clips: Clips = 4,
     accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches an update.")] = 2,
-    latents: Annotated[int, typer.Option("--latents", min=2, help="Latents of a clip: 12 are 45 frames, 24 are 93.")] = 12,
+    latents: Latents = 12,
     columns: Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")] = None,
-    stride: Annotated[int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")] = 24,
-    lr: Annotated[float, typer.Option("--lr", min=1e-7, help="Highest learning rate.")] = 2e-4,
+    stride: Stride = 24,
+    lr: PeakLr = 2e-4,
     ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged weights.")] = 0.99,
     source_share: Annotated[
         float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions at t = 1, the start of a rollout.")
@@ -61,40 +71,23 @@ def train_fixer_command(
         Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: as they show in pixels, or all alike.")
     ] = "amplitude",
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
+    threads: Threads = None,
+    seed: Seed = 0,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are trained.")] = "onefixer-tiny",
-    metric_weights: Annotated[
-        Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
-    ] = None,
+    metric_weights: MetricWeights = None,
 ) -> None:
     """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
-    if threads is not None:
-        torch.set_num_threads(threads)
-    chosen, console, began = variant_of(variant), Console(stderr=True), time.time()
+    use_threads(threads)
+    chosen, progress = variant_of(variant), Progress(steps)
     recipe = GeneratorRecipe(
         clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share, channels=channels
     )
     settings = onefixer_settings(fixer).model_copy(update={"window": recipe.window, "history": "finalise"})
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
     run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])
-    distance: tuple[str, Distance] | None = None
-    if any(stage.horizon for stage in chosen.stages):
-        name, measure = distance_for_training(metric_weights)
-        distance = name, measure.distance
-        console.print(f"perceptual term: {name}")
-
-    def encoded(done: int, count: int) -> None:
-        if done == count or done % 10 == 0:
-            console.print(f"clips as latents: {done}/{count} sequences, {time.time() - began:.0f} s")
-
-    def report(step: int, numbers: Mapping[str, float]) -> None:
-        if step % max(steps // 100, 1) == 0:
-            values = ", ".join(f"{key} {value:.4g}" for key, value in numbers.items())
-            left = (steps - step) * numbers["s"]
-            console.print(f"{step}/{steps} {values}; about {left / 60:.0f} min left", highlight=False)
-
-    console.print(f"wrote {train_fixer(run, out, distance, encoded, report)}")
+    distance = progress.perceptual_term(metric_weights) if any(stage.horizon for stage in chosen.stages) else None
+    encoded = partial(progress.prepared, "clips as latents, sequences")
+    progress.wrote(train_fixer(run, out, distance, encoded, progress.update))
 
 
 def memory_command(

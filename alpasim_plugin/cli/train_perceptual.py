@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -11,8 +9,8 @@ from typing import Annotated
 import cv2
 import torch
 import typer
-from rich.console import Console
 
+from alpasim_plugin.cli.training_options import Progress, Steps
 from alpasim_plugin.nets.perceptual import NAME
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.pair_store import PairDataset
@@ -26,7 +24,7 @@ EPILOG = "Example: `simrun train perceptual data/pairs --out runs/perceptual --s
 def perceptual(
     data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames and maps of its split train are learned from.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 1500,
+    steps: Steps = 1500,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and draws.")] = 0,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
 ) -> None:
@@ -36,13 +34,8 @@ def perceptual(
     task = PerceptualTask(PairDataset(data, "train").sequences, PerceptualRecipe(seed=seed))
     schedule = Schedule(steps, peak_lr=2e-3, ema=0.998, save_every=100)
     trainer = Trainer(task.module, out, schedule, task.batch, task.loss, task.facts)
-    console, began = Console(stderr=True), time.time()
-
-    def report(step: int, numbers: object) -> None:
-        if step % 50 == 0 or step == steps:
-            console.print(f"{step}/{steps} {time.time() - began:.0f} s {json.dumps(numbers)}")
-
-    trainer.run(report)
+    progress = Progress(steps, every=50)
+    trainer.run(progress.update)
     task.module.load_state_dict(trainer.averaged())
     path = out / f"{NAME}.safetensors"
     task.module.net.save(path, {"made_by": "simrun train perceptual", "steps": str(steps), "seed": str(seed)})
@@ -50,4 +43,4 @@ def perceptual(
     data_card = {"pairs": "clean frames, renders and maps of the split train", "sequences": len(task.sequences)}
     training = {"schedule": asdict(schedule), "recipe": asdict(task.recipe)}
     ModelCard(WHAT, data_card, training, rows, hours).write(path)
-    console.print(f"wrote {path}")
+    progress.wrote(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ import torch
 import typer
 from rich.console import Console
 
+from alpasim_plugin.cli.training_options import Progress, Seed, Steps
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.policy import PolicyRecipe, PolicyTask, measure
 from alpasim_plugin.training.policy_data import LessonRecipe, make_lessons, read_lessons
@@ -46,8 +46,8 @@ def policy_data(
 def policy(
     data: Annotated[Path, typer.Argument(help="Folder that 'simrun train policy-data' wrote.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
-    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates in all.")] = 4000,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")] = 0,
+    steps: Steps = 4000,
+    seed: Seed = 0,
     machine: Annotated[str, typer.Option("--machine", help="What the model card calls this machine.")] = "two CPU cores",
     threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of the arithmetic.")] = 1,
 ) -> None:
@@ -57,13 +57,8 @@ def policy(
     task = PolicyTask(net, read_lessons(data, "train"), PolicyRecipe(seed=seed))
     schedule = Schedule(steps, peak_lr=1.5e-3, warmup=min(200, steps // 10 + 1), weight_decay=0.02, ema=0.998)
     trainer = Trainer(net, out, schedule, task.batch, task.loss, task.facts)
-    console, began = Console(stderr=True), time.time()
-
-    def report(step: int, numbers: object) -> None:
-        if step % 50 == 0:
-            console.print(f"{step}/{steps} {time.time() - began:.0f} s {json.dumps(numbers)}")
-
-    trainer.run(report)
+    progress = Progress(steps, every=50)
+    trainer.run(progress.update)
     net.load_state_dict(trainer.averaged())
     net.eval()
     held_out = measure(PolicyTask(net, read_lessons(data, "val"), PolicyRecipe())) if (data / "val").is_dir() else None
@@ -71,7 +66,7 @@ def policy(
     command = f"simrun train policy {data} --out {out} --steps {steps} --seed {seed}"
     card = model_card(task, out, {"command": command, "steps": steps, "seed": seed, "machine": machine, "held_out": held_out})
     (out / CARD_FILE).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    console.print(f"wrote {out / WEIGHTS_FILE}")
+    progress.wrote(out / WEIGHTS_FILE)
 
 
 def model_card(task: PolicyTask, run: Path, facts: dict[str, Any]) -> dict[str, Any]:

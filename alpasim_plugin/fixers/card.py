@@ -38,7 +38,7 @@ class Card:
         return f"{self.settings.name}, {self.note}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything, for run.json and content keys."""
+        """Return everything, for run.json."""
         return {
             "name": self.name,
             "label": self.label,
@@ -46,6 +46,13 @@ class Card:
             "weights": dict(self.weights),
             "settings": self.settings.model_dump(mode="json"),
         }
+
+    def content(self) -> dict[str, Any]:
+        """Return what decides its pictures: weights by their digests, not by where they lie, so that a moved file keeps its rollouts."""
+        settings = self.settings.model_dump(mode="json")
+        if isinstance(self.settings, OneFixerSettings):
+            settings["weights"] = {part: self.weights[path] for part in PARTS if (path := getattr(self.settings.weights, part)) is not None}
+        return {"name": self.name, "settings": settings}
 
 
 def fixer_card(name: str, overrides: Sequence[str] = ()) -> Card:

@@ -121,7 +121,7 @@ def make_plan(
                     shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
                     shaped_by += [model] if (model := models[scene_id]) and parse_renderer(renderer).base == BASE else []
                     shaped_by += [content] if (content := contents[policy]) else []
-                    rollout_key = digest([*shaped_by, cards[renderer].as_dict()] if renderer in cards else shaped_by)
+                    rollout_key = digest([*shaped_by, cards[renderer].content()] if renderer in cards else shaped_by)
                     keys = rollout_key, score_key(rollout_key, options.preset)
                     cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], *keys))
     return RunPlan(tuple(cells), scenarios, tuple(renderers), tuple(policies), tuple(seeds), options, cards)

@@ -54,9 +54,9 @@ class Arm:
         if self.card is None and self.label not in (RAW, TRUTH):
             raise InputError("choosing what to measure", f"arm {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
 
-    def as_dict(self) -> dict[str, Any]:
+    def content(self) -> dict[str, Any]:
         """Return everything that decides its pictures."""
-        return {"label": self.label, "fixer": self.card and self.card.as_dict()}
+        return {"label": self.label, "fixer": self.card and self.card.content()}
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mappi
         device: Where the fixer computes.
         networks: Perceptual distances by name, each with what identifies its weights.
     """
-    facts = [VERSION, clip.name, len(clip.t_us), dict(clip.identity), arm.as_dict(), seed, device, dict(networks)]
+    facts = [VERSION, clip.name, len(clip.t_us), dict(clip.identity), arm.content(), seed, device, dict(networks)]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
