@@ -41,6 +41,12 @@ def plan_of(policies: tuple[str, ...] = ("lane-camera",), preset: str = "paper",
     return make_plan(refs, ("clean", "3dgs"), policies, seeds, RunOptions(preset=preset))
 
 
+def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
+    """Plan four rollouts a seed that render next to nothing: what is reused does not depend on the renderer."""
+    refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
+    return make_plan(refs, ("clean",), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
+
+
 def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Heard]:
     heard = Heard()
     return execute_run(plan, root, workers, ["simrun"], heard, resume, certificate="none"), heard
@@ -63,7 +69,7 @@ def test_one_and_two_workers_give_the_same_run(tmp_path: Path) -> None:
 
 
 def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_path: Path) -> None:
-    plan = plan_of(seeds=(0,))
+    plan = cheap_plan()
     run(plan, tmp_path)
     before = comparable(tmp_path)
     lost = tmp_path / plan.cells[1].folder / MANIFEST
@@ -74,24 +80,24 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
 
 
 def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
-    run(plan_of(seeds=(0,)), tmp_path)
+    run(cheap_plan(), tmp_path)
     with pytest.raises(InputError, match="it holds another run") as caught:
-        run(plan_of(seeds=(0, 1)), tmp_path)
+        run(cheap_plan((0, 1)), tmp_path)
     assert "--resume" in caught.value.do_this
-    result, heard = run(plan_of(seeds=(0, 1)), tmp_path, resume=True)
+    result, heard = run(cheap_plan((0, 1)), tmp_path, resume=True)
     assert heard.fates.count(("ok", True)) == 4
     assert result.n_rollouts == 8
 
 
 def test_a_failing_policy_is_a_failed_rollout_and_exit_code_4(tmp_path: Path) -> None:
     broken = "tests.runtime.broken_policies:Raises"
-    result, _ = run(plan_of(policies=("constant-velocity", broken), seeds=(0,)), tmp_path)
+    result, _ = run(plan_of(("constant-velocity", broken), seeds=(0,)), tmp_path)
     assert (result.n_rollouts, result.n_failed, result.exit_code) == (8, 4, 4)
     assert result.summary["failures"]["by_class"] == {"policy": 4}
     rows = pq.read_table(tmp_path / "rollouts.parquet").to_pylist()
     assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
     assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)
-    _, heard = run(plan_of(policies=("constant-velocity", broken), seeds=(0,)), tmp_path)
+    _, heard = run(plan_of(("constant-velocity", broken), seeds=(0,)), tmp_path)
     assert heard.fates.count(("ok", True)) == 4  # failed rollouts run again, finished ones do not
 
 
