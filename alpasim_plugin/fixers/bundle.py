@@ -17,6 +17,7 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights, read_metadata, save_weights
+from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 FORMAT = "simrun-fixer-1"
 PARTS = ("dit", "vae", "decoder", "prompt")
@@ -74,10 +75,7 @@ def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in MUST_MATCH]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
-    parts: dict[str, StateDict] = {}
-    for key, value in load_weights(path, sha256=settings.weights.sha256.bundle).items():
-        part, _, rest = key.partition(".")
-        parts.setdefault(part, {})[rest] = value
+    parts = _parts(load_weights(path, sha256=settings.weights.sha256.bundle))
     unknown, missing = sorted(set(parts) - set(PARTS)), sorted({"dit", "vae"} - set(parts))
     if unknown or missing:
         found = "; ".join([f"no {part}.*" for part in missing] + [f"unknown part {part}.*" for part in unknown])
@@ -101,6 +99,25 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
         raise InputError(DOING, str(path), found, f"give a file that save_bundle wrote ({FORMAT})")
     name = str(made_for.pop("name"))
     return name, (*_flat(made_for), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
+
+
+def load_tiny_vae(path: str | Path) -> TinyVAE:
+    """Return the tiny autoencoder in a file: a bundle's, or one that `TinyVAE.save` wrote.
+
+    Raises:
+        InputError: Neither, or a bundle with another kind of autoencoder.
+    """
+    tensors = load_weights(path)
+    return TinyVAE.from_state_dict(_parts(tensors).get("vae", tensors), source=str(path))
+
+
+def _parts(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
+    """Return tensors by what stands before the first dot of their keys, keys without it."""
+    parts: dict[str, StateDict] = {}
+    for key, value in tensors.items():
+        part, _, rest = key.partition(".")
+        parts.setdefault(part, {})[rest] = value
+    return parts
 
 
 def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:
