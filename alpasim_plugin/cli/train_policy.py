@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,18 +13,36 @@ import torch
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.training_options import Progress, Seed, Steps
+from alpasim_plugin.cli.training_options import AsJson, Debug, Progress, Seed, Steps, scene_files
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.policy import PolicyRecipe, PolicyTask, measure
-from alpasim_plugin.training.policy_data import LessonRecipe, make_lessons, read_lessons
+from alpasim_plugin.training.policy_data import LESSONS_FILE, LessonRecipe, make_lessons, read_lessons
 from alpasim_plugin.training.scenes import SPLITS
-from alpasim_plugin.training.trainer import Schedule, Trainer
+from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 from policies.learned_net import LearnedNet, save_net
 from scenarios.load import load_scenario
 
 WEIGHTS_FILE, CARD_FILE = "learned.safetensors", "learned.json"
+WHAT = "Network of the policy learned: a path and speeds from camera frames, speed and route command"
 POLICY_DATA_EPILOG = "Example: `simrun train policy-data data/scenes --out data/lessons`"
 POLICY_EPILOG = "Example: `simrun train policy data/lessons --out runs/policy --steps 4000`"
+
+
+@dataclass(frozen=True)
+class PolicyCard(ModelCard):
+    """The card of a policy's weights.
+
+    Args:
+        steps, seed: Updates, and seed of weights and draws.
+        parameters: Numbers that were learned.
+        held_out: Mean errors on the lessons of the split ``val``; None where there are none.
+    """
+
+    steps: int
+    seed: int
+    parameters: int
+    held_out: Mapping[str, float] | None
 
 
 def policy_data(
@@ -30,17 +50,26 @@ def policy_data(
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; finished scenes are kept.")],
     split: Annotated[str, typer.Option("--split", help="'train', or 'val' to measure on; never 'test'.")] = "train",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the practice drives.")] = 0,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Render practice drives off the logged paths and write down what a teacher who knows the scene does there."""
+    del debug
     if split not in SPLITS or split == "test":
         raise InputError("making lessons", f"--split {split}", "not a split to learn from", "give train or val")
-    paths = sorted((scenes / split).glob("*.yaml"), key=lambda p: int(p.stem.rsplit("_", 1)[-1]))
+    paths = scene_files(scenes, split)
     if not paths:
         raise InputError("making lessons", str(scenes / split), "no scenarios", "write some with 'simrun train scenes'")
     console = Console(stderr=True)
+    rows: list[dict[str, Any]] = []
     for i, path in enumerate(paths, start=1):
-        made = make_lessons(load_scenario(path), out / split / path.stem, LessonRecipe(), seed)
-        console.print(f"{i}/{len(paths)} {path.stem}{'' if made else ' (was there)'}")
+        folder = out / split / path.stem
+        made = make_lessons(load_scenario(path), folder, LessonRecipe(), seed)
+        rows.append({"scene": path.stem, "folder": str(folder), "made": made, "lessons": _lessons_in(folder)})
+        console.print(f"[{i}/{len(paths)}] {path.stem}{'' if made else ' (was there)'}", highlight=False, markup=False)
+    if as_json:
+        totals = {"scenes": len(rows), "made": sum(row["made"] for row in rows), "lessons": sum(row["lessons"] for row in rows)}
+        print(json.dumps({"split": split, **totals, "rows": rows}))
 
 
 def policy(
@@ -48,10 +77,12 @@ def policy(
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
     steps: Steps = 4000,
     seed: Seed = 0,
-    machine: Annotated[str, typer.Option("--machine", help="What the model card calls this machine.")] = "two CPU cores",
     threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of the arithmetic.")] = 1,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
-    """Train the network of the policy 'learned'; writes OUT/learned.safetensors (averaged, float16) and its model card."""
+    """Train the network of the policy 'learned'; writes OUT/learned.safetensors (averaged, float16) and its card, OUT/learned.json."""
+    del debug
     torch.set_num_threads(threads)
     net = LearnedNet(seed).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     task = PolicyTask(net, read_lessons(data, "train"), PolicyRecipe(seed=seed))
@@ -62,34 +93,24 @@ def policy(
     net.load_state_dict(trainer.averaged())
     net.eval()
     held_out = measure(PolicyTask(net, read_lessons(data, "val"), PolicyRecipe())) if (data / "val").is_dir() else None
-    save_net(net, out / WEIGHTS_FILE, {"made_by": "simrun train policy", "steps": str(steps), "seed": str(seed)})
-    command = f"simrun train policy {data} --out {out} --steps {steps} --seed {seed}"
-    card = model_card(task, out, {"command": command, "steps": steps, "seed": seed, "machine": machine, "held_out": held_out})
-    (out / CARD_FILE).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    progress.wrote(out / WEIGHTS_FILE)
+    path = out / WEIGHTS_FILE
+    save_net(net, path, {"made_by": "simrun train policy", "steps": str(steps), "seed": str(seed)})
+    rows, hours = curves(out / LOG_FILE)
+    training = {"schedule": asdict(schedule), "recipe": asdict(task.recipe)}
+    parameters = sum(p.numel() for p in net.parameters())
+    card = PolicyCard(WHAT, lessons_facts(task), training, rows, hours, steps, seed, parameters, held_out).write(path)
+    progress.wrote(path, as_json, card.replace(out / CARD_FILE))  # the shipped weights' card is called so as well
 
 
-def model_card(task: PolicyTask, run: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return what there is to know of the weights in a run folder."""
-    rows = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
-    families: dict[str, int] = {}
-    for lessons in task.lessons:
-        family = lessons.folder.name.rsplit("_", 1)[0]
-        families[family] = families.get(family, 0) + 1
-    tenth = max(len(rows) // 20, 1)
-    curve = [{"step": part[-1]["step"], "loss": round(sum(r["loss"] for r in part) / len(part), 4)} for part in _parts(rows, tenth)]
+def lessons_facts(task: PolicyTask) -> dict[str, Any]:
+    """Return what a policy learned from: frames, lessons, scenes by family, and whose frames they are."""
     return {
-        "name": "learned",
-        "sha256": hashlib.sha256((run / WEIGHTS_FILE).read_bytes()).hexdigest(),
-        "parameters": sum(p.numel() for p in task.net.parameters()),
-        "data": {"frames": sum(len(one.arrays["frames"]) for one in task.lessons), "lessons": int(task.ends[-1]), "scenes": families,
-                 "renderer": task.lessons[0].info["recipe"]["renderer"]},
-        "seconds": round(sum(r["s"] for r in rows)),
-        "recipe": task.facts["recipe"],
-        **facts,
-        "curve": curve,
-    }  # fmt: skip
+        "frames": sum(len(one.arrays["frames"]) for one in task.lessons),
+        "lessons": int(task.ends[-1]),
+        "scenes": dict(Counter(one.folder.name.rsplit("_", 1)[0] for one in task.lessons)),
+        "renderer": task.lessons[0].info["recipe"]["renderer"],
+    }
 
 
-def _parts(rows: list[dict[str, float]], size: int) -> list[list[dict[str, float]]]:
-    return [rows[i : i + size] for i in range(0, len(rows), size)]
+def _lessons_in(folder: Path) -> int:
+    return int(json.loads((folder / LESSONS_FILE).read_text(encoding="utf-8"))["lessons"])

@@ -1,7 +1,8 @@
-"""What the commands that train networks share: options, the perceptual term, and how they tell how far they are."""
+"""What the commands of ``simrun train`` share: options, the perceptual term, and how they tell how far they are and what they made."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,8 +12,12 @@ import torch
 import typer
 from rich.console import Console
 
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.nets.picture_distance import distance_for_training
+from alpasim_plugin.training.model_card import curves
 from alpasim_plugin.training.perceptual_term import Distance
+from alpasim_plugin.training.trainer import LOG_FILE
 
 Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; its split 'train' is learned from.")]
 RunFolder = Annotated[Path, typer.Option("--out", help="Folder of the run; the same command continues there.")]
@@ -26,12 +31,32 @@ Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws
 MetricWeights = Annotated[
     Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
 ]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
 
 def use_threads(threads: int | None) -> None:
     """Set torch's threads where a number is given."""
     if threads is not None:
         torch.set_num_threads(threads)
+
+
+def scene_files(scenes: Path, split: str) -> list[Path]:
+    """Return the scenarios of a split as 'simrun train scenes' numbered them, so that the first few are of all families."""
+    return sorted((scenes / split).glob("*.yaml"), key=lambda path: (path.stem.rsplit("_", 1)[-1], path.stem))
+
+
+def whole_numbers(option: str, text: str, least: int) -> list[int]:
+    """Return the numbers of a comma-separated option.
+
+    Raises:
+        InputError: Anything but whole numbers of at least ``least``.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) >= least for part in parts):
+        found = f"not a list of whole numbers of at least {least}"
+        raise InputError(f"reading {option}", f"{option} {text}", found, f"write for example {option} {least + 1},{least + 3}")
+    return [int(part) for part in parts]
 
 
 class Progress:
@@ -68,6 +93,21 @@ class Progress:
             left = (self.steps - step) * numbers["s"]
             self.console.print(f"{step}/{self.steps} {values}; about {left / 60:.0f} min left", highlight=False)
 
-    def wrote(self, path: Path) -> None:
-        """Name what was made."""
-        self.console.print(f"wrote {path}")
+    def wrote(self, path: Path, as_json: bool, card: Path | None = None) -> None:
+        """Name the weights that were made; with ``as_json`` one document on standard output says more of them.
+
+        Args:
+            path: The file of weights, in the folder of its run.
+            as_json: Print ``weights``, ``sha256``, ``bytes``, ``card``, ``steps``, ``hours`` and ``last``, the log's last means.
+            card: What is told about them, where that is a file; by default what `ModelCard` wrote beside them, if it did.
+        """
+        self.console.print(f"wrote {path}", highlight=False, markup=False)
+        if not as_json:
+            return
+        rows, hours = curves(path.parent / LOG_FILE)
+        card = card or path.with_suffix(".card.json")
+        facts = {
+            "weights": str(path), "sha256": file_sha256(path), "bytes": path.stat().st_size, "card": str(card) if card.exists() else None,
+            "steps": self.steps, "hours": hours, "last": rows[-1],
+        }  # fmt: skip
+        print(json.dumps(facts))
