@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,12 +21,13 @@ from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_c
 from alpasim_plugin.cli.train_policy import POLICY_DATA_EPILOG, POLICY_EPILOG, policy, policy_data
 from alpasim_plugin.cli.train_splat import EPILOG as SPLAT_EXAMPLE
 from alpasim_plugin.cli.train_splat import splat
-from alpasim_plugin.cli.training_options import Progress, RunFolder, Seed, Steps
+from alpasim_plugin.cli.training_options import AsJson, Debug, Progress, RunFolder, Seed, Steps
+from alpasim_plugin.fixers.bundle import load_tiny_vae
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clips import read_video, to_tensor
-from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.training.scenes import DEFAULT_COUNTS, write_scenes
 from alpasim_plugin.training.trainer import Schedule, Trainer
 from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
@@ -60,11 +62,17 @@ def scenes(
     split: Annotated[Literal["train", "val", "test"], typer.Option("--split", help="Which split.")] = "train",
     count: Annotated[int | None, typer.Option("--count", min=1, help="Scenes; by default 120, 20 and 60.")] = None,
     duration_s: Annotated[float, typer.Option("--duration-s", min=1.0, help="Length of every drive.")] = 9.9,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Draw scenarios; those of the test split come from other families of roads and traffic."""
-    console = Console(stderr=True)
+    del debug
+    console, paths = Console(stderr=True), []
     for path in write_scenes(out, split, count or DEFAULT_COUNTS[split], duration_s):
-        console.print(str(path))
+        paths.append(str(path))
+        console.print(str(path), highlight=False, markup=False)
+    if as_json:
+        print(json.dumps({"split": split, "scenes": len(paths), "paths": paths}))
 
 
 @app.command("vae", epilog="Example: `simrun train vae data/pairs --video drive.mp4 --out runs/vae --steps 4000`")
@@ -75,11 +83,14 @@ def vae(
     video_share: Annotated[float, typer.Option("--video-share", min=0.1, max=1.0, help="Only the first share of every video.")] = 1.0,
     steps: Steps = 4000,
     seed: Seed = 0,
-    init: Annotated[Path | None, typer.Option("--init", help="Weights to start from.")] = None,
+    init: Annotated[Path | None, typer.Option("--init", help="Weights to start from: an autoencoder, or a fixer's bundle.")] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose autoencoder sizes are trained.")] = "onefixer-tiny",
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Train the tiny video autoencoder; writes OUT/vae.safetensors with averaged weights and measured latent statistics."""
-    model = TinyVAE.load(init).requires_grad_(True) if init else TinyVAE.random(TinySizes(*onefixer_settings(fixer).vae.widths), seed)
+    del debug
+    model = load_tiny_vae(init).requires_grad_(True) if init else TinyVAE.random(TinySizes(*onefixer_settings(fixer).vae.widths), seed)
     dataset = PairDataset(data, "train")
     videos = [read_video(path, WIDTH, HEIGHT, 0.0, video_share) for path in video or ()]
     task = VaeTask(model, dataset.sequences, videos, VaeRecipe(seed=seed, video_clips=1 if videos else 0))
@@ -91,28 +102,40 @@ def vae(
     mean, std = measure_stats(model, clips)
     model.stats = LatentStats((mean * model.stats.std + model.stats.mean).tolist(), (std * model.stats.std).tolist(), stored=True)
     model.save(out / "vae.safetensors", {"made_by": "simrun train vae", "steps": str(steps), "seed": str(seed)})
-    progress.wrote(out / "vae.safetensors")
+    progress.wrote(out / "vae.safetensors", as_json)
 
 
 @app.command("vae-quality", epilog="Example: `simrun train vae-quality runs/vae/vae.safetensors data/pairs --split val --video drive.mp4`")
 def vae_quality(
-    weights: Annotated[str, typer.Argument(help="Weights, or 'untrained'.")],
+    weights: Annotated[str, typer.Argument(help="Weights of an autoencoder, a fixer's bundle, or 'untrained'.")],
     data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "val",
     video: Annotated[list[Path] | None, typer.Option("--video", help="Driving video to measure on as well. Repeatable.")] = None,
     first_share: Annotated[float, typer.Option("--first-share", min=0.0, max=0.9, help="Skip this share of every video.")] = 0.0,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
-    """Measure a tiny autoencoder on held-out frames; prints one JSON document."""
-    model = TinyVAE.random() if weights == "untrained" else TinyVAE.load(weights)
-    rows: list[dict[str, object]] = []
-    for sequence in PairDataset(data, split).sequences:
-        clip = sequence.clip
-        gt, render = to_tensor(clip.rgb_gt)[None], to_tensor(clip.rgb_input)[None]
-        opacity = (to_tensor(clip.opacity[..., None])[None] + 1) / 2
-        rows.append({"clip": sequence.name, "from": "latent", **asdict(quality(round_trip(model, gt), gt))})
-        rows.append({"clip": sequence.name, "from": "latent and render", **asdict(quality(round_trip(model, gt, render, opacity), gt))})
-        rows.append({"clip": sequence.name, "from": "render alone", **asdict(quality(render, gt))})
-    for path in video or ():
-        gt = to_tensor(read_video(path, WIDTH, HEIGHT, first_share))[None]
-        rows.append({"clip": path.stem, "from": "latent", **asdict(quality(round_trip(model, gt), gt))})
+    """Measure a tiny autoencoder on held-out frames; prints one JSON document, with or without --json."""
+    del as_json, debug
+    model = TinyVAE.random() if weights == "untrained" else load_tiny_vae(weights)
+    console, rows = Console(stderr=True), []
+    clips = [partial(_pair_qualities, model, sequence) for sequence in PairDataset(data, split).sequences]
+    clips += [partial(_video_qualities, model, path, first_share) for path in video or ()]
+    for number, clip in enumerate(clips, start=1):
+        found = clip()
+        rows += found
+        console.print(f"[{number}/{len(clips)}] {found[0]['clip']}: {found[0]['psnr_db']:.2f} dB", highlight=False, markup=False)
     print(json.dumps({"weights": weights, "split": split, "rows": rows}, indent=1))
+
+
+def _pair_qualities(model: TinyVAE, sequence: PairSequence) -> list[dict[str, object]]:
+    clip = sequence.clip
+    gt, render = to_tensor(clip.rgb_gt)[None], to_tensor(clip.rgb_input)[None]
+    opacity = (to_tensor(clip.opacity[..., None])[None] + 1) / 2
+    made = {"latent": round_trip(model, gt), "latent and render": round_trip(model, gt, render, opacity), "render alone": render}
+    return [{"clip": sequence.name, "from": name, **asdict(quality(video, gt))} for name, video in made.items()]
+
+
+def _video_qualities(model: TinyVAE, path: Path, first_share: float) -> list[dict[str, object]]:
+    gt = to_tensor(read_video(path, WIDTH, HEIGHT, first_share))[None]
+    return [{"clip": path.stem, "from": "latent", **asdict(quality(round_trip(model, gt), gt))}]

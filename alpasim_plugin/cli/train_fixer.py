@@ -12,7 +12,9 @@ import torch
 import typer
 
 from alpasim_plugin.cli.training_options import (
+    AsJson,
     Clips,
+    Debug,
     Latents,
     MetricWeights,
     Pairs,
@@ -24,6 +26,7 @@ from alpasim_plugin.cli.training_options import (
     Stride,
     Threads,
     use_threads,
+    whole_numbers,
 )
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
@@ -75,8 +78,11 @@ def train_fixer_command(
     seed: Seed = 0,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are trained.")] = "onefixer-tiny",
     metric_weights: MetricWeights = None,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
+    del debug
     use_threads(threads)
     chosen, progress = variant_of(variant), Progress(steps)
     recipe = GeneratorRecipe(
@@ -87,7 +93,7 @@ def train_fixer_command(
     run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])
     distance = progress.perceptual_term(metric_weights) if any(stage.horizon for stage in chosen.stages) else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
-    progress.wrote(train_fixer(run, out, distance, encoded, progress.update))
+    progress.wrote(train_fixer(run, out, distance, encoded, progress.update), as_json)
 
 
 def memory_command(
@@ -97,9 +103,11 @@ def memory_command(
     columns: Annotated[int, typer.Option("--columns", min=2, help="Width in latents.")] = 32,
     rows: Annotated[int, typer.Option("--rows", min=2, help="Height in latents.")] = 18,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are measured.")] = "onefixer-tiny",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Measure the peak memory and the time of one training sample over clip length and horizon, each in a process of its own."""
-    counts, horizons = ([int(x) for x in text.split(",")] for text in (latents, horizon))
+    del debug
+    counts, horizons = whole_numbers("--latents", latents, 2), whole_numbers("--horizon", horizon, 0)
     cells = measure_memory(onefixer_settings(fixer), counts, horizons, clips, rows, columns)
     print(json.dumps([cell._asdict() for cell in cells], indent=1) if as_json else memory_table(cells))

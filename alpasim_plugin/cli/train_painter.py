@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli.training_options import (
+    AsJson,
     Clips,
+    Debug,
     Latents,
     MetricWeights,
     Pairs,
@@ -45,12 +47,16 @@ def painter(
     threads: Threads = None,
     seed: Seed = 0,
     metric_weights: MetricWeights = None,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Train the decoder on the generator's own rollouts; generator and encoder stay. Writes OUT/fixer.safetensors and its card."""
+    del debug
     use_threads(threads)
     progress = Progress(steps)
     distance = progress.perceptual_term(metric_weights) if perceptual else None
     recipe = PainterRecipe(clips, rows, columns, perceptual_weight=perceptual, seed=seed)
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=0.99, save_every=max(steps // 20, 5))
     prepared = partial(progress.prepared, every=50)
-    progress.wrote(train_painter(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update))
+    path = train_painter(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update)
+    progress.wrote(path, as_json)

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli.jobs import spread
+from alpasim_plugin.cli.training_options import AsJson, Debug, scene_files
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.cache import cache_root
 from alpasim_plugin.renderers.reconstruction import KIND, ensure
@@ -40,8 +41,8 @@ def reconstructions(
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
     jobs: Jobs = 1,
     again: Annotated[bool, typer.Option("--again", help="Fit those that are there as well.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Fit the reconstructions that the renderer 3dgs shows of scenarios, so that no run has to wait for them."""
     del debug
@@ -83,22 +84,26 @@ def pairs(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the degradation and of the path beside the log.")] = 0,
     count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first so many scenes of each split.")] = None,
     jobs: Jobs = 1,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Render pairs of damaged and clean frames with opacity, semantic map and poses; finished sequences are kept."""
     del debug
     work: list[_Scene] = []
     for name in (s.strip() for s in split.split(",")):
-        files = sorted((scenes / name).glob("*.yaml"), key=lambda p: p.stem.rsplit("_", 1)[-1])[:count]
-        work += [_Scene(path, name) for path in files]
+        work += [_Scene(path, name) for path in scene_files(scenes, name)[:count]]
     if not work:
         raise InputError("making training pairs", str(scenes), f"no scenario in {split}", "make some with 'simrun train scenes'")
     console, began = Console(stderr=True), time.perf_counter()
     maker = _Maker(out, PairRecipe(source=source, degradation=degradation, wander_m=wander_m), seed)
+    rows = []
     for number, (scene, made) in enumerate(spread(maker, work, jobs), start=1):
+        rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})
         note = "" if made else " (was there)"
         line = f"[{number}/{len(work)}] {scene.split}/{scene.path.stem}{note}, {time.perf_counter() - began:.0f} s"
         console.print(line, highlight=False, markup=False)
+    if as_json:
+        print(json.dumps({"sequences": len(rows), "made": sum(bool(row["made"]) for row in rows), "rows": rows}))
 
 
 @dataclass(frozen=True)
@@ -113,20 +118,23 @@ class _Maker:
     recipe: PairRecipe
     seed: int
 
+    def folder(self, scene: _Scene) -> Path:
+        return self.out / scene.split / scene.path.stem
+
     def __call__(self, scene: _Scene) -> bool:
         family = scene.path.stem.rsplit("_", 1)[0]
-        folder = self.out / scene.split / scene.path.stem
-        return make_sequence(load_scenario(scene.path), folder, self.recipe, self.seed, split=scene.split, family=family)
+        return make_sequence(load_scenario(scene.path), self.folder(scene), self.recipe, self.seed, split=scene.split, family=family)
 
 
 def pairs_sheet(
     data: Annotated[Path, typer.Argument(help="Folder of pairs: SPLIT/SEQUENCE.")],
     out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.md and sheet.jpg; none writes neither.")] = None,
     split: Annotated[str | None, typer.Option("--split", help="Splits, comma-separated; by default all there are.")] = None,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
-    """Measure pairs: counts, error, holes, light and map, and a picture of some; prints one JSON document."""
-    del debug
+    """Measure pairs: counts, error, holes, light and map, and a picture of some; prints one JSON document, with or without --json."""
+    del as_json, debug
     names = [s.strip() for s in split.split(",")] if split else sorted(p.name for p in data.glob("*") if any(p.glob("*/sequence.json")))
     if not names:
         raise InputError("measuring pairs", str(data), "no finished sequence", "make some with 'simrun train pairs'")
@@ -149,7 +157,8 @@ def import_pairs(
     split: Annotated[str, typer.Option("--split", help="train, val or test.")] = "train",
     fps: Annotated[float, typer.Option("--fps", help="Frames per second, where the poses carry no times.")] = 10.0,
     size: Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Scale all pictures to this size.")] = None,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Turn renders of your own reconstruction into a sequence of pairs, as long as its shortest channel."""
     del debug
@@ -157,8 +166,11 @@ def import_pairs(
         asked = f"--split {split} --name {name}"
         raise InputError("importing training pairs", asked, "no place for a sequence", "give train, val or test, and a plain name")
     sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)
-    frames = import_sequence(sources, out / split / name, fps=fps, size=_size(size), facts={"split": split})
-    Console(stderr=True).print(f"{out / split / name}: {frames} frames", highlight=False, markup=False)
+    folder = out / split / name
+    frames = import_sequence(sources, folder, fps=fps, size=_size(size), facts={"split": split})
+    Console(stderr=True).print(f"{folder}: {frames} frames", highlight=False, markup=False)
+    if as_json:
+        print(json.dumps({"folder": str(folder), "split": split, "frames": frames}))
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -10,7 +10,7 @@ import cv2
 import torch
 import typer
 
-from alpasim_plugin.cli.training_options import Progress, Steps
+from alpasim_plugin.cli.training_options import AsJson, Debug, Progress, Steps
 from alpasim_plugin.nets.perceptual import NAME
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.pair_store import PairDataset
@@ -27,8 +27,11 @@ def perceptual(
     steps: Steps = 1500,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and draws.")] = 0,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Train the feature network of the perceptual distance; writes OUT/perceptual-syn.safetensors with averaged weights, float16."""
+    del debug
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
     task = PerceptualTask(PairDataset(data, "train").sequences, PerceptualRecipe(seed=seed))
@@ -43,4 +46,4 @@ def perceptual(
     data_card = {"pairs": "clean frames, renders and maps of the split train", "sequences": len(task.sequences)}
     training = {"schedule": asdict(schedule), "recipe": asdict(task.recipe)}
     ModelCard(WHAT, data_card, training, rows, hours).write(path)
-    progress.wrote(path)
+    progress.wrote(path, as_json)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import typer
 
+from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.perceptual import load_perceptual
 from alpasim_plugin.nets.picture_distance import PictureDistance, load_distance
@@ -20,7 +21,7 @@ from alpasim_plugin.types import F32, F64, U8
 from evaluators.video import ssim
 from evaluators.video.perceptual import picture_distances
 
-CHECK_EPILOG = "Example: `simrun train perceptual-check perceptual-syn data/pairs --split val --examples ../shared/data/lpips`"
+CHECK_EPILOG = "Example: `simrun train perceptual-check perceptual-syn data/pairs --split val --examples DATA/lpips`"
 EXAMPLES = ("ex_ref", "ex_p0", "ex_p1")
 
 
@@ -31,8 +32,11 @@ def perceptual_check(
     frames: Annotated[int, typer.Option("--frames", min=1, help="Clean frames, evenly from all sequences.")] = 12,
     examples: Annotated[Path | None, typer.Option("--examples", help="Folder with LPIPS's ex_ref.png, ex_p0.png, ex_p1.png.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the damage.")] = 0,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
-    """Measure a distance on damaged frames; prints one JSON document."""
+    """Measure a distance on damaged frames; prints one JSON document, with or without --json."""
+    del as_json, debug
     torch.set_num_threads(1)
     distance = named_distance(name)
     sequences = PairDataset(data, split).sequences

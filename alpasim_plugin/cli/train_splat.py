@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.degrade import log_actors
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
@@ -49,12 +50,15 @@ def splat(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of start, order and splits.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="cuda needs gsplat.")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print metrics.json on stdout.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Fit 3D Gaussians to posed views of a scenario: background, actors as rigid nodes, sky.
 
     Writes background.ply, actors/*.ply, sky.png, reconstruction.json, metrics.json and pictures of held-out views (truth left).
+    --json prints metrics.json.
     """
+    del debug
     # Tensors here are small: threads of torch gain little and, where other work shares the cores, wait for each other most of the time.
     torch.set_num_threads(1)
     chosen = _recipe(recipe, steps, gaussians, views, width, seed)
