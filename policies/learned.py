@@ -36,7 +36,8 @@ class Learned:
 
     Args:
         scenario: Gives the camera, the scene's id for the random streams, and nothing else.
-        weights: File that ``simrun train policy`` wrote; None takes the shipped ones.
+        weights: File that ``simrun train policy`` wrote; None takes the class's ``loads``. In runs, name a subclass whose
+            ``loads`` is the file: a rollout's content key holds that file's digest.
         temperature: Scale of the network's own standard deviations when a plan is drawn; 0 drives the mean.
 
     Raises:
@@ -53,7 +54,7 @@ class Learned:
         self.camera = front_camera(scenario, "learned")
         self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
         self.scene_id, self.temperature = scenario.scene_id, float(temperature)
-        self.net = load_net(WEIGHTS if weights is None else Path(weights))
+        self.net = load_net(type(self).loads if weights is None else Path(weights))
         self.grid_m, self.weights = path_grid(), knot_weights()
         self.reset(0, scenario.route)
 

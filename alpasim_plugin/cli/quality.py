@@ -29,7 +29,7 @@ from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistanc
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.quality import RAW, Arm, QualityClip, measure, roll, row_key
 from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
-from alpasim_plugin.training.pair_store import SEQUENCE_FILE, PairDataset, PairSequence
+from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
 from evaluators.video.charts import plot_by_frame, plot_speed
 from evaluators.video.sheet import sheet
 from evaluators.video.summary import TRUTH, summarise
@@ -72,7 +72,7 @@ class Work:
 
 
 def quality(
-    data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/training.md).")],
+    data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/pairs.md).")],
     out: Annotated[Path, typer.Option("--out", help="Folder for results; the same command continues there.")],
     fixers: Annotated[str, typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE.")] = "3dgs",
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test",
@@ -197,8 +197,7 @@ def finish(work: Work) -> dict[str, Any]:
 def quality_clip(sequence: PairSequence) -> QualityClip:
     """Return a sequence of pairs as a clip to measure on."""
     clip = sequence.clip
-    written = (sequence.folder / SEQUENCE_FILE).stat().st_mtime_ns  # a sequence made again is another one, whatever it says of itself
-    facts = {**sequence.info, "written_ns": written}
+    facts = {**sequence.info, CONTENT: sequence.content}  # a sequence made again is another one, whatever it says of itself
     return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
 
 

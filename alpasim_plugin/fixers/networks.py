@@ -61,6 +61,24 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
     return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
 
 
+def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, source: str) -> CosmosCausalDiT:
+    """Build a transformer that blocks can be streamed through.
+
+    Args:
+        weights: State dict.
+        settings: Give the stretch of its rotary embedding.
+        source: Where the weights come from, for errors.
+
+    Raises:
+        InputError: Weights that do not fit together, or whose conditions are not those that streaming gives.
+    """
+    net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
+    if net.sizes.map_channels != LATENT:
+        found = f"its map input has {net.sizes.map_channels} channels, streaming gives {LATENT} (variant V6 takes the render there)"
+        raise InputError(DOING, source, found, "train a variant that starts from the render, for example V9")
+    return net
+
+
 @lru_cache(maxsize=4)
 def _load(settings: OneFixerSettings, device: str) -> Networks:
     parts, precision = _Parts(settings), settings.precision
@@ -104,7 +122,7 @@ class _Parts:
             self.made_up("dit")
             sizes = DiTSizes(**settings.dit.model_dump())
             given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
-        return CosmosCausalDiT.from_state_dict(given[0], settings.rope_ratios, source=given[1])
+        return streaming_dit(given[0], settings, given[1])
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
         """Return the prompt's features ``(1, tokens, text_width)``; a single zero token where none is given and none was learned."""

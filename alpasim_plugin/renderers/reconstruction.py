@@ -41,8 +41,8 @@ class ReconstructionRenderer:
         stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
-        self.scenario, self.seed, self.threads = scenario, seed, threads
+    def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
+        self.scenario, self.threads = scenario, threads
         self.backend = backend_of(device)
         self.model = model_of(scenario, threads)
         self.stats: Mapping[str, int] = {}
@@ -63,7 +63,7 @@ def _3dgs(scenario: Scenario, seed: int, device: str, threads: int | None) -> Re
         return CleanRenderer(scenario, seed, device, threads)
     if amount.kind == "surrogate":
         return SurrogateRenderer(scenario, seed, device, threads)
-    return ReconstructionRenderer(scenario, seed, device, threads)
+    return ReconstructionRenderer(scenario, device, threads)
 
 
 def model_of(scenario: Scenario, threads: int | None = None) -> Model:

@@ -64,15 +64,6 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
     return Reconstruction.load(folder), _read_sky_views(folder / SKY_VIEWS)
 
 
-def model_hash(folder: Path) -> str:
-    """Return one hash of all files of a reconstruction, as they were written.
-
-    Raises:
-        OSError: It is not there.
-    """
-    return _hash(folder / HASHES)
-
-
 def _read_sky_views(path: Path) -> list[SkyView]:
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -1,11 +1,11 @@
 """Training clips as latents, encoded once and kept on disk: the autoencoder is frozen.
 
-    FOLDER/DIGEST/SEQUENCE-INFO.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
+    FOLDER/DIGEST/SEQUENCE-CONTENT.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
 
 Clips of a sequence start ``stride`` frames apart, once as they are and once mirrored, with another class's colours on the map's cars (see
 `map_colours`). Each is encoded from its own first frame on, as a
-rollout that starts there would be. DIGEST covers the autoencoder's weights and the form of the clips, INFO what
-the sequence says of itself.
+rollout that starts there would be. DIGEST covers the autoencoder's weights and the form of the clips, CONTENT the
+sequence's arrays.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.clips import to_tensor
 from alpasim_plugin.training.map_colours import OTHERS, recolour_boxes
-from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.training.whole import save_array
 
 F16 = npt.NDArray[np.float16]
@@ -93,6 +93,9 @@ class LatentClips:
         folder: Keeps the latents; what is there already is read.
         report: Called with the number of sequences done and in all.
 
+    Attributes:
+        digest: Of everything the latents depend on: autoencoder, form, and the sequences in their order.
+
     Raises:
         InputError: No sequence, or one that is too short for a clip.
     """
@@ -107,8 +110,9 @@ class LatentClips:
     ) -> None:
         if not sequences:
             raise InputError(DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first")
-        self.form, self.digest = form, digest(vae, form)
-        self._folder = folder / self.digest
+        encoder = digest(vae, form)
+        self.form, self.digest = form, f"{encoder}-{pairs_digest(sequences)}"
+        self._folder = folder / encoder
         self._folder.mkdir(parents=True, exist_ok=True)
         self._where: list[tuple[PairSequence, F16, int]] = []
         for done, sequence in enumerate(sequences):
@@ -127,8 +131,7 @@ class LatentClips:
         return LatentClip(z_r, z_0, z_map, z[3 * CHANNELS :], sequence, i // 2 * self.form.stride, bool(i % 2))
 
     def _latents(self, sequence: PairSequence, vae: TinyVAE) -> F16:
-        info = hashlib.blake2b(json.dumps(sequence.info, sort_keys=True).encode(), digest_size=4).hexdigest()
-        path = self._folder / f"{sequence.name}-{info}.npy"
+        path = self._folder / f"{sequence.name}-{sequence.content[:12]}.npy"
         if not path.exists():
             save_array(path, encode_sequence(sequence, vae, self.form))
         return np.asarray(np.load(path, mmap_mode="r"))

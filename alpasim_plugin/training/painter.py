@@ -56,7 +56,7 @@ class Rollouts:
     Args:
         clips: Training clips.
         net: Frozen generator.
-        block_latents, window: As at deployment.
+        block_latents, window, use_map: As at deployment.
         folder: Keeps them; what is there already is read.
         report: Called with the number of clips done and in all.
     """
@@ -67,11 +67,12 @@ class Rollouts:
         net: CosmosCausalDiT,
         block_latents: int,
         window: int,
+        use_map: bool,
         folder: Path,
         report: Callable[[int, int], None] | None = None,
     ) -> None:
         self.clips = clips
-        self.digest = _digest(net.state_dict(), clips, block_latents, window)
+        self.digest = _digest(net.state_dict(), clips, f"{block_latents} {window} {use_map}")
         self._folder = folder / self.digest
         self._folder.mkdir(parents=True, exist_ok=True)
         text = torch.zeros(1, 1, net.sizes.text_width)
@@ -85,7 +86,7 @@ class Rollouts:
                     for what in ("eps", "context")
                 )
                 z_r, m, z_map = (z[None] for z in (clip.z_r, clip.m, clip.z_map))
-                z = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=block_latents, window=window)
+                z = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=block_latents, window=window, use_map=use_map)
                 save_array(path, z[0].half().numpy())
             if report is not None:
                 report(index + 1, len(clips))
@@ -183,8 +184,8 @@ def psnr_db(made: Tensor, wanted: Tensor) -> float:
     return float(-10 * torch.log10(error.clamp_min(1e-12)))
 
 
-def _digest(weights: Mapping[str, Tensor], clips: LatentClips, block_latents: int, window: int) -> str:
-    out = hashlib.blake2b(f"{clips.digest} {len(clips)} {block_latents} {window}".encode(), digest_size=8)
+def _digest(weights: Mapping[str, Tensor], clips: LatentClips, deployed: str) -> str:
+    out = hashlib.blake2b(f"{clips.digest} {deployed}".encode(), digest_size=8)
     for key, value in sorted(weights.items()):
         out.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return out.hexdigest()

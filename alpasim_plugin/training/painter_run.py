@@ -12,8 +12,9 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
+from alpasim_plugin.fixers.networks import streaming_dit
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
+from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, read_metadata
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE, DIT_PREFIX, half
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
@@ -60,13 +61,13 @@ def train_painter(
         for prefix in (DIT_PREFIX, VAE_PREFIX)
     }
     vae = TinyVAE.from_state_dict(parts[VAE_PREFIX], source=str(bundle))
-    net = CosmosCausalDiT.from_state_dict(parts[DIT_PREFIX], settings.rope_ratios, source=str(bundle)).requires_grad_(False)
+    net = streaming_dit(parts[DIT_PREFIX], settings, str(bundle)).requires_grad_(False)
 
     def tell(what: str) -> Callable[[int, int], None] | None:
         return None if prepared is None else lambda done, count: prepared(what, done, count)
 
     clips = LatentClips(PairDataset(data, "train").sequences, vae, form, out.parent / "latents", tell("latents"))
-    rollouts = Rollouts(clips, net, settings.block_latents, settings.window, out.parent / "rollouts", tell("rollouts"))
+    rollouts = Rollouts(clips, net, settings.block_latents, settings.window, settings.uses_map, out.parent / "rollouts", tell("rollouts"))
     task = PainterTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
@@ -101,6 +102,11 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
             ("its generator has no history", settings.history == "none"),
             ("its decoder does not see the render", settings.decoder.kind != "render"),
             (f"its autoencoder is {settings.vae.kind}", settings.vae.kind != "tiny"),
+            # The rollouts are made in one step on a finalised history from Eq. 1's source.
+            (f"its history is {settings.history}", settings.history == "last-forward"),
+            (f"it takes {len(settings.steps)} steps", len(settings.steps) != 1),
+            (f"it keeps a sink of {settings.sink}", settings.sink != 0),
+            ("its source holds the render where that is transparent", settings.holes != "noise"),
         )
         if wrong
     ]

@@ -102,9 +102,11 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
         raise InputError(DOING, str(path), f"an array of shape {T.shape}", "give one 4 x 4 matrix a frame")
     off = np.abs(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     bad = ~np.isfinite(T).all(axis=(1, 2)) | ~(off < ORTHONORMAL) | (np.linalg.det(np.nan_to_num(T[:, :3, :3])) < 0)
+    with np.errstate(invalid="ignore"):
+        bad |= ~(np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ORTHONORMAL)  # a transposed pose has its translation there
     if bad.any():
         found = f"pose {int(np.argmax(bad))} is no rotation and translation"
-        raise InputError(DOING, str(path), found, "give T_world_camera, metres, OpenCV axes")
+        raise InputError(DOING, str(path), found, "give T_world_camera (columns are axes, the last one the place), metres, OpenCV axes")
     if times is None:
         times = [round(i / fps * 1e6) for i in range(len(T))]
     if any(b <= a for a, b in pairwise(times)):

@@ -110,6 +110,7 @@ def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
         "sequences": len(facts),
         "frames": sum(f.frames for f in facts),
         "with_moving_actors": sum(bool(f.moving_actors) for f in facts),
+        "not_known_whether_actors_move": sum(f.moving_actors is None for f in facts),
         "families": dict(sorted(Counter(f.family for f in facts).items())),
         "degradations": dict(sorted(Counter(f.degradation for f in facts).items())),
         "psnr_db": {"mean": _mean(values), "p05": _at(values, 5), "p50": _at(values, 50), "p95": _at(values, 95)},
@@ -127,7 +128,7 @@ def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
 def markdown(document: Mapping[str, Any]) -> str:
     """Return the statistics as two Markdown tables: by split, and how many frames are how bad."""
     columns = {**document["splits"], "all": document["all"]}
-    counted = ("sequences", "frames", "with_moving_actors")
+    counted = ("sequences", "frames", "with_moving_actors", "not_known_whether_actors_move")
     rows = [[name.replace("_", " "), *(f"{c[name]:,}" for c in columns.values())] for name in counted]
     for name in ("families", "degradations"):
         rows += [[name, *(", ".join(f"{k} {v}" for k, v in c[name].items()) for c in columns.values())]]

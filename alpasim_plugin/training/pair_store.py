@@ -13,8 +13,9 @@ Channels may differ in length; a sequence is as long as its shortest one.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,7 @@ from alpasim_plugin.training.whole import whole_folder
 from alpasim_plugin.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"
+CONTENT = "content"
 READING = "reading training pairs"
 
 
@@ -94,6 +96,11 @@ class PairSequence:
         return self.folder.name
 
     @cached_property
+    def content(self) -> str:
+        """Digest of its arrays: two sequences are the same data only if this is equal, whatever they say of themselves."""
+        return str(self.info.get(CONTENT) or _content(self.folder))
+
+    @cached_property
     def clip(self) -> PairClip:
         """All frames that every channel has, as memory maps."""
         arrays = {name: self._open(name) for name in CHANNELS}
@@ -115,7 +122,7 @@ class PairSequence:
             raise InputError(READING, str(path), str(error), "give a whole .npy file of this channel") from error
         if array.ndim != axes or array.dtype != np.dtype(dtype):
             found = f"{array.dtype} with {array.ndim} axes"
-            raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/training.md)")
+            raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/pairs.md)")
         return array
 
 
@@ -143,6 +150,11 @@ class PairDataset:
         return len(self.sequences)
 
 
+def pairs_digest(sequences: Sequence[PairSequence]) -> str:
+    """Return what identifies some sequences as training data: their names and what is in their arrays, in order."""
+    return hashlib.blake2b("\n".join(f"{s.name} {s.content}" for s in sequences).encode(), digest_size=8).hexdigest()
+
+
 def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapping[str, Any]) -> None:
     """Write a sequence; it appears under its name only once complete.
 
@@ -158,8 +170,19 @@ def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapp
     """
     with whole_folder(folder, "writing training pairs") as partial:
         count = _write_arrays(partial, frames, length)
-        document = {**info, "frames": count}
+        document = {**info, "frames": count, CONTENT: _content(partial)}
         (partial / SEQUENCE_FILE).write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
+
+
+def _content(folder: Path) -> str:
+    out = hashlib.blake2b(digest_size=16)
+    for name in CHANNELS:
+        try:
+            with (folder / f"{name}.npy").open("rb") as file:
+                out.update(hashlib.file_digest(file, "sha256").digest())
+        except OSError as error:
+            raise InputError(READING, str(folder / f"{name}.npy"), str(error), "give a whole .npy file of this channel") from error
+    return out.hexdigest()
 
 
 def _write_arrays(folder: Path, frames: Iterable[Pair], length: int) -> int:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from alpasim_plugin.nets.perceptual import FeatureNet, PerceptualDistance
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.distortions import Distortion, draw_distortion
-from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.training.perceptual_targets import target_distance
 from alpasim_plugin.training.semantics import CLASSES, class_masks
 from alpasim_plugin.training.trainer import Loss
@@ -111,7 +111,7 @@ class PerceptualTask:
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the training data and recipe."""
-        return {"sequences": [s.name for s in self.sequences], "recipe": asdict(self.recipe)}
+        return {"sequences": [s.name for s in self.sequences], "pairs": pairs_digest(self.sequences), "recipe": asdict(self.recipe)}
 
     def batch(self, index: int) -> PerceptualBatch:
         """Make batch ``index``."""

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.policy_data import Lessons
+from alpasim_plugin.training.policy_data import Lessons, lessons_digest
 from alpasim_plugin.training.policy_expert import SIGHT_M
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import U8
@@ -70,7 +70,12 @@ class PolicyTask:
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the training data and recipe."""
-        return {"scenes": [one.folder.name for one in self.lessons], "lessons": int(self.ends[-1]), "recipe": asdict(self.recipe)}
+        return {
+            "scenes": [one.folder.name for one in self.lessons],
+            "lessons": int(self.ends[-1]),
+            "data": lessons_digest(self.lessons),
+            "recipe": asdict(self.recipe),
+        }
 
     def batch(self, index: int) -> PolicyBatch:
         """Make batch ``index``."""

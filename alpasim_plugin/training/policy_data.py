@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -24,6 +25,7 @@ from policies.lane_camera import front_camera
 from policies.learned_command import COMMANDS, route_command
 
 LESSONS_FILE = "lessons.json"
+LESSONS_VERSION = 2  # 1 drew all drives of a scene from one stream
 READING = "reading lessons for the learned policy"
 WIDE_PX, TOP_ROW = 352, 30  # frames are rendered wider than the policy looks, so that it can be turned; without most of the sky
 MAX_TURN_RAD = np.deg2rad(8.5)
@@ -84,6 +86,7 @@ def make_lessons(scenario: Scenario, folder: Path, recipe: LessonRecipe, seed: i
         InfrastructureError: The disk refuses.
     """
     info = {"scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "recipe": asdict(recipe)}
+    info["version"] = LESSONS_VERSION
     path = folder / LESSONS_FILE
     if path.exists() and {k: v for k, v in json.loads(path.read_text(encoding="utf-8")).items() if k in info} == info:
         return False
@@ -98,10 +101,10 @@ def make_lessons(scenario: Scenario, folder: Path, recipe: LessonRecipe, seed: i
 
 
 def _lessons(scenario: Scenario, camera: CameraSpec, recipe: LessonRecipe, seed: int, threads: int) -> dict[str, Any]:
-    random = stream(scenario.scene_id, seed, "training.policy")
+    random = stream(scenario.scene_id, seed, "training.policy.lessons")
     renderer = make_renderer(recipe.renderer, scenario, seed=seed, threads=threads)
     rows: dict[str, list[Any]] = {name: [] for name in _FORMS}
-    for practice in practice_drives(scenario, recipe.drives, recipe.drive_s, random):
+    for practice in practice_drives(scenario, recipe.drives, recipe.drive_s, seed):
         last: tuple[int, Moment] | None = None
         for moment in practice.moments:
             if not moment.free:
@@ -186,6 +189,11 @@ class Lessons:
                 found = f"{out[name].dtype} with {out[name].ndim} axes"
                 raise InputError(READING, str(path), found, f"{dtype} with {axes} axes is needed: make the lessons again")
         return out
+
+
+def lessons_digest(lessons: Sequence[Lessons]) -> str:
+    """Return what identifies some lessons as training data: scene, seed and recipe of each, in order."""
+    return hashlib.blake2b(json.dumps([one.info for one in lessons], sort_keys=True).encode(), digest_size=8).hexdigest()
 
 
 def read_lessons(root: Path, split: str) -> Sequence[Lessons]:

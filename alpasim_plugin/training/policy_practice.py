@@ -1,6 +1,6 @@
 """Practice drives for the learned policy: where the car is, how it got there, and who is around, off the logged path and its timing.
 
-Everything is drawn by streams of their own (scene, seed, "training.policy", drive).
+Every drive has a stream of its own (scene, seed, "training.policy.drive", number): what is done with one leaves the others as they were.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import numpy as np
 
 from alpasim_plugin.gaussians.degrade import log_actors
 from alpasim_plugin.geometry import se3, yaw_of
+from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.policy_expert import STEP_S, Habit, Line, acceleration, advance, leader_on
 from alpasim_plugin.types import F64, Actor, Scenario
 from alpasim_plugin.world.ego import ego_state_from_log
@@ -48,7 +49,7 @@ class Practice:
     moments: tuple[Moment, ...]
 
 
-def practice_drives(scenario: Scenario, count: int, drive_s: float, random: np.random.Generator) -> Iterator[Practice]:
+def practice_drives(scenario: Scenario, count: int, drive_s: float, seed: int) -> Iterator[Practice]:
     """Yield drives of a scenario along its route, along the lanes beside it, and along the turns of its junctions, where it has any."""
     first = ego_state_from_log(scenario.ego_log, scenario.start_us, scenario.vehicle)
     cruise = max(first.speed_mps, 6.0)
@@ -56,7 +57,7 @@ def practice_drives(scenario: Scenario, count: int, drive_s: float, random: np.r
     for k in range(count):
         # Every third drive keeps to the route; the others take turns among the other ways there are.
         path, turn_s_m = others[(k - 1 - k // 3) % len(others)] if others and k % 3 else (smooth_path(scenario.route.xyz), None)
-        yield _drive(scenario, path, turn_s_m, cruise, drive_s, random)
+        yield _drive(scenario, path, turn_s_m, cruise, drive_s, stream(scenario.scene_id, seed, "training.policy.drive", k))
 
 
 def lines_beside(scenario: Scenario) -> list[Path]:
@@ -114,7 +115,7 @@ def _drive(
         t = t_us + round(step * STEP_S * 1e6)
         if t > scenario.end_us or s > path.length_m - 15.0:
             break
-        actors, bodies = _present(scenario, t, leader)
+        actors, bodies = others_at(scenario, t, leader)
         ahead = leader_on(line, s, front, half, bodies)
         if step % round(MOMENT_S / STEP_S) == 0:
             moments.append(_moment(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
@@ -181,10 +182,10 @@ def _turn(angle: float) -> F64:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _present(scenario: Scenario, t_us: int, leader: _CastLeader | None) -> tuple[dict[str, F64], Bodies]:
+def others_at(scenario: Scenario, t_us: int, leader: _CastLeader | None) -> tuple[dict[str, F64], Bodies]:
     """Return the poses of everybody at a recorded time, and the same as bodies with velocities."""
     actors = log_actors(scenario, t_us)
-    before = log_actors(scenario, t_us - 100_000)
+    before, after = (log_actors(scenario, t_us + dt_us) for dt_us in (-100_000, 100_000))
     if leader is not None:
         actors[leader.actor.actor_id] = leader.pose(scenario)
     boxes = {a.actor_id: a.box for a in scenario.actors}
@@ -195,8 +196,10 @@ def _present(scenario: Scenario, t_us: int, leader: _CastLeader | None) -> tuple
     for i, name in enumerate(names):
         if leader is not None and name == leader.actor.actor_id:
             velocity[i] = leader.speed_mps * np.array([np.cos(yaw[i]), np.sin(yaw[i])])
-        elif name in before:
-            velocity[i] = (actors[name][:2, 3] - before[name][:2, 3]) / 0.1
+        else:  # who has only just appeared moves on as the log shows it next
+            earlier, later = (before, actors) if name in before else (actors, after)
+            if name in later:
+                velocity[i] = (later[name][:2, 3] - earlier[name][:2, 3]) / 0.1
     return actors, bodies_from(xy, yaw, [boxes[name] for name in names], velocity)
 
 

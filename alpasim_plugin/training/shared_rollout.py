@@ -160,11 +160,12 @@ def roll_out(
     *,
     block_latents: int = 2,
     window: int | None = 12,
+    use_map: bool = True,
 ) -> Tensor:
     """Return the generator's own predictions of whole clips ``(B, C, N, H, W)``, as it makes them when deployed; see `Sample`."""
     t = torch.ones(z_r.shape[0], z_r.shape[2])
     sample = Sample(z_r, z_r, z_map, m, eps, eps_context, t, t, z_r.shape[2] - 1)
-    rollout = _Rollout(net, sample, text, Objectives("own", 0), block_latents, window)
+    rollout = _Rollout(net, sample, text, Objectives("own", 0, use_map=use_map), block_latents, window)
     made = rollout.history()
     assert made is not None, "own history"
     return made

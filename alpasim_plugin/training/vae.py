@@ -6,6 +6,7 @@ semantic maps, which it only encodes for the generator. Latents get a little noi
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -18,7 +19,7 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import LATENT
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.clips import Clip, ClipSize, draw_pair_clip, draw_video_clip
-from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import U8
 
@@ -65,7 +66,8 @@ class VaeTask:
     @property
     def facts(self) -> dict[str, Any]:
         """Identify the training data and recipe."""
-        return {"sequences": len(self.sequences), "videos": [list(v.shape) for v in self.videos], "recipe": asdict(self.recipe)}
+        videos = [hashlib.blake2b(video.tobytes(), digest_size=8).hexdigest() for video in self.videos]
+        return {"sequences": len(self.sequences), "pairs": pairs_digest(self.sequences), "videos": videos, "recipe": asdict(self.recipe)}
 
     def batch(self, index: int) -> VaeBatch:
         """Make batch ``index``."""

@@ -20,12 +20,12 @@ from alpasim_plugin.training.fixer_run import FixerRun, start_weights, train_fix
 from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.memory import measure_memory, memory_table
-from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.pair_store import PairDataset, write_sequence
 from alpasim_plugin.training.trainer import Schedule
 from alpasim_plugin.training.variants import VARIANTS, variant_of
 from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 
-from .pair_files import make
+from .pair_files import make, pair
 
 FORM = ClipForm(latents=4, stride=7)
 
@@ -47,7 +47,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_of(data: Path, variant: str, *, steps: int = 2, init: Path | None = None) -> FixerRun:
     recipe = GeneratorRecipe(clips=2, columns=4, block_latents=2, window=4, steps=steps, accumulate=1)
     schedule = Schedule(steps, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
-    return FixerRun(small_settings("window=4"), variant_of(variant), data, data / "vae.safetensors", init, FORM, recipe, schedule)
+    settings = small_settings("window=4", "history=finalise", "holes=noise")
+    return FixerRun(settings, variant_of(variant), data, data / "vae.safetensors", init, FORM, recipe, schedule)
 
 
 def clips_of(data: Path, folder: Path) -> LatentClips:
@@ -74,13 +75,15 @@ def test_latents_are_those_of_a_rollout_that_starts_there_and_are_encoded_once(d
 
 
 def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: Path) -> None:
-    make(tmp_path, name="a", frames=21)
-    clips_of_this = LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
-    info = tmp_path / "train" / "a" / "sequence.json"
-    info.write_text(json.dumps({**json.loads(info.read_text()), "scene_id": "another"}))
-    LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
-    assert len(clips_of_this) == 4
-    assert len(list((tmp_path / "z").rglob("*.npy"))) == 2
+    (tmp_path / "vae.safetensors").write_bytes((data / "vae.safetensors").read_bytes())
+    old = make(tmp_path, name="a", frames=21)
+    before = clips_of(tmp_path, tmp_path / "z")
+    frames = (pair(i)._replace(rgb_input=pair(i + 1).rgb_input) for i in range(21))
+    write_sequence(old.folder, frames, 21, {key: old.info[key] for key in ("scene_id", "split")})
+    after = clips_of(tmp_path, tmp_path / "z")
+    assert after.digest != before.digest
+    assert torch.equal(after[0].z_0, before[0].z_0)
+    assert not torch.equal(after[0].z_r, before[0].z_r)
 
 
 def test_too_short_sequences_and_no_sequences_are_refused(data: Path, tmp_path: Path) -> None:
@@ -91,7 +94,7 @@ def test_too_short_sequences_and_no_sequences_are_refused(data: Path, tmp_path: 
         LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
 
 
-QUICK = ("base", "image", "V6", "V7", "V8")  # between them every branch; V9 is trained below
+QUICK = ("base", "image", "V5", "V6", "V7", "V8")  # between them every branch; V9 is trained below
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in VARIANTS])
@@ -142,6 +145,12 @@ def test_trained_weights_serve_the_streaming_fixer(data: Path, tmp_path: Path, v
     assert session.trained
     fixed = pixels(run_blocks(session, frames, maps_of(frames)))
     assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
+
+
+def test_weights_that_take_the_render_as_a_condition_are_refused_before_they_drive(data: Path, tmp_path: Path) -> None:
+    path = train_fixer(run_of(data, "V6"), tmp_path / "run", ("brightness", brightness))
+    with pytest.raises(InputError, match="32 channels, streaming gives 16"):
+        load_networks(small_settings("window=4", "holes=noise", "history=finalise", f"weights.bundle={path}"))
 
 
 def test_without_history_a_frame_does_not_depend_on_those_before(data: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.conditioning import draw_map
+from alpasim_plugin.fixers.map_style import COLOURS
 from alpasim_plugin.training.map_colours import OTHERS, recolour_boxes
 from tests.fixers.test_conditioning import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
 
@@ -37,6 +38,14 @@ def test_a_map_without_cars_stays_as_it_is() -> None:
     np.testing.assert_array_equal(recolour_boxes(people, "truck"), people)
     black = np.zeros((2, 4, 4, 3), np.uint8)
     np.testing.assert_array_equal(recolour_boxes(black, "truck"), black)
+
+
+@pytest.mark.parametrize("paint", COLOURS)
+@pytest.mark.parametrize("kind", OTHERS)
+def test_paint_of_every_colour_and_darkness_stays(paint: str, kind: str) -> None:
+    shares = np.linspace(0.1, 1.0, 64)[None, :, None]
+    faded = np.rint(shares * np.array(COLOURS[paint])).astype(np.uint8)
+    np.testing.assert_array_equal(recolour_boxes(faded, kind), faded)
 
 
 def test_an_unknown_class_is_refused() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -37,18 +38,32 @@ def net_of(bundle: Path) -> CosmosCausalDiT:
 
 def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
-    rollouts = Rollouts(clips, net, 2, 4, tmp_path / "r")
+    rollouts = Rollouts(clips, net, 2, 4, True, tmp_path / "r")
     assert len(rollouts) == len(clips)
     clip, z = rollouts[2]
     assert z.shape == clip.z_0.shape
     assert torch.isfinite(z).all()
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "r").rglob("*.npy")}
-    Rollouts(clips, net, 2, 4, tmp_path / "r")
+    Rollouts(clips, net, 2, 4, True, tmp_path / "r")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "r").rglob("*.npy")} == files
     other = net_of(bundle)
     with torch.no_grad():
         other.final_layer.linear.weight.add_(0.1)
-    assert Rollouts(clips, other, 2, 4, tmp_path / "r").digest != rollouts.digest
+    assert Rollouts(clips, other, 2, 4, True, tmp_path / "r").digest != rollouts.digest
+
+
+def test_a_generator_without_a_map_is_rolled_out_without_one(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
+    clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
+    with_map, without = (Rollouts(clips, net, 2, 4, use_map, tmp_path / "r") for use_map in (True, False))
+    assert not torch.equal(with_map[0][1], without[0][1])
+    blind = Path(copytree(data, tmp_path / "blind")) / "train"
+    for name in ("a", "b"):  # the same pairs, but for their maps
+        np.save(blind / name / "sdmap.npy", np.zeros_like(np.load(blind / name / "sdmap.npy")))
+        info = blind / name / "sequence.json"
+        info.write_text(json.dumps({k: v for k, v in json.loads(info.read_text()).items() if k != "content"}))
+    unmapped = clips_of(blind.parent, tmp_path / "z")
+    assert torch.equal(Rollouts(unmapped, net, 2, 4, False, tmp_path / "r")[0][1], without[0][1])
+    assert not torch.equal(Rollouts(unmapped, net, 2, 4, True, tmp_path / "r")[0][1], with_map[0][1]), "other pairs, other rollouts"
 
 
 def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
@@ -87,7 +102,7 @@ def test_only_the_decoder_learns_and_pictures_get_nearer(data: Path, bundle: Pat
 
 
 def test_batches_are_functions_of_their_number_and_crops_fit(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
-    rollouts = Rollouts(clips_of(data, tmp_path / "z"), net_of(bundle), 2, 4, tmp_path / "r")
+    rollouts = Rollouts(clips_of(data, tmp_path / "z"), net_of(bundle), 2, 4, True, tmp_path / "r")
     one, two = (PainterTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2))
     two.batch(0)
     a, b = one.batch(3), two.batch(3)

@@ -17,6 +17,7 @@ from alpasim_plugin.training.pair_import import PairSources, import_sequence, re
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
 
 H, W = 32, 48
+MOVED = np.eye(4) + np.outer([3.0, 2.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0])  # a pose away from the origin
 
 
 def picture(i: int, height: int = H, width: int = W) -> np.ndarray:
@@ -93,6 +94,7 @@ def test_poses_without_times_follow_the_frame_rate(tmp_path: Path) -> None:
         (lambda f: {"opacity": _saved(f / "a.npy", np.zeros((4, H, W)))}, "float64"),
         (lambda f: {"poses": _saved(f / "p.npy", np.zeros((4, 3, 4)))}, r"shape \(4, 3, 4\)"),
         (lambda f: {"poses": _saved(f / "p.npy", np.tile(2 * np.eye(4), (4, 1, 1)))}, "pose 0 is no rotation"),
+        (lambda f: {"poses": _saved(f / "p.npy", np.tile(MOVED.T, (4, 1, 1)))}, "pose 0 is no rotation"),
         (lambda f: {"poses": _written(f / "p.json", '[{"t_us": 0}]')}, "KeyError"),
         (lambda f: {"poses": _written(f / "p.json", json.dumps([{"T_world_camera": np.eye(4).tolist(), "t_us": 5}] * 2))}, "increase"),
         (lambda f: {"sdmap": _written(f / "v.mp4", "no video")}, r"v\.mp4"),
