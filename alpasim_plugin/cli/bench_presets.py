@@ -17,7 +17,7 @@ from evaluators.presets import preset as find_preset
 EPILOG = """
 Examples:
 
-- `simrun bench presets ../shared/data/alpasim-golden/rollouts --scene ../shared/data/alpasim-golden/scenes`
+- `simrun bench presets DATA/alpasim-golden/rollouts --scene DATA/alpasim-golden/scenes`, DATA being the folder of third-party logs
 
 - `simrun bench presets runs/smoke/rollouts/3dgs --scene suites/smoke`
 """
