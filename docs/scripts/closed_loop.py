@@ -63,7 +63,8 @@ def families(rows: list[dict[str, Any]]) -> str:
         cells = []
         for renderer in RENDERERS:
             events = [row["offroad_or_collision_at_fault"] for row in rows if family(row) == name and row["renderer"] == renderer]
-            cells.append(f"{sum(1 for event in events if event)} of {len(events)}")
+            known = [event for event in events if event is not None]
+            cells.append(f"{int(sum(known))} of {len(known)}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
