@@ -73,6 +73,10 @@ def train_fixer_command(
     channels: Annotated[
         Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: as they show in pixels, or all alike.")
     ] = "amplitude",
+    recolour: Annotated[
+        bool, typer.Option("--recolour/--no-recolour", help="Show the map's cars in another class's colours in mirrored clips.")
+    ] = True,
+    stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Write what there is after this update.")] = None,
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
     threads: Threads = None,
     seed: Seed = 0,
@@ -90,10 +94,10 @@ def train_fixer_command(
     )
     settings = onefixer_settings(fixer).model_copy(update={"window": recipe.window, "history": "finalise"})
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
-    run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride), recipe, schedule, PRECISIONS[precision])
+    run = FixerRun(settings, chosen, data, vae, init, ClipForm(latents, stride, recolour), recipe, schedule, PRECISIONS[precision])
     distance = progress.perceptual_term(metric_weights) if any(stage.horizon for stage in chosen.stages) else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
-    progress.wrote(train_fixer(run, out, distance, encoded, progress.update), as_json)
+    progress.wrote(train_fixer(run, out, distance, encoded, progress.update, stop_at), as_json)
 
 
 def memory_command(

@@ -62,8 +62,9 @@ def train_fixer(
     distance: tuple[str, Distance] | None = None,
     encoded: Callable[[int, int], None] | None = None,
     report: Callable[[int, Mapping[str, float]], None] | None = None,
+    stop_at: int | None = None,
 ) -> Path:
-    """Train to the schedule's end, from the last checkpoint if there is one, and write OUT/fixer.safetensors and its card.
+    """Train to the schedule's end or to update ``stop_at``, from the last checkpoint if there is one, and write OUT/fixer.safetensors and its card.
 
     Args:
         run: What is trained.
@@ -71,6 +72,7 @@ def train_fixer(
         distance: Name and function of the perceptual term.
         encoded: Called with sequences encoded and in all.
         report: Called after every update with its number and the log's numbers.
+        stop_at: Update after which to write what there is; a later call goes on from there.
 
     Raises:
         InputError: Data, weights or recipe that do not fit.
@@ -86,8 +88,8 @@ def train_fixer(
     task = GeneratorTask(net, vae, clips, run.variant, run.recipe, distance)
     facts = {**task.facts, "init": file_sha256(run.init) if run.init else None, "precision": str(run.precision)}
     trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision)
-    trainer.run(report)
-    return write_bundle(run, out, trainer.averaged(), vae, facts)
+    trainer.run(report, stop_at)
+    return write_bundle(run, out, trainer.averaged(), vae, facts, trainer.step)
 
 
 def start_weights(run: FixerRun) -> dict[str, Tensor]:
@@ -102,8 +104,8 @@ def start_weights(run: FixerRun) -> dict[str, Tensor]:
     return weights if run.variant.mixed else widen_map(weights, 32)
 
 
-def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyVAE, facts: Mapping[str, Any]) -> Path:
-    """Write what was trained as one float16 file, with its card."""
+def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyVAE, facts: Mapping[str, Any], updates: int) -> Path:
+    """Write what was trained in so many updates as one float16 file, with its card."""
     path = out / BUNDLE_FILE
     parts = {"dit": {k: half(v) for k, v in dit.items()}, "vae": {k: half(v) for k, v in vae.state_dict().items()}}
     history = run.settings.history if run.variant.history else "none"
@@ -111,7 +113,8 @@ def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyV
     settings = run.settings.model_copy(
         update={"holes": "noise", "history": history, "block_latents": block, "uses_map": run.variant.use_map}
     )  # fmt: skip
-    note = f"{run.variant.name}, {run.schedule.steps} updates"
+    planned = "" if updates == run.schedule.steps else f" of {run.schedule.steps}"
+    note = f"{run.variant.name}, {updates}{planned} updates"
     save_bundle(path, parts, settings, trained=True, note=note)
     rows, hours = curves(out / LOG_FILE)
     training = {"variant": run.variant.name, "about": run.variant.about, "schedule": asdict(run.schedule), **facts}

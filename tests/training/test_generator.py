@@ -14,7 +14,7 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
-from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.nets.checkpoints import load_weights, read_metadata
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.fixer_run import FixerRun, start_weights, train_fixer
 from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
@@ -111,6 +111,14 @@ def test_every_variant_trains_by_one_function(data: Path, tmp_path: Path, name: 
     assert any("flow" in row for row in rows) == has_flow
     assert any("perceptual" in row for row in rows) == any(stage.horizon for stage in run.variant.stages)
     assert start["additional_patch_embedding.proj.1.weight"].shape[1] == (64 if run.variant.mixed else 128)
+
+
+def test_a_run_can_be_stopped_for_what_there_is_and_goes_on(data: Path, tmp_path: Path) -> None:
+    path = train_fixer(run_of(data, "base", steps=3), tmp_path / "run", stop_at=2)
+    assert read_metadata(path)["note"] == "base, 2 of 3 updates"
+    whole = train_fixer(run_of(data, "base", steps=3), tmp_path / "whole")
+    again = train_fixer(run_of(data, "base", steps=3), tmp_path / "run")
+    assert all(torch.equal(value, load_weights(whole)[key]) for key, value in load_weights(again).items())
 
 
 def test_v7_divides_its_updates_between_its_two_terms() -> None:
