@@ -139,10 +139,14 @@ def pairs_sheet(
     if not names:
         raise InputError("measuring pairs", str(data), "no finished sequence", "make some with 'simrun train pairs'")
     datasets = {name: PairDataset(data, name) for name in names}
-    facts = [measure_sequence(sequence, name) for name, dataset in datasets.items() for sequence in dataset.sequences]
+    todo = [(name, sequence) for name, dataset in datasets.items() for sequence in dataset.sequences]
+    console, facts = Console(stderr=True), []
+    for number, (name, sequence) in enumerate(todo, start=1):
+        facts.append(measure_sequence(sequence, name))
+        console.print(f"[{number}/{len(todo)}] {name}/{sequence.name}", highlight=False, markup=False)
     document = sheet(facts)
     if out is not None:
-        write_sheet(out, document, contact_sheet([s for dataset in datasets.values() for s in dataset.sequences]))
+        write_sheet(out, document, contact_sheet([sequence for _, sequence in todo]))
     print(json.dumps(document, indent=1))
 
 
