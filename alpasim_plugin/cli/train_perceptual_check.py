@@ -21,7 +21,10 @@ from alpasim_plugin.types import F32, F64, U8
 from evaluators.video import ssim
 from evaluators.video.perceptual import picture_distances
 
-CHECK_EPILOG = "Example: `simrun train perceptual-check perceptual-syn data/pairs --split val --examples DATA/lpips`, DATA being the folder of third-party data"
+CHECK_EPILOG = (
+    "Example: `simrun train perceptual-check perceptual-syn data/pairs --split val --examples DATA/lpips`, "
+    "DATA being the folder of third-party data"
+)
 EXAMPLES = ("ex_ref", "ex_p0", "ex_p1")
 
 
