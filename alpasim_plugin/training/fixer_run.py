@@ -64,7 +64,7 @@ def train_fixer(
     report: Callable[[int, Mapping[str, float]], None] | None = None,
     stop_at: int | None = None,
 ) -> Path:
-    """Train to the schedule's end or to update ``stop_at``, from the last checkpoint if there is one, and write OUT/fixer.safetensors and its card.
+    """Train to the schedule's end or to ``stop_at``, from the last checkpoint if there is one; write OUT/fixer.safetensors and its card.
 
     Args:
         run: What is trained.

@@ -128,8 +128,8 @@ def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor
 def channel_amplitudes(vae: TinyVAE, sigma: float = 0.3) -> Tensor:
     """Return how strongly an error of each latent channel shows in pixels: its root mean square there, scaled to mean 1, ``(16,)``.
 
-    Channels are normalised to unit variance, but a unit of the one that carries brightness moves pixels 4 to 39 times as much as a unit of the
-    others (shipped weights). A loss that weighs all alike spends the network on what cannot be seen.
+    Channels are normalised to unit variance, but a unit of the one that carries brightness moves pixels 4 to 39 times as much as a
+    unit of the others (shipped weights). A loss that weighs all alike spends the network on what cannot be seen.
     """
     noise = torch.from_numpy(stream("training", 0, "vae.channel_amplitudes").standard_normal((1, LATENT, 3, 8, 8), dtype="float32"))
     z = torch.zeros_like(noise)
