@@ -70,6 +70,7 @@ def train_fixer_command(
     source_share: Annotated[
         float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions at t = 1, the start of a rollout.")
     ] = 0.35,
+    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term; the paper has 10.")] = 10.0,
     channels: Annotated[
         Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: as they show in pixels, or all alike.")
     ] = "amplitude",
@@ -88,7 +89,7 @@ def train_fixer_command(
     """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
     del debug
     use_threads(threads)
-    chosen, progress = variant_of(variant), Progress(steps)
+    chosen, progress = variant_of(variant).weighing(perceptual), Progress(steps)
     recipe = GeneratorRecipe(
         clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share, channels=channels
     )

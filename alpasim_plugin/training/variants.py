@@ -7,7 +7,7 @@ forcing on the same clips, with histories of every noise level. ``image`` sees o
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from alpasim_plugin.errors import InputError
@@ -35,6 +35,14 @@ class Variant:
     def objectives(self, step: int, steps: int) -> Objectives:
         """Return what update ``step`` of ``steps`` minimises."""
         return self.stages[min(step * len(self.stages) // steps, len(self.stages) - 1)]
+
+    def weighing(self, perceptual: float) -> Variant:
+        """Return the variant with another weight lambda of its perceptual term.
+
+        Raises:
+            InputError: A negative weight.
+        """
+        return replace(self, stages=tuple(replace(stage, weight=perceptual) for stage in self.stages))
 
     @property
     def use_map(self) -> bool:

@@ -121,6 +121,13 @@ def test_a_run_can_be_stopped_for_what_there_is_and_goes_on(data: Path, tmp_path
     assert all(torch.equal(value, load_weights(whole)[key]) for key, value in load_weights(again).items())
 
 
+def test_the_perceptual_terms_weight_can_be_chosen() -> None:
+    assert [stage.weight for stage in variant_of("V7").stages] == [10.0, 10.0]
+    assert [stage.weight for stage in variant_of("V7").weighing(2.5).stages] == [2.5, 2.5]
+    with pytest.raises(InputError, match="weight -1"):
+        variant_of("V9").weighing(-1.0)
+
+
 def test_v7_divides_its_updates_between_its_two_terms() -> None:
     kinds = [variant_of("V7").objectives(step, 5) for step in range(5)]
     assert [k.flow for k in kinds] == ["own", "own", "own", None, None]
