@@ -70,7 +70,7 @@ def scenes(
     console, paths = Console(stderr=True), []
     for path in write_scenes(out, split, count or DEFAULT_COUNTS[split], duration_s):
         paths.append(str(path))
-        console.print(str(path), highlight=False, markup=False)
+        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"split": split, "scenes": len(paths), "paths": paths}))
 

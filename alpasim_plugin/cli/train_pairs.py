@@ -50,7 +50,7 @@ def reconstructions(
     console, rows = Console(stderr=True), []
     for number, (ref, row) in enumerate(spread(_Fitted(again), refs, jobs), start=1):
         rows.append({"path": ref.path, **row})
-        console.print(f"[{number}/{len(refs)}] {row['scene_id']}: {row['what']}", highlight=False, markup=False)
+        console.print(f"[{number}/{len(refs)}] {row['scene_id']}: {row['what']}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps(rows))
 
@@ -101,7 +101,7 @@ def pairs(
         rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})
         note = "" if made else " (was there)"
         line = f"[{number}/{len(work)}] {scene.split}/{scene.path.stem}{note}, {time.perf_counter() - began:.0f} s"
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"sequences": len(rows), "made": sum(bool(row["made"]) for row in rows), "rows": rows}))
 
@@ -143,7 +143,7 @@ def pairs_sheet(
     console, facts = Console(stderr=True), []
     for number, (name, sequence) in enumerate(todo, start=1):
         facts.append(measure_sequence(sequence, name))
-        console.print(f"[{number}/{len(todo)}] {name}/{sequence.name}", highlight=False, markup=False)
+        console.print(f"[{number}/{len(todo)}] {name}/{sequence.name}", highlight=False, markup=False, soft_wrap=True)
     document = sheet(facts)
     if out is not None:
         write_sheet(out, document, contact_sheet([sequence for _, sequence in todo]))
@@ -172,7 +172,7 @@ def import_pairs(
     sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)
     folder = out / split / name
     frames = import_sequence(sources, folder, fps=fps, size=_size(size), facts={"split": split})
-    Console(stderr=True).print(f"{folder}: {frames} frames", highlight=False, markup=False)
+    Console(stderr=True).print(f"{folder}: {frames} frames", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"folder": str(folder), "split": split, "frames": frames}))
 

@@ -66,7 +66,7 @@ def policy_data(
         folder = out / split / path.stem
         made = make_lessons(load_scenario(path), folder, LessonRecipe(), seed)
         rows.append({"scene": path.stem, "folder": str(folder), "made": made, "lessons": _lessons_in(folder)})
-        console.print(f"[{i}/{len(paths)}] {path.stem}{'' if made else ' (was there)'}", highlight=False, markup=False)
+        console.print(f"[{i}/{len(paths)}] {path.stem}{'' if made else ' (was there)'}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         totals = {"scenes": len(rows), "made": sum(row["made"] for row in rows), "lessons": sum(row["lessons"] for row in rows)}
         print(json.dumps({"split": split, **totals, "rows": rows}))

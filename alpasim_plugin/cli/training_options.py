@@ -101,7 +101,7 @@ class Progress:
             as_json: Print ``weights``, ``sha256``, ``bytes``, ``card``, ``steps``, ``hours`` and ``last``, the log's last means.
             card: What is told about them, where that is a file; by default what `ModelCard` wrote beside them, if it did.
         """
-        self.console.print(f"wrote {path}", highlight=False, markup=False)
+        self.console.print(f"wrote {path}", highlight=False, markup=False, soft_wrap=True)
         if not as_json:
             return
         rows, hours = curves(path.parent / LOG_FILE)
