@@ -101,7 +101,7 @@ def _panel(ax: Any, errors: Sequence[tuple[Row, float]]) -> None:
         ax.annotate("\n".join(names), (at, y), xytext=(shift, 4), textcoords="offset points", fontsize=7, va=side, ha=align)
     for group, marker in MARKERS.items():
         ax.plot([], [], marker, color=f"C{list(MARKERS).index(group)}", label=group)
-    ax.legend(fontsize=8, loc="upper right")
+    ax.legend(fontsize=8, loc="center right")
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.margins(x=0.38, y=0.12)
