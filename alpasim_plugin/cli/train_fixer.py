@@ -11,23 +11,7 @@ from typing import Annotated, Literal
 import torch
 import typer
 
-from alpasim_plugin.cli.training_options import (
-    AsJson,
-    Clips,
-    Debug,
-    Latents,
-    MetricWeights,
-    Pairs,
-    PeakLr,
-    Progress,
-    RunFolder,
-    Seed,
-    Steps,
-    Stride,
-    Threads,
-    use_threads,
-    whole_numbers,
-)
+from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -54,18 +38,18 @@ def onefixer_settings(name: str) -> OneFixerSettings:
 
 
 def train_fixer_command(
-    data: Pairs,
-    vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae').")],
-    out: RunFolder,
+    data: options.Pairs,
+    vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle.")],
+    out: options.RunFolder,
     variant: Annotated[str, typer.Option("--variant", help=f"One of {', '.join(VARIANTS)}.")] = "V9",
     init: Annotated[Path | None, typer.Option("--init", help="Weights to start from: a run's fixer.safetensors, or a transformer.")] = None,
-    steps: Steps = 400,
-    clips: Clips = 4,
+    steps: options.Steps = 400,
+    clips: options.Clips = 4,
     accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches an update.")] = 2,
-    latents: Latents = 12,
+    latents: options.Latents = 12,
     columns: Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")] = None,
-    stride: Stride = 24,
-    lr: PeakLr = 2e-4,
+    stride: options.Stride = 24,
+    lr: options.PeakLr = 2e-4,
     ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged weights.")] = 0.99,
     source_share: Annotated[
         float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions at t = 1, the start of a rollout.")
@@ -79,17 +63,17 @@ def train_fixer_command(
     ] = True,
     stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Write what there is after this update.")] = None,
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")] = "fp32",
-    threads: Threads = None,
-    seed: Seed = 0,
+    threads: options.Threads = None,
+    seed: options.Seed = 0,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are trained.")] = "onefixer-tiny",
-    metric_weights: MetricWeights = None,
-    as_json: AsJson = False,
-    debug: Debug = False,
+    metric_weights: options.MetricWeights = None,
+    as_json: options.AsJson = False,
+    debug: options.Debug = False,
 ) -> None:
     """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
     del debug
-    use_threads(threads)
-    chosen, progress = variant_of(variant).weighing(perceptual), Progress(steps)
+    options.use_threads(threads)
+    chosen, progress = variant_of(variant).weighing(perceptual), options.Progress(steps)
     recipe = GeneratorRecipe(
         clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share, channels=channels
     )
@@ -108,11 +92,11 @@ def memory_command(
     columns: Annotated[int, typer.Option("--columns", min=2, help="Width in latents.")] = 32,
     rows: Annotated[int, typer.Option("--rows", min=2, help="Height in latents.")] = 18,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose sizes are measured.")] = "onefixer-tiny",
-    as_json: AsJson = False,
-    debug: Debug = False,
+    as_json: options.AsJson = False,
+    debug: options.Debug = False,
 ) -> None:
     """Measure the peak memory and the time of one training sample over clip length and horizon, each in a process of its own."""
     del debug
-    counts, horizons = whole_numbers("--latents", latents, 2), whole_numbers("--horizon", horizon, 0)
+    counts, horizons = options.whole_numbers("--latents", latents, 2), options.whole_numbers("--horizon", horizon, 0)
     cells = measure_memory(onefixer_settings(fixer), counts, horizons, clips, rows, columns)
     print(json.dumps([cell._asdict() for cell in cells], indent=1) if as_json else memory_table(cells))

@@ -75,7 +75,7 @@ def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in MUST_MATCH]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
-    parts = _parts(load_weights(path, sha256=settings.weights.sha256.bundle))
+    parts = parts_of(load_weights(path, sha256=settings.weights.sha256.bundle))
     unknown, missing = sorted(set(parts) - set(PARTS)), sorted({"dit", "vae"} - set(parts))
     if unknown or missing:
         found = "; ".join([f"no {part}.*" for part in missing] + [f"unknown part {part}.*" for part in unknown])
@@ -108,10 +108,10 @@ def load_tiny_vae(path: str | Path) -> TinyVAE:
         InputError: Neither, or a bundle with another kind of autoencoder.
     """
     tensors = load_weights(path)
-    return TinyVAE.from_state_dict(_parts(tensors).get("vae", tensors), source=str(path))
+    return TinyVAE.from_state_dict(parts_of(tensors).get("vae", tensors), source=str(path))
 
 
-def _parts(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
+def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
     """Return tensors by what stands before the first dot of their keys, keys without it."""
     parts: dict[str, StateDict] = {}
     for key, value in tensors.items():

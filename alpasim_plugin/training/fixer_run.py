@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.bundle import save_bundle
+from alpasim_plugin.fixers.bundle import load_tiny_vae, parts_of, save_bundle
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
@@ -26,7 +26,6 @@ from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 from alpasim_plugin.training.variants import Variant
 
 BUNDLE_FILE = "fixer.safetensors"
-DIT_PREFIX = "dit."
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class FixerRun:
         settings: The fixer that is trained: sizes, block, window.
         variant: Objectives.
         data: Folder of pairs; its ``train`` split is used.
-        vae: Trained autoencoder's weights.
+        vae: Trained autoencoder's weights, or a bundle that holds them.
         init: Weights of a transformer or bundle to start from; None starts from a network that changes nothing.
         form: Clips.
         recipe: Batches.
@@ -81,7 +80,7 @@ def train_fixer(
     if run.recipe.steps != run.schedule.steps or run.recipe.accumulate != run.schedule.accumulate:
         found = f"recipe {run.recipe.steps} x {run.recipe.accumulate}, schedule {run.schedule.steps} x {run.schedule.accumulate}"
         raise InputError("training a fixer", str(out), found, "give both the same updates and batches an update")
-    vae = TinyVAE.load(run.vae)
+    vae = load_tiny_vae(run.vae)
     dataset = PairDataset(run.data, "train")
     clips = LatentClips(dataset.sequences, vae, run.form, out.parent / "latents", encoded)
     net = CosmosCausalDiT.from_state_dict(start_weights(run), run.settings.rope_ratios, source=str(run.init or "initial weights"))
@@ -100,7 +99,7 @@ def start_weights(run: FixerRun) -> dict[str, Tensor]:
         weights = initial_weights(sizes, derive_seed("training", run.recipe.seed, "generator"), zero_velocity=True)
     else:
         tensors = load_weights(run.init, dtype=torch.float32)
-        weights = {key.removeprefix(DIT_PREFIX): t for key, t in tensors.items() if key.startswith(DIT_PREFIX)} or dict(tensors)
+        weights = parts_of(tensors).get("dit", tensors)
     return weights if run.variant.mixed else widen_map(weights, 32)
 
 

@@ -46,7 +46,7 @@ def recolour_boxes(sdmap: U8, kind: str) -> U8:
     length = np.linalg.norm(pixels, axis=-1)
     small = OFF / np.linalg.norm(old[0])  # rounding may make a share of nothing a little less
     mixed = (off <= OFF + OFF_SHARE * length) & (shares >= -small).all(axis=-1)
-    mixed &= _paint_distance(pixels) > np.maximum(off, PAINT_OFF)
+    mixed[mixed] = _paint_distance(pixels[mixed]) > np.maximum(off[mixed], PAINT_OFF)
     pixels[mixed] = np.clip(np.rint(shares[mixed] @ new), 0, 255)
     out[inked] = pixels.astype(np.uint8)
     return out

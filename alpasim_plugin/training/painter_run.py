@@ -11,12 +11,12 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
+from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of, save_bundle
 from alpasim_plugin.fixers.networks import streaming_dit
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, read_metadata
-from alpasim_plugin.training.fixer_run import BUNDLE_FILE, DIT_PREFIX, half
+from alpasim_plugin.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.painter import PainterRecipe, PainterTask, Rollouts
@@ -25,7 +25,6 @@ from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 DOING = "adapting a decoder"
-VAE_PREFIX = "vae."
 
 
 def train_painter(
@@ -56,12 +55,9 @@ def train_painter(
     """
     settings = bundle_settings(bundle)
     tensors = load_weights(bundle, dtype=torch.float32)
-    parts = {
-        prefix: {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-        for prefix in (DIT_PREFIX, VAE_PREFIX)
-    }
-    vae = TinyVAE.from_state_dict(parts[VAE_PREFIX], source=str(bundle))
-    net = streaming_dit(parts[DIT_PREFIX], settings, str(bundle)).requires_grad_(False)
+    parts = parts_of(tensors)
+    vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
+    net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
 
     def tell(what: str) -> Callable[[int, int], None] | None:
         return None if prepared is None else lambda done, count: prepared(what, done, count)
@@ -74,7 +70,7 @@ def train_painter(
     trainer.run(report)
     path = out / BUNDLE_FILE
     made: dict[str, dict[str, Tensor]] = {
-        "dit": {key: half(value) for key, value in parts[DIT_PREFIX].items()},
+        "dit": {key: half(value) for key, value in parts["dit"].items()},
         "vae": {key: half(value) for key, value in trainer.averaged().items()},
     }
     note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
