@@ -108,6 +108,6 @@ class Progress:
         card = card or path.with_suffix(".card.json")
         facts = {
             "weights": str(path), "sha256": file_sha256(path), "bytes": path.stat().st_size, "card": str(card) if card.exists() else None,
-            "steps": self.steps, "hours": hours, "last": rows[-1],
+            "steps": rows[-1]["step"], "hours": hours, "last": rows[-1],
         }  # fmt: skip
         print(json.dumps(facts))

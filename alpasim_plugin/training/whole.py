@@ -36,8 +36,17 @@ def whole_folder(folder: Path, doing: str) -> Iterator[Path]:
 
 
 def save_array(path: Path, array: npt.NDArray[Any]) -> None:
-    """Write one ``.npy`` file."""
+    """Write one ``.npy`` file.
+
+    Raises:
+        InfrastructureError: The disk refuses.
+    """
     partial = path.with_name(f"{path.name}.{os.getpid()}.part")
-    with partial.open("wb") as file:
-        np.save(file, array)
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            np.save(file, array)
+        partial.replace(path)
+    except OSError as error:
+        raise InfrastructureError("writing training data", str(path), str(error), "make room, or choose another folder") from error
+    finally:
+        partial.unlink(missing_ok=True)
