@@ -11,8 +11,8 @@ from alpasim_plugin.types import Actor, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneChangeCount, Profile
 from alpasim_plugin.world.roads import build_road
-from scenarios.cast import Cast, Fail, cast_actors
 from scenarios.check import check_drive
+from scenarios.ego_path import Bump, EgoWay, LaneChange, ego_way
 from scenarios.expert import Drive, ExpertStyle, drive
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_road import (
@@ -25,7 +25,7 @@ from scenarios.schema_road import (
     SplitSegment,
     StraightSegment,
 )
-from scenarios.ways import Bump, EgoWay, LaneChange, ego_way
+from scenarios.traffic import Cast, Fail, cast_actors
 
 TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's foresight does not see them freeze
 DEFAULT_DURATION_US = 8_000_000

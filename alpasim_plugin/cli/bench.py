@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from alpasim_plugin.bench.raster import bench_raster
 from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline
 from alpasim_plugin.cli.quality import EPILOG as QUALITY_EXAMPLES
 from alpasim_plugin.cli.quality import quality
-from alpasim_plugin.gaussians.bench import bench_raster
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed and error of parts.")
 
@@ -41,7 +41,7 @@ def raster(
     del debug
     if gradients:
         # Imported on use: it loads torch.
-        from alpasim_plugin.gaussians.gradient_bench import bench_gradients
+        from alpasim_plugin.bench.raster_gradient import bench_gradients
 
         rows = [asdict(row) for row in bench_gradients(repeats=repeats)]
     else:

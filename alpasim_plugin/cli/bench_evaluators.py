@@ -10,9 +10,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from alpasim_plugin.bench.aggregation import TableRow, bench_table
+from alpasim_plugin.bench.evaluators import BenchRow, bench_evaluators
 from alpasim_plugin.errors import InputError
-from evaluators.bench import BenchRow, bench_evaluators
-from evaluators.bench_table import TableRow, bench_table
 
 EPILOG = "Example: `simrun bench evaluators --actors 10,40 --steps 200`"
 

@@ -13,11 +13,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from alpasim_plugin.bench.fixer import Plan, Row
+from alpasim_plugin.bench.fixer_run import Bench, bench_fixer
+from alpasim_plugin.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.bench import Plan, Row
-from alpasim_plugin.fixers.bench_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
-from alpasim_plugin.runtime.bench_fixer import Bench, bench_fixer
 
 PAGE, PICTURE = Path("docs/speed-and-error.md"), Path("docs/img/speed-and-error.png")
 EPILOG = """

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
+from alpasim_plugin.bench.preset_conversion import as_markdown, conversion_table, convert
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
-from evaluators.conversion import as_markdown, conversion_table, convert
 from evaluators.presets import preset as find_preset
 
 EPILOG = """

@@ -9,13 +9,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
+from alpasim_plugin.bench.block_speed import BlockTimes, measure_blocks
+from alpasim_plugin.bench.block_work import TEXT_TOKENS, BlockWork, block_work
+from alpasim_plugin.bench.roofline import Device, device_of
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.measure_block import BlockTimes, measure_blocks
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.work import TEXT_TOKENS, BlockWork, block_work
-from alpasim_plugin.nets.roofline import Device, device_of
 
 SIDE = 16
 

@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli import train_pairs
+from alpasim_plugin.cli.train_decoder import EPILOG as PAINTER_EXAMPLE
+from alpasim_plugin.cli.train_decoder import painter
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
-from alpasim_plugin.cli.train_painter import EPILOG as PAINTER_EXAMPLE
-from alpasim_plugin.cli.train_painter import painter
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
 from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_check

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import torch
 import typer
 
+from alpasim_plugin.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
@@ -18,7 +19,6 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
 from alpasim_plugin.training.generator import GeneratorRecipe
 from alpasim_plugin.training.latent_clips import ClipForm
-from alpasim_plugin.training.memory import measure_memory, memory_table
 from alpasim_plugin.training.trainer import Schedule
 from alpasim_plugin.training.variants import VARIANTS, variant_of
 

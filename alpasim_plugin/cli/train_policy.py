@@ -15,9 +15,9 @@ from rich.console import Console
 
 from alpasim_plugin.cli.training_options import AsJson, Debug, Progress, Seed, Steps, scene_files
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.training.demonstrations import LESSONS_FILE, LessonRecipe, make_lessons, read_lessons
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.policy import PolicyRecipe, PolicyTask, measure
-from alpasim_plugin.training.policy_data import LESSONS_FILE, LessonRecipe, make_lessons, read_lessons
 from alpasim_plugin.training.scenes import SPLITS
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 from policies.learned_net import LearnedNet, save_net

@@ -19,13 +19,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.degrade import log_actors
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary, write_pictures
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.fit.view_files import read_views
-from alpasim_plugin.gaussians.workers import thread_count
+from alpasim_plugin.gaussians.raster.workers import thread_count
+from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.types import Scenario
 from scenarios.load import load_scenario

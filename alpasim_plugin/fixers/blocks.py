@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from alpasim_plugin.fixers.base import BlockFixer
+from alpasim_plugin.fixers.block_runner import Workshop
 from alpasim_plugin.fixers.chunk import ChunkRenderer
-from alpasim_plugin.fixers.map_prepare import prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
-from alpasim_plugin.fixers.workshop import Workshop
+from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.types import Frame, RenderRequest, Scenario
 
 FixedRenderer = SpeculativeRenderer | ChunkRenderer

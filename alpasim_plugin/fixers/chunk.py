@@ -7,7 +7,7 @@ from typing import Any
 
 from alpasim_plugin.errors import RendererError
 from alpasim_plugin.fixers.base import BlockFixer
-from alpasim_plugin.fixers.workshop import Workshop
+from alpasim_plugin.fixers.block_runner import Workshop
 from alpasim_plugin.types import Frame, RenderRequest
 
 

@@ -22,11 +22,11 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.networks import Networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
-from alpasim_plugin.nets.carry import State
 from alpasim_plugin.nets.graphs import CudaRecorder, Function, GraphedFunction, Recorder
 from alpasim_plugin.nets.kv_cache import RollingCache
 from alpasim_plugin.nets.sampling import finalise, mixed_source, opacity_mask, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import from_names
+from alpasim_plugin.nets.streaming_state import State
 
 Stage = Callable[[str], AbstractContextManager[object]]
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from alpasim_plugin.errors import RendererError
 from alpasim_plugin.fixers.base import BlockFixer
-from alpasim_plugin.fixers.foretold import Deviation, deviation, same_view
+from alpasim_plugin.fixers.block_runner import Shot, Workshop
+from alpasim_plugin.fixers.prediction_error import Deviation, deviation, same_view
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.workshop import Shot, Workshop
 from alpasim_plugin.types import Frame, RenderRequest
 
 

@@ -2,12 +2,12 @@
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud
-from alpasim_plugin.gaussians.formats import read_gaussians
-from alpasim_plugin.gaussians.output import RasterOutput
-from alpasim_plugin.gaussians.ply import read_ply, write_ply
-from alpasim_plugin.gaussians.prepared import PreparedCloud, prepare
-from alpasim_plugin.gaussians.rasterize import rasterize
-from alpasim_plugin.gaussians.rasterize_cpu import rasterize_prepared
+from alpasim_plugin.gaussians.files.formats import read_gaussians
+from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.raster.prepared import PreparedCloud, prepare
+from alpasim_plugin.gaussians.raster.rasterize import rasterize
+from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 
 __all__ = [
     "CleanReport",

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.nets.carry import Carry
+from alpasim_plugin.nets.streaming_state import Carry
 
 
 @runtime_checkable

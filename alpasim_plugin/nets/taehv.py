@@ -19,12 +19,12 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.carry import Carry, State, Stream, in_passes
 from alpasim_plugin.nets.checkpoints import StateDict, unwrap
 from alpasim_plugin.nets.clips import GROUP, check_latents, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import DoublingConv, FrameConv, Pointwise, from_layers, halves_to_frames, run, to_layers
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
+from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
 
 GROWTH = (1, 2, 2)  # frames made of one, by stage
 COLOURS = 3

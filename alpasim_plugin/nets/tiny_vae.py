@@ -29,12 +29,12 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.carry import Carry, State, Stream, in_passes
 from alpasim_plugin.nets.checkpoints import load_weights, save_weights, unwrap
 from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import from_layers, halves_to_frames, split_last, to_layers
 from alpasim_plugin.nets.latent_stats import LatentStats
+from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
 from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinyEncoder, TinyPainter, TinySizes
 from alpasim_plugin.nets.tiny_vae_transform import CELL, COLOURS, CosineTransform, from_grid, to_grid
 

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.carry import Carry
 from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.frame_layers import FrameConv, Pointwise, conv_frames, halves_to_frames, run
+from alpasim_plugin.nets.streaming_state import Carry
 from alpasim_plugin.nets.tiny_vae_transform import CELL, COLOURS, COMPONENTS
 
 LATENT = len(COMPONENTS)

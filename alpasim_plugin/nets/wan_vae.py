@@ -14,12 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.carry import Carry, State, Stream, in_passes
 from alpasim_plugin.nets.checkpoints import unwrap
 from alpasim_plugin.nets.clips import check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import Pointwise, from_layers, run, to_layers
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
+from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
 from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Down, FrameAttention, ResidualBlock, Up
 from alpasim_plugin.nets.wan_vae_layout import DECODER_TIME, DO, DOING, ENCODER_TIME, WanLayout, read_layout
 

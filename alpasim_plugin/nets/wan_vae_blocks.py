@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.nets.carry import Carry
 from alpasim_plugin.nets.frame_layers import DoublingConv, HalvingConv, Pointwise, conv_frames, halves_to_frames, run
+from alpasim_plugin.nets.streaming_state import Carry
 
 SQUARE_FLOOR = 1e-24  # added to the mean square of a channel vector
 TAPS = 3  # of every temporal kernel: the frame itself and two before it

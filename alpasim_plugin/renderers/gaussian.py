@@ -16,17 +16,17 @@ from typing import TypeVar
 import numpy as np
 
 from alpasim_plugin.errors import InputError, RendererError
-from alpasim_plugin.gaussians.builder import build_scene, with_background
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.degrade import GHOST, Surrogate, log_actors, log_times
-from alpasim_plugin.gaussians.formats import read_gaussians
-from alpasim_plugin.gaussians.log_views import LogView
-from alpasim_plugin.gaussians.nodes import SceneNode
-from alpasim_plugin.gaussians.output import RasterOutput
-from alpasim_plugin.gaussians.rasterize import Backend
-from alpasim_plugin.gaussians.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.sky_mask import SkyMask
+from alpasim_plugin.gaussians.files.formats import read_gaussians
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.raster.rasterize import Backend
+from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
+from alpasim_plugin.gaussians.scene.degrade import GHOST, Surrogate, log_actors, log_times
+from alpasim_plugin.gaussians.scene.log_views import LogView
+from alpasim_plugin.gaussians.scene.nodes import SceneNode
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
 from alpasim_plugin.geometry import interpolate, inverse
 from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario

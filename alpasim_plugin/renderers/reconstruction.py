@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from alpasim_plugin.gaussians.build_actors import build_actor
-from alpasim_plugin.gaussians.builder import LIGHT, lit
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.nodes import Level, SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.sky_mask import SkyMask, SkyView
+from alpasim_plugin.gaussians.scene.build_actors import build_actor
+from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
+from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.sky_mask import SkyMask, SkyView
 from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory

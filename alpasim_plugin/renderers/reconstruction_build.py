@@ -15,7 +15,7 @@ from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import logged_views
-from alpasim_plugin.gaussians.sky_mask import SkyView
+from alpasim_plugin.gaussians.scene.sky_mask import SkyView
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_files import write_model
 from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe

@@ -19,7 +19,7 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.sky_mask import SkyView
+from alpasim_plugin.gaussians.scene.sky_mask import SkyView
 
 HASHES, SKY_VIEWS = "hashes.json", "sky_views.npz"
 

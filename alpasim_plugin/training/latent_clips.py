@@ -27,8 +27,8 @@ from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.sampling import opacity_mask
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.class_colours import OTHERS, recolour_boxes
 from alpasim_plugin.training.clips import to_tensor
-from alpasim_plugin.training.map_colours import OTHERS, recolour_boxes
 from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.training.whole import save_array
 

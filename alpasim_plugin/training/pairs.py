@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.conditioning import draw_map
-from alpasim_plugin.fixers.map_layers import actor_boxes
-from alpasim_plugin.fixers.map_prepare import prepare_map
-from alpasim_plugin.gaussians.degrade import log_actors
+from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.geometry import interpolate, yaw_of
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.seeding import stream
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.layers import actor_boxes
+from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.training.pair_store import SEQUENCE_FILE, Pair, write_sequence
 from alpasim_plugin.types import F64, CameraSpec, Degradation, RenderRequest, Scenario
 from alpasim_plugin.world.ground import ground_pose

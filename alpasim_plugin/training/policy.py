@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.policy_data import Lessons, lessons_digest
+from alpasim_plugin.training.demonstrations import Lessons, lessons_digest
 from alpasim_plugin.training.policy_expert import SIGHT_M
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import U8

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from alpasim_plugin.fixers.map_style import BOX_COLOURS, COLOURS
+from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.types import F32, U8
 
 CLASSES = ("boundary", "white line", "yellow line", "crosswalk", "stop line", "vehicle", "other road user")

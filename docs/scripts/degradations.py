@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from alpasim_plugin.gaussians.degrade import log_actors
+from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.training.pair_sheet import HOLE_BELOW, psnr_db, ssim_grey
 from alpasim_plugin.training.pairs import beside_log

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.bench.stand_in import save_stand_in
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.onefixer import OneFixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.stand_in import save_stand_in
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import U8, Frame
 

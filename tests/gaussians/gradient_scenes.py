@@ -11,11 +11,11 @@ from torch import Tensor
 
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.arrays import logit, sigmoid
-from alpasim_plugin.gaussians.gradient_types import GradientOutput, Splats
-from alpasim_plugin.gaussians.project import project_gaussians
-from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
-from alpasim_plugin.gaussians.rasterize_reference import composite_reference
-from alpasim_plugin.gaussians.rasterize_torch import GaussianTensors, rasterize_tensors
+from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
+from alpasim_plugin.gaussians.raster.project import project_gaussians
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_reference import composite_reference
+from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from alpasim_plugin.seeding import stream
 
 FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.gaussians.paint import GAP_M, LINE_M, WHITE, YELLOW, Strokes, paint_strokes
-from alpasim_plugin.gaussians.site import make_site
+from alpasim_plugin.gaussians.scene.paint import GAP_M, LINE_M, WHITE, YELLOW, Strokes, paint_strokes
+from alpasim_plugin.gaussians.scene.site import make_site
 from alpasim_plugin.types import F64, Lane, LaneMap, Marking, Scenario
 from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
 

@@ -7,12 +7,12 @@ from functools import lru_cache, partial
 import numpy as np
 import pytest
 
-from alpasim_plugin.gaussians.build_actors import build_actor
-from alpasim_plugin.gaussians.builder import build_scene, placed_cloud, with_background
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.contours import contours
-from alpasim_plugin.gaussians.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.site import make_site
+from alpasim_plugin.gaussians.scene.build_actors import build_actor
+from alpasim_plugin.gaussians.scene.builder import build_scene, placed_cloud, with_background
+from alpasim_plugin.gaussians.scene.contours import contours
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.site import make_site
 from alpasim_plugin.geometry import quat_from_yaw, se3
 from alpasim_plugin.types import Environment, LaneMap, Route, Scenario, Trajectory
 from alpasim_plugin.world.ground import height_at

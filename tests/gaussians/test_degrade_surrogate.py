@@ -10,11 +10,22 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.degrade import KNOT_US, STEPS, SWAY_M, SWAY_ON, Surrogate, extended, flattened, log_actors, log_times, wander
-from alpasim_plugin.gaussians.log_views import LogView, LogViews
-from alpasim_plugin.gaussians.nodes import Level, SceneNode
+from alpasim_plugin.gaussians.scene.degrade import (
+    KNOT_US,
+    STEPS,
+    SWAY_M,
+    SWAY_ON,
+    Surrogate,
+    extended,
+    flattened,
+    log_actors,
+    log_times,
+    wander,
+)
+from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
+from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
+from alpasim_plugin.gaussians.scene.surfels import cloud_of, with_sheen
 from alpasim_plugin.gaussians.sh import dc_from_rgb, sh_colours
-from alpasim_plugin.gaussians.surfels import cloud_of, with_sheen
 from alpasim_plugin.geometry import se2
 from alpasim_plugin.types import Degradation, Scenario
 from tests.gaussians.scene_maps import camera_spec, curve, parked, straight

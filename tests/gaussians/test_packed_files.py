@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply
 from alpasim_plugin.gaussians.arrays import SH_C0
-from alpasim_plugin.gaussians.compressed_ply import read_compressed_ply, unpack_rotation
-from alpasim_plugin.gaussians.formats import read_gaussians
-from alpasim_plugin.gaussians.ply_header import read_ply_header
+from alpasim_plugin.gaussians.files.compressed_ply import read_compressed_ply, unpack_rotation
+from alpasim_plugin.gaussians.files.formats import read_gaussians
+from alpasim_plugin.gaussians.files.ply_header import read_ply_header
+from alpasim_plugin.gaussians.files.splat import read_splat, write_splat
+from alpasim_plugin.gaussians.files.spz import read_spz, unpack_smallest_three
 from alpasim_plugin.gaussians.sh import sh_basis
-from alpasim_plugin.gaussians.splat import read_splat, write_splat
-from alpasim_plugin.gaussians.spz import read_spz, unpack_smallest_three
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from hypothesis.extra import numpy as hnp
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
-from alpasim_plugin.gaussians.formats import read_gaussians
-from alpasim_plugin.gaussians.ply import ply_rows, read_ply_arrays
-from alpasim_plugin.gaussians.ply_header import read_ply_element, read_ply_header
+from alpasim_plugin.gaussians.files.formats import read_gaussians
+from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays
+from alpasim_plugin.gaussians.files.ply_header import read_ply_element, read_ply_header
 
 
 def make_cloud(n: int = 5, k: int = 16, seed: int = 3) -> GaussianCloud:

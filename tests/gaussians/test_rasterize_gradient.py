@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.bench.raster import driving_camera, driving_like_scene
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
-from alpasim_plugin.gaussians.bench import driving_camera, driving_like_scene
-from alpasim_plugin.gaussians.gradient_types import Splats
-from alpasim_plugin.gaussians.project import project_gaussians
-from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
-from alpasim_plugin.gaussians.rasterize_reference import composite_reference, rasterize_reference
+from alpasim_plugin.gaussians.raster.gradient_types import Splats
+from alpasim_plugin.gaussians.raster.project import project_gaussians
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_reference import composite_reference, rasterize_reference
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import (

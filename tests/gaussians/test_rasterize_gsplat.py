@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from alpasim_plugin.errors import InputError, RendererError
-from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize, rasterize_gsplat
-from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.rasterize_torch import GaussianTensors, rasterize_tensors
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
+from alpasim_plugin.gaussians.raster import rasterize_gsplat
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid, splats
 
 

@@ -11,7 +11,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.cloud import quat_multiply
 from alpasim_plugin.gaussians.constants import ALPHA_MAX
-from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.gaussians.gaussian_scenes import LSB, assert_same_image, camera, random_cloud, random_rigid, splats
 
 FAST = ("cpu", "torch")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
-from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid, splats
 
 BACKENDS = ("reference", "cpu", "torch")

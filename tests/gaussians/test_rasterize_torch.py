@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.rasterize_torch import GaussianTensors, rasterize_tensors, rasterize_torch, sh_colours_torch
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors, rasterize_torch, sh_colours_torch
 from alpasim_plugin.gaussians.sh import sh_colours
 from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid
 

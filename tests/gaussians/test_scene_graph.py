@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from alpasim_plugin.errors import RendererError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.nodes import Level, SceneNode, split_by_tile
-from alpasim_plugin.gaussians.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.scene_graph import SceneGraph, in_view
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
+from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, split_by_tile
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, in_view
+from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.gaussians.sky import make_sky
 from alpasim_plugin.geometry import quat_from_yaw, se2, se3
 from alpasim_plugin.seeding import stream
 from tests.gaussians.scene_maps import camera_spec, straight
@@ -147,7 +147,7 @@ def test_splitting_by_tile_loses_nothing() -> None:
 
 
 def test_visible_count_of_a_street_stays_within_budget() -> None:
-    from alpasim_plugin.gaussians.builder import build_scene
+    from alpasim_plugin.gaussians.scene.builder import build_scene
 
     scenario = straight()
     graph = build_scene(scenario, lambda xy: np.zeros(len(xy)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from alpasim_plugin.gaussians import simd as v
+from alpasim_plugin.gaussians.raster import simd as v
 
 
 @njit

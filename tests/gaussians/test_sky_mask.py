@@ -3,8 +3,8 @@
 import numpy as np
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.log_views import LogView
-from alpasim_plugin.gaussians.sky_mask import SkyMask
+from alpasim_plugin.gaussians.scene.log_views import LogView
+from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
 from alpasim_plugin.geometry import se2
 
 

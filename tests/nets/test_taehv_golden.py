@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.carry import Carry
 from alpasim_plugin.nets.frame_layers import run, to_layers
+from alpasim_plugin.nets.streaming_state import Carry
 from alpasim_plugin.nets.taehv import TinyDecoder
 from tests.nets.codec_cases import golden
 

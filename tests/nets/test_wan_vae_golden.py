@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.carry import Carry
 from alpasim_plugin.nets.frame_layers import from_layers, to_layers
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD
+from alpasim_plugin.nets.streaming_state import Carry
 from alpasim_plugin.nets.wan_vae import WanVAE
 from tests.nets.codec_cases import golden
 

@@ -9,7 +9,7 @@ import pytest
 
 from alpasim_plugin.errors import InputError, RendererError
 from alpasim_plugin.gaussians import write_ply
-from alpasim_plugin.gaussians.degrade import GHOST
+from alpasim_plugin.gaussians.scene.degrade import GHOST
 from alpasim_plugin.geometry import quat_from_yaw, se3
 from alpasim_plugin.renderers import RENDERERS, make_renderer
 from alpasim_plugin.renderers.gaussian import SurrogateRenderer, clear_cache, scene_key, scene_of

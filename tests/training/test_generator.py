@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
@@ -19,7 +20,6 @@ from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.fixer_run import FixerRun, start_weights, train_fixer
 from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
-from alpasim_plugin.training.memory import measure_memory, memory_table
 from alpasim_plugin.training.pair_store import PairDataset, write_sequence
 from alpasim_plugin.training.trainer import Schedule
 from alpasim_plugin.training.variants import VARIANTS, variant_of

@@ -27,8 +27,8 @@ from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
 from alpasim_plugin.gaussians.fit.ssim_cpu import SsimTruth
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.rasterize_gradient import rasterize_gradient
-from alpasim_plugin.gaussians.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.seeding import stream
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)

@@ -14,7 +14,7 @@ from torch import Tensor
 from alpasim_plugin.gaussians.arrays import logit
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.start import Start
-from alpasim_plugin.gaussians.gradient_types import Splats
+from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.sh import SH_SIZES, sh_rotation
 from alpasim_plugin.geometry import quat_from_matrix
 from alpasim_plugin.types import F64

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
+from alpasim_plugin.gaussians.scene.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
 from alpasim_plugin.types import F32, F64
 
 

@@ -15,7 +15,7 @@ import torch
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.builder import with_background
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.nodes import Level, SceneNode
-from alpasim_plugin.gaussians.ply import read_ply, write_ply
-from alpasim_plugin.gaussians.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
+from alpasim_plugin.gaussians.scene.builder import with_background
+from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
 INDEX_FILE, BACKGROUND_FILE, SKY_FILE = "reconstruction.json", "background.ply", "sky.png"
 

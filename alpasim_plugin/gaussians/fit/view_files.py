@@ -27,9 +27,9 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.ply_header import read_ply_element, read_ply_header
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.ply_header import read_ply_element, read_ply_header
 from alpasim_plugin.geometry import inverse
 from alpasim_plugin.types import F64, Bool
 

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.degrade import log_actors
-from alpasim_plugin.gaussians.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.geometry import interpolate
 from alpasim_plugin.types import F32, F64, Bool, CameraSpec, Scenario
 

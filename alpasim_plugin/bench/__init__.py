@@ -1,0 +1,1 @@
+"""Speed beside error: what measures the product and is no part of it."""

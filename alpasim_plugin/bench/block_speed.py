@@ -1,0 +1,105 @@
+"""Time steady blocks of a fixer on a device with random weights: what the floors of `work` are held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from alpasim_plugin.bench.block_work import TEXT_TOKENS, BlockWork, check_device, run_block, steady_after
+from alpasim_plugin.bench.fixer_speed import MB
+from alpasim_plugin.bench.random_networks import random_networks
+from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.stage_clock import StageClock
+from alpasim_plugin.nets.attention_kernels import Kernel, attention_kernel
+from alpasim_plugin.nets.graphs import GraphedFunction
+from alpasim_plugin.nets.precision import stream_dtype
+
+
+@dataclass(frozen=True)
+class BlockTimes:
+    """Milliseconds per block.
+
+    Attributes:
+        first: The very first block, buffers and kernels chosen in it.
+        all_in: Steady blocks with their cache write, through recordings on a GPU.
+        stages: The same by stage, each run by itself.
+        calls: How steady blocks ran (see `GraphedFunction.counts`); empty without recordings.
+        peak_mb: Most memory allocated on the device, 1e6 bytes; None on a CPU.
+        device: Its name.
+    """
+
+    first: float
+    all_in: list[float]
+    stages: dict[str, list[float]]
+    calls: dict[str, int]
+    peak_mb: float | None
+    device: str
+
+
+def measure_blocks(
+    settings: OneFixerSettings,
+    work: BlockWork,
+    height: int,
+    width: int,
+    device: str,
+    blocks: int = 30,
+    text_tokens: int = TEXT_TOKENS,
+    attention: Kernel = "auto",
+) -> BlockTimes:
+    """Run a fixer's networks block by block over noise.
+
+    Args:
+        settings: The fixer; weights that it names are not read.
+        work: Of the same settings and size: what memory it needs.
+        height, width: Pixels, multiples of 16.
+        device: ``cpu`` or ``cuda``.
+        blocks: Steady blocks to time, and as many again with a clock at each stage.
+        text_tokens: Of the prompt.
+        attention: The transformer's and the autoencoder's attention kernel.
+
+    Raises:
+        FixerError: A GPU that is absent or too small, before anything is put on it.
+        InputError: An attention kernel that is not there.
+    """
+    check_device(settings, work, device)
+    with attention_kernel(attention, device, stream_dtype(settings.precision, device), settings.dit.head_width):
+        return _measured(settings, work, height, width, device, blocks, text_tokens)
+
+
+def _measured(
+    settings: OneFixerSettings, work: BlockWork, height: int, width: int, device: str, blocks: int, text_tokens: int
+) -> BlockTimes:
+    pipeline = BlockPipeline(random_networks(settings, device, text_tokens), settings)
+    clock = StageClock(device)
+    state, index = pipeline.start(work.views, height, width), 0
+
+    def advance() -> float:
+        nonlocal state, index
+        begin = clock.now()
+        state = _block(pipeline, state, index, work, height, width)
+        index += 1
+        return 1e3 * (clock.now() - begin)
+
+    first = advance()
+    warm = steady_after(settings) + 3  # shapes settle, two eager calls, one recording
+    for _ in range(warm):
+        advance()
+    all_in = [advance() for _ in range(blocks)]
+    fix = state.history.fix
+    calls = dict(fix.counts) if isinstance(fix, GraphedFunction) else {}
+    pipeline.stage = clock
+    stages: dict[str, list[float]] = {}
+    for _ in range(blocks):
+        clock.take()
+        advance()
+        for name, ms in clock.take().items():
+            stages.setdefault(name, []).append(ms)
+    on_gpu = torch.device(device).type == "cuda"
+    peak = torch.cuda.max_memory_allocated(device) / MB if on_gpu else None
+    return BlockTimes(first, all_in, stages, calls, peak, torch.cuda.get_device_name(device) if on_gpu else "cpu")
+
+
+def _block(pipeline: BlockPipeline, state: PipelineState, index: int, work: BlockWork, height: int, width: int) -> PipelineState:
+    return pipeline.keep(run_block(pipeline, state, index, work.views, height, width)[1])

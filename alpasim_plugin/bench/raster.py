@@ -1,0 +1,237 @@
+"""Measure the rasterisers: time beside error, on a random scene with the statistics of a street.
+
+Run ``python -m alpasim_plugin.bench.raster``.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.raster.prepared import prepare
+from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
+from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F64
+
+Size = tuple[int, int, int]  # Gaussians, width, height
+SIZES: tuple[Size, ...] = ((30_000, 256, 144), (100_000, 256, 144), (100_000, 480, 272), (100_000, 960, 544), (500_000, 960, 544))
+SKY = (0.5, 0.6, 0.8)
+_LSB = 1.0 / 255.0
+_TORCH_LIMIT = 100_000 * 256 * 144  # Gaussians x pixels up to which the torch backend is timed too
+
+
+@dataclass(frozen=True)
+class BenchRow:
+    """Speed of one scene at one size, with the error of the very same image beside it.
+
+    Attributes:
+        n: Gaussians in the scene.
+        width: Pixels.
+        height: Pixels.
+        threads: Threads used.
+        visible: Gaussians that reach the image.
+        pairs: (Gaussian, 16-pixel tile) pairs.
+        ms_best: Fastest frame of the prepared scene.
+        ms_p50: Median time of a frame.
+        ms_p95: 95th percentile of it.
+        cpu_ms: Processor time of a frame, all threads together: what remains comparable on a busy machine.
+        first_ms: Preparing the scene and drawing the first frame, kernels compiled or loaded included where they were not before.
+        max_error: Largest difference of a colour from the float64 reference, full scale 1; None where it was not asked for.
+        share_above_lsb: Share of the pixels that differ by more than 1/255; None likewise.
+        torch_ms: One frame of the torch backend; None where it was left out as too large.
+    """
+
+    n: int
+    width: int
+    height: int
+    threads: int
+    visible: int
+    pairs: int
+    ms_best: float
+    ms_p50: float
+    ms_p95: float
+    cpu_ms: float
+    first_ms: float
+    max_error: float | None
+    share_above_lsb: float | None
+    torch_ms: float | None
+
+
+def bench_raster(
+    sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequence[int] = (1, 2), with_error: bool = True, seed: int = 0
+) -> list[BenchRow]:
+    """Time the CPU rasteriser and compare the images that it made with the reference.
+
+    Args:
+        sizes: ``(Gaussians, width, height)`` of each scene.
+        repeats: Frames timed per row.
+        threads: Thread counts to time.
+        with_error: Also draw the float64 reference, which takes about 75 us a visible Gaussian.
+        seed: Seed of the scene.
+
+    Returns:
+        One row per size and thread count, in that order.
+    """
+    rows = []
+    for n, width, height in sizes:
+        scene, camera = driving_like_scene(n, seed), driving_camera(width, height)
+        want = rasterize_reference(scene, camera, SKY) if with_error else None
+        torch_ms = _torch_ms(scene, camera) if n * width * height <= _TORCH_LIMIT else None
+        for count in threads:
+            begin = time.perf_counter()
+            nodes = [(prepare(scene), None)]
+            out = rasterize_prepared(nodes, camera, SKY, threads=count)
+            first_ms = (time.perf_counter() - begin) * 1e3
+            used = time.process_time()
+            times = _times_ms(partial(rasterize_prepared, nodes, camera, SKY, threads=count), repeats)
+            cpu_ms = (time.process_time() - used) / repeats * 1e3
+            error = None if want is None else np.abs(out.rgb - want.rgb).max(axis=2)
+            rows.append(
+                BenchRow(
+                    n, width, height, count, out.stats["visible"], out.stats["pairs"],
+                    min(times), float(np.median(times)), float(np.percentile(times, 95)), cpu_ms, first_ms,
+                    None if error is None else float(error.max()), None if error is None else float(np.mean(error > _LSB)), torch_ms,
+                )
+            )  # fmt: skip
+    return rows
+
+
+def start_times_ms() -> tuple[float, float]:
+    """Return the time from starting Python to the first image: with nothing compiled, and with kernels cached by an earlier process."""
+    code = (
+        "import numpy as np; from alpasim_plugin.bench.raster import driving_camera, driving_like_scene;"
+        "from alpasim_plugin.gaussians import rasterize; rasterize(driving_like_scene(1000), driving_camera(64, 36))"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
+        first, second = (
+            _times_ms(lambda: subprocess.run([sys.executable, "-c", code], env=environment, check=True), 1)[0] for _ in range(2)
+        )
+    return first, second
+
+
+def format_rows(rows: Sequence[BenchRow]) -> str:
+    """Return the rows as a Markdown table."""
+    lines = [
+        "| Gaussians | image | threads | visible | tile pairs | ms best | p50 | p95 | cpu | first | error, 1/255 | share above | torch |",
+        "|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for r in rows:
+        torch_ms = "-" if r.torch_ms is None else f"{r.torch_ms:.0f}"
+        worst = "-" if r.max_error is None else f"{r.max_error / _LSB:.4f}"
+        share = "-" if r.share_above_lsb is None else f"{r.share_above_lsb:.2g}"
+        times = " | ".join(f"{ms:.1f}" for ms in (r.ms_best, r.ms_p50, r.ms_p95, r.cpu_ms))
+        lines.append(
+            f"| {r.n} | {r.width}x{r.height} | {r.threads} | {r.visible} | {r.pairs} | {times} | "
+            f"{r.first_ms:.0f} | {worst} | {share} | {torch_ms} |"
+        )
+    return "\n".join(lines)
+
+
+def _times_ms(call: Callable[[], object], repeats: int) -> list[float]:
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        times.append((time.perf_counter() - begin) * 1e3)
+    return times
+
+
+def _torch_ms(scene: GaussianCloud, camera: PinholeCamera) -> float:
+    # Imported on use: the table without this column needs no torch.
+    from alpasim_plugin.gaussians.raster.rasterize_torch import rasterize_torch
+
+    def draw() -> RasterOutput:
+        return rasterize_torch(scene, camera, SKY)
+
+    return min(_times_ms(draw, 2))
+
+
+def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianCloud:
+    """Return n Gaussians around a straight road, world axes ENU with the road along x, seen well from (0, 0, 1.6) towards +x.
+
+    30 % road, 35 % facades, 12 % vehicles, 18 % foliage, 5 % far shell at 300 m; sizes scale with n^-1/2, so that the covered share of an
+    image does not depend on n.
+    """
+    rng = stream("raster-bench", seed, "scene")
+    size = np.sqrt(100_000 / n)
+    counts = np.floor(np.array([0.30, 0.35, 0.12, 0.18]) * n).astype(int)
+    road, facade, vehicle, foliage = counts
+    far = n - int(counts.sum())
+
+    def flat(count: int, length_m: float, thickness_m: float) -> F64:
+        scales = length_m * size * np.exp(rng.normal(0.0, 0.4, (count, 3)))
+        scales[:, 2] = thickness_m
+        return np.asarray(scales)
+
+    # Points are denser near the camera, as reconstructions are.
+    def ahead(count: int, reach_m: float) -> F64:
+        return np.asarray(-8.0 + (reach_m + 8.0) * rng.uniform(0, 1, count) ** 1.5)
+
+    road_means = np.stack([ahead(road, 120), rng.uniform(-9, 9, road), rng.normal(0, 0.01, road)], axis=1)
+    side = rng.choice([-1.0, 1.0], facade)
+    facade_means = np.stack([ahead(facade, 140), side * (12 + rng.normal(0, 0.1, facade)), rng.uniform(0, 14, facade)], axis=1)
+    box = rng.integers(0, 24, vehicle)
+    car_at = np.stack([np.linspace(4, 110, 24), np.tile([-5.5, -2.0, 2.0, 5.5], 6), np.full(24, 0.8)], axis=1)
+    vehicle_means = car_at[box] + rng.uniform(-1, 1, (vehicle, 3)) * [2.2, 0.9, 0.75]
+    tree = rng.integers(0, 30, foliage)
+    tree_at = np.stack([np.linspace(0, 130, 30), np.tile([-9.5, 9.5], 15), np.full(30, 4.5)], axis=1)
+    foliage_means = tree_at[tree] + rng.normal(0, [1.4, 1.2, 1.4], (foliage, 3))
+    direction = rng.normal(size=(far, 3))
+    direction[:, 0] = 2 * np.abs(direction[:, 0])
+    direction[:, 2] = np.abs(direction[:, 2])
+    far_means = 300.0 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+    upright = np.sqrt(0.5)
+    quats = np.concatenate(
+        [
+            np.tile([1.0, 0, 0, 0], (road, 1)),
+            np.tile([upright, upright, 0, 0], (facade, 1)),  # thin axis along y
+            rng.normal(size=(vehicle + foliage + far, 4)),
+        ]
+    )
+    scales = np.concatenate(
+        [
+            flat(road, 0.2, 0.01),
+            flat(facade, 0.32, 0.02),
+            flat(vehicle, 0.07, 0.02),
+            0.12 * size * np.exp(rng.normal(0, 0.5, (foliage, 3))),
+            7.0 * size * np.exp(rng.normal(0, 0.3, (far, 3))),
+        ]
+    )
+    sh = rng.normal(0, 0.03, (n, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = rng.uniform(-1.2, 1.2, (n, 3))
+    opacities = np.clip(rng.beta(4.0, 1.2, n), 0.02, 0.999)
+    return GaussianCloud(
+        np.concatenate([road_means, facade_means, vehicle_means, foliage_means, far_means]),
+        quats.astype(np.float32),
+        scales.astype(np.float32),
+        opacities.astype(np.float32),
+        sh.astype(np.float32),
+    )
+
+
+def driving_camera(width: int, height: int) -> PinholeCamera:
+    """Return the camera of the bench: at (0, 0, 1.6), looking along +x, horizontal field of view 65 degrees."""
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T_world_camera[:3, 3] = [0, 0, 1.6]
+    return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)
+
+
+if __name__ == "__main__":
+    print(format_rows(bench_raster()))
+    cold_ms, cached_ms = start_times_ms()
+    print(f"\nstart of a process to its first image: {cold_ms:.0f} ms with nothing compiled, {cached_ms:.0f} ms with cached kernels")

@@ -1,0 +1,111 @@
+"""Make shots and have them fixed: the base renderer, the semantic map and the fixer's calls, each checked and timed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from alpasim_plugin.errors import FixerError, SimrunError
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.layers import actor_boxes
+from alpasim_plugin.semantic_map.prepare import PreparedMap
+from alpasim_plugin.types import U8, Actor, Frame, RenderRequest
+
+Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
+DOING = "fixing a block of frames"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One rendered frame with the semantic map of the same view."""
+
+    request: RenderRequest
+    frame: Frame
+    map: U8 | None  # (H, W, 3); None where the fixer uses none
+
+
+@dataclass
+class Workshop:
+    """What all blocks of a rollout are made with.
+
+    Attributes:
+        render: The base renderer, checked.
+        scene_map: The scene's map, or None where the fixer uses none.
+        actors: The scenario's, for the sizes of their boxes.
+        threads: Threads of the map rasteriser.
+        spent_ms: Time since `start_clock` by stage; the base renderer's is left out.
+    """
+
+    render: Callable[[RenderRequest], Frame]
+    scene_map: PreparedMap | None
+    actors: Sequence[Actor]
+    threads: int | None = None
+    spent_ms: dict[str, float] = field(default_factory=dict)
+
+    def start_clock(self) -> None:
+        """Begin a call: every stage met so far stands at zero."""
+        self.spent_ms = dict.fromkeys(self.spent_ms, 0.0)
+
+    def shoot(self, request: RenderRequest) -> Shot:
+        """Render one frame and draw its map."""
+        frame = self.render(request)
+        if self.scene_map is None:
+            return Shot(request, frame, None)
+        with self._timed("map"):
+            boxes = actor_boxes(request.actors, self.actors)
+            image = draw_map(self.scene_map, request.camera, request.T_world_camera[-1], boxes, threads=self.threads)
+        return Shot(request, frame, image)
+
+    def fix(self, fixer: object, call: Call, shots: Sequence[Shot]) -> list[Frame]:
+        """Have a block fixed and check what comes back.
+
+        Args:
+            fixer: Whose call it is; for messages, and for the stages it timed itself (``spent_ms``).
+            call: Its ``preview`` or ``step``.
+            shots: The block.
+
+        Raises:
+            FixerError: The fixer raised, or its frames have another number, time, camera, size or type.
+        """
+        frames, maps = [shot.frame for shot in shots], [shot.map for shot in shots if shot.map is not None]
+        name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
+        before = dict(getattr(fixer, "spent_ms", {}))
+        with self._timed("fix"):
+            try:
+                fixed = list(call(frames, maps))
+            except SimrunError:
+                raise
+            except Exception as error:
+                raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
+        self._own_stages(before, getattr(fixer, "spent_ms", {}))
+        problem = _problem(frames, fixed)
+        if problem:
+            raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")
+        return fixed
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.spent_ms[stage] = self.spent_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
+
+    def _own_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+        """File what a fixer timed itself (sums that only grow) as ``fix: STAGE``, and the rest of its call as ``fix``."""
+        for stage, total_ms in after.items():
+            part_ms = total_ms - before.get(stage, 0.0)
+            name = f"fix: {stage}"
+            self.spent_ms[name] = self.spent_ms.get(name, 0.0) + part_ms
+            self.spent_ms["fix"] -= part_ms
+
+
+def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:
+    if len(fixed) != len(given):
+        return f"{len(fixed)} frames came back"
+    for before, after in zip(given, fixed, strict=True):
+        if (before.t_us, before.camera) != (after.t_us, after.camera):
+            return f"camera {before.camera!r} at {before.t_us} us came back as {after.camera!r} at {after.t_us} us"
+        if before.rgb.shape != after.rgb.shape or before.rgb.dtype != after.rgb.dtype:
+            return f"rgb came back as {after.rgb.dtype} {after.rgb.shape}, not {before.rgb.dtype} {before.rgb.shape}"
+    return ""

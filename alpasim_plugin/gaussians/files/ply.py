@@ -1,0 +1,182 @@
+"""Read and write Gaussians as PLY in the layout of the original 3DGS code, for any spherical harmonics degree.
+
+Properties are found by name. Opacity is stored as logit, scale as natural logarithm, rotation as ``wxyz`` (not normalised) and
+``f_rest`` channel by channel: all red coefficients, then green, then blue.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.arrays import GaussianArrays, build_cloud, logit, sigmoid
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.ply_header import PlyElement, PlyHeader, read_ply_element, read_ply_header
+
+_REQUIRED = (
+    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+    "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+)  # fmt: skip
+Precision = Literal["float32", "float64"]
+
+
+def read_ply(path: Path | str, element: str | None = None) -> GaussianCloud:
+    """Read a Gaussian PLY file; broken Gaussians are dropped (`read_gaussians` also reports how many).
+
+    Args:
+        path: The file.
+        element: Which element to read where the file holds several models, as Street Gaussians writes them
+            (``vertex_background``, ``vertex_obj_000``, ...); None takes the only one.
+
+    Returns:
+        The cloud, in the axes and units of the file.
+
+    Raises:
+        InputError: Missing or truncated file, missing properties, ASCII body, or several elements and none named.
+
+    Example:
+        >>> cloud = read_ply("background.ply")  # doctest: +SKIP
+    """
+    return build_cloud(read_ply_arrays(path, element))[0]
+
+
+def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArrays:
+    """Read a Gaussian PLY file without dropping anything; see `read_ply`."""
+    header = read_ply_header(path)
+    chosen = header.element(element) if element is not None else _only_gaussian_element(header)
+    n_rest = _check_properties(header, chosen)
+    rows = read_ply_element(header, chosen.name)
+    return GaussianArrays(
+        means=_columns(rows, ("x", "y", "z")),
+        quats=_columns(rows, [f"rot_{i}" for i in range(4)]),
+        scales=_exp(_columns(rows, [f"scale_{i}" for i in range(3)])),
+        opacities=sigmoid(_columns(rows, ["opacity"])[:, 0]),
+        sh=_sh_from_columns(rows, n_rest),
+    )
+
+
+def write_ply(path: Path | str, cloud: GaussianCloud, precision: Precision = "float32") -> None:
+    """Write a cloud as a binary little-endian PLY that other 3DGS tools read.
+
+    Means, rotations and colours survive a round trip bit for bit. Scales and opacities pass through a logarithm, which float32
+    cannot hold exactly (relative error up to 5e-7); ``precision="float64"`` keeps them exact too, for tools that accept doubles.
+
+    Args:
+        path: The file; it appears under its name only once complete.
+        cloud: What to write.
+        precision: Type of every property.
+
+    Raises:
+        InputError: The folder is missing or not writable.
+    """
+    path = Path(path)
+    rows = ply_rows(cloud, precision)
+    word = {"float32": "float", "float64": "double"}[precision]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {word} {name}" for name in rows.dtype.names or ()]
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with partial.open("wb") as stream:
+            stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+            stream.write(rows.tobytes())
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise InputError("writing a PLY file", str(path), f"{error.strerror}", "check that the folder exists and has room") from error
+
+
+def ply_rows(cloud: GaussianCloud, precision: Precision = "float32") -> NDArray[np.void]:
+    """Return the rows ``(N,)`` of the vertex element that `write_ply` stores."""
+    n, k = cloud.sh.shape[:2]
+    rest = np.swapaxes(np.asarray(cloud.sh)[:, 1:, :], 1, 2).reshape(n, 3 * (k - 1))
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(np.asarray(cloud.scales, dtype=np.float64))
+    groups: list[tuple[Sequence[str], NDArray[np.floating]]] = [
+        (("x", "y", "z"), np.asarray(cloud.means)),
+        (("nx", "ny", "nz"), np.zeros((n, 3))),
+        ([f"f_dc_{i}" for i in range(3)], np.asarray(cloud.sh)[:, 0, :]),
+        ([f"f_rest_{i}" for i in range(3 * (k - 1))], rest),
+        (("opacity",), logit(np.asarray(cloud.opacities))[:, None]),
+        ([f"scale_{i}" for i in range(3)], log_scales),
+        ([f"rot_{i}" for i in range(4)], np.asarray(cloud.quats)),
+    ]
+    names = [name for group, _ in groups for name in group]
+    table = np.concatenate([values for _, values in groups], axis=1).astype("<f4" if precision == "float32" else "<f8")
+    return np.ascontiguousarray(table).view([(name, table.dtype) for name in names]).reshape(n)
+
+
+def _only_gaussian_element(header: PlyHeader) -> PlyElement:
+    """Return the only element that may hold Gaussians, or say which there are."""
+    candidates = [e for e in header.elements if "opacity" in e.properties or e.name.startswith("vertex")]
+    if len(candidates) == 1:
+        return candidates[0]
+    names = [e.name for e in header.elements]
+    if not candidates:
+        raise InputError("reading Gaussians from a PLY file", str(header.path), f"no vertex element, only {names}", "give a 3DGS PLY")
+    raise InputError(
+        "reading Gaussians from a PLY file",
+        str(header.path),
+        f"{len(candidates)} models in one file: {[e.name for e in candidates]}",
+        f"name one with element=, for example element={candidates[0].name!r}",
+    )
+
+
+def _check_properties(header: PlyHeader, element: PlyElement) -> int:
+    """Return the number of coefficients per channel beyond the constant one."""
+    have = set(element.properties)
+    missing = [name for name in _REQUIRED if name not in have]
+    if missing:
+        compressed = "packed_position" in have
+        raise InputError(
+            "reading Gaussians from a PLY file",
+            f"{header.path}, element {element.name!r}",
+            f"missing properties {missing}" + (" (it is a compressed PLY)" if compressed else ""),
+            "use read_gaussians, which knows compressed PLY" if compressed else "give a 3DGS PLY, not a mesh or points",
+        )
+    time_terms = sorted(name for name in have if name.startswith("f_dc_") and name not in _REQUIRED)
+    if time_terms:
+        raise InputError(
+            "reading Gaussians from a PLY file",
+            f"{header.path}, element {element.name!r}",
+            f"colours that change over time (Fourier terms {time_terms[0]}..{time_terms[-1]})",
+            "bake the colours at one time before export: only three f_dc values a Gaussian are supported",
+        )
+    n_rest = sum(name.startswith("f_rest_") for name in have)
+    per_channel, left_over = divmod(n_rest, 3)
+    complete = all(f"f_rest_{i}" in have for i in range(n_rest))
+    if left_over or not complete or math.isqrt(per_channel + 1) ** 2 != per_channel + 1:
+        raise InputError(
+            "reading Gaussians from a PLY file",
+            f"{header.path}, element {element.name!r}",
+            f"{n_rest} f_rest properties; a degree L has 3 ((L + 1)^2 - 1): 0, 9, 24, 45, 72",
+            "export the file again with whole bands of spherical harmonics",
+        )
+    return per_channel
+
+
+def _columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.floating]:
+    """Return ``(N, len(names))`` of float32, or float64 where the file has doubles."""
+    doubles = any(rows.dtype[name].itemsize > 4 for name in names)
+    return np.stack([rows[name].astype(np.float64 if doubles else np.float32) for name in names], axis=1)
+
+
+def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> NDArray[np.floating]:
+    """Return ``(N, 1 + n_rest, 3)``; the file is channel-major, memory is basis-major."""
+    dc = _columns(rows, [f"f_dc_{i}" for i in range(3)])
+    if not n_rest:
+        return dc[:, None, :]
+    rest = _columns(rows, [f"f_rest_{i}" for i in range(3 * n_rest)]).reshape(len(rows), 3, n_rest)
+    return np.concatenate([dc[:, None, :], np.swapaxes(rest, 1, 2)], axis=1)
+
+
+def _exp(log_scales: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return exp in float64; overflow becomes infinity, which cleaning drops and counts."""
+    with np.errstate(over="ignore"):
+        return np.exp(log_scales.astype(np.float64))

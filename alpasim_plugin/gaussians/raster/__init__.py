@@ -1,0 +1,1 @@
+"""The rasterisers: reference, CPU, torch, gsplat, and the CPU gradient."""

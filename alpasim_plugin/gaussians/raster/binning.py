@@ -1,0 +1,189 @@
+"""Sort splats by depth and list them per tile, nearest first.
+
+One stable sort of all visible splats, then a counting sort into tiles that keeps its order: on a CPU this beats the sort of all
+(tile, depth) pairs that GPU rasterisers use.
+"""
+
+# Numba's decorators are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.gaussians.raster.layout import HALF_WIDTH, RADIUS_X, RADIUS_Y, RECORD, SLOPE, TILE, TOP_Y, U, V, Z
+
+_RADIX_BITS = 11
+_LOW = np.int64(0xFFFFFFFF)
+
+
+@njit(cache=True, nogil=True)
+def depth_order(count, records, ids, depth_bits, pairs, spare):
+    """Return the array (``pairs`` or ``spare``) whose low 32 bits list the records nearest first, equal depths by identity.
+
+    The key is the bit pattern of the float32 depth: non-negative floats sort as integers. Identities are given in input order, so the
+    result does not depend on the order in which threads wrote the records.
+    """
+    if count == 0:
+        return pairs
+    nearest, farthest = np.int64(depth_bits[Z]), np.int64(depth_bits[Z])
+    for i in range(count):
+        key = np.int64(depth_bits[i * RECORD + Z])
+        nearest, farthest = min(nearest, key), max(farthest, key)
+    width = 0
+    while (farthest - nearest) >> width:
+        width += 1
+    passes = max(1, (width + _RADIX_BITS - 1) // _RADIX_BITS)
+    bits = (width + passes - 1) // passes
+    size = 1 << bits
+    mask = size - 1
+    histogram = np.zeros((passes, size), np.int64)
+    for i in range(count):
+        key = np.int64(depth_bits[i * RECORD + Z]) - nearest
+        pairs[i] = (key << 32) | i
+        for p in range(passes):
+            histogram[p, (key >> (p * bits)) & mask] += 1
+    source, target = pairs, spare
+    for p in range(passes):
+        total = 0
+        for b in range(size):
+            here = histogram[p, b]
+            histogram[p, b] = total
+            total += here
+        shift = 32 + p * bits
+        for i in range(count):
+            item = source[i]
+            b = (item >> shift) & mask
+            target[histogram[p, b]] = item
+            histogram[p, b] += 1
+        source, target = target, source
+    _order_ties(count, source, ids)
+    return source
+
+
+@njit(cache=True, nogil=True)
+def _order_ties(count, pairs, ids):
+    """Sort runs of equal depth by identity."""
+    start = 0
+    while start < count:
+        end = start + 1
+        while end < count and (pairs[end] >> 32) == (pairs[start] >> 32):
+            end += 1
+        if end - start > 32:
+            run = pairs[start:end].copy()
+            order = np.argsort(ids[run & _LOW])
+            for i in range(end - start):
+                pairs[start + i] = run[order[i]]
+        else:
+            for i in range(start + 1, end):
+                item = pairs[i]
+                identity = ids[item & _LOW]
+                j = i - 1
+                while j >= start and ids[pairs[j] & _LOW] > identity:
+                    pairs[j + 1] = pairs[j]
+                    j -= 1
+                pairs[j + 1] = item
+        start = end
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _tile_span(low, high, n_tiles):
+    """Return the first and one past the last tile whose pixel centres can lie between two coordinates."""
+    # Clamped as floats, since far off-screen bounds do not fit an integer; truncation is rounding down, as nothing is negative.
+    half, per_tile, zero = np.float32(0.5), np.float32(1.0 / TILE), np.float32(0.0)
+    limit = np.float32(n_tiles)
+    first = min(max((low - half) * per_tile, zero), limit)
+    last = min(max((high - half) * per_tile + np.float32(1.0), zero), limit)
+    return np.int32(first), np.int32(last)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ellipse_columns(records, at, row, tiles_x):
+    """Return the first and one past the last tile of a tile row that a splat's ellipse can touch."""
+    centre, radius_y = records[at + V], records[at + RADIUS_Y]
+    low = max(np.float32(row * TILE + 0.5) - centre, -radius_y)
+    high = min(np.float32(row * TILE + TILE - 0.5) - centre, radius_y)
+    left = right = records[at + RADIUS_X]
+    top_y, slope, half_width = records[at + TOP_Y], records[at + SLOPE], records[at + HALF_WIDTH]
+    one, zero, slack = np.float32(1.0), np.float32(0.0), np.float32(0.02)
+    # The rightmost point lies at dy = top_y and the leftmost at -top_y; outside of the band the nearer end of the band counts.
+    if top_y < low or top_y > high:
+        end = low if top_y < low else high
+        share = end / radius_y
+        right = min(right, slope * end + half_width * np.sqrt(max(zero, one - share * share)) + slack)
+    if -top_y < low or -top_y > high:
+        end = low if -top_y < low else high
+        share = end / radius_y
+        left = min(left, half_width * np.sqrt(max(zero, one - share * share)) - slope * end + slack)
+    return _tile_span(records[at + U] - left, records[at + U] + right, tiles_x)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _tile_box(records, at, tiles_x, tiles_y):
+    """Return the tiles of a splat's box: first and one past the last column, the same for rows."""
+    left, right = _tile_span(records[at + U] - records[at + RADIUS_X], records[at + U] + records[at + RADIUS_X], tiles_x)
+    top, bottom = _tile_span(records[at + V] - records[at + RADIUS_Y], records[at + V] + records[at + RADIUS_Y], tiles_y)
+    return left, right, top, bottom
+
+
+@njit(cache=True, nogil=True)
+def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram):
+    """Copy records into depth order and count, per chunk of ``chunk_size`` splats, how many meet each tile."""
+    n_chunks = histogram.shape[0]
+    while True:
+        chunk = v.fetch_add(cursor, 0, 1)
+        if chunk >= n_chunks:
+            return
+        counts = histogram[chunk]
+        counts[:] = 0
+        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
+            v.prefetch(records, (order[min(rank + 12, count - 1)] & _LOW) * RECORD)
+            source, at = (order[rank] & _LOW) * RECORD, rank * RECORD
+            v.store(ordered, at, v.load(records, source))
+            left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
+            for row in range(top, bottom):
+                if bottom - top > 1 and right - left > 1:
+                    left_here, right_here = _ellipse_columns(ordered, at, row, tiles_x)
+                else:
+                    left_here, right_here = left, right
+                for tile in range(row * tiles_x + left_here, row * tiles_x + right_here):
+                    counts[tile] += 1
+
+
+@njit(cache=True, nogil=True)
+def tile_offsets(histogram, starts):
+    """Turn the counts into each chunk's write positions; fill ``starts`` (tiles + 1); return the number of (splat, tile) pairs."""
+    n_chunks = histogram.shape[0]
+    total = 0
+    for tile in range(starts.shape[0] - 1):
+        starts[tile] = total
+        for chunk in range(n_chunks):
+            here = histogram[chunk, tile]
+            histogram[chunk, tile] = total
+            total += here
+    starts[starts.shape[0] - 1] = total
+    return total
+
+
+@njit(cache=True, nogil=True)
+def fill_tiles(cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists):
+    """Write each tile's list of ranks; chunks ascend and so do the ranks in a chunk, hence every list is in depth order."""
+    n_chunks = histogram.shape[0]
+    while True:
+        chunk = v.fetch_add(cursor, 0, 1)
+        if chunk >= n_chunks:
+            return
+        position = histogram[chunk]
+        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, count)):
+            at = rank * RECORD
+            left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
+            for row in range(top, bottom):
+                if bottom - top > 1 and right - left > 1:
+                    left_here, right_here = _ellipse_columns(ordered, at, row, tiles_x)
+                else:
+                    left_here, right_here = left, right
+                for tile in range(row * tiles_x + left_here, row * tiles_x + right_here):
+                    lists[position[tile]] = rank
+                    position[tile] += 1

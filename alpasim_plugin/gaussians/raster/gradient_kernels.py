@@ -1,0 +1,192 @@
+"""Composite tiles for training and take the image's gradient back to the splats, sixteen pixels at a time.
+
+The forward pass is that of `raster_kernels`; it keeps each pixel's transmittance and the last splat drawn there. The backward pass walks a
+tile's list from the back: with ``T`` the transmittance behind a splat and ``S`` what all splats behind it add to the loss,
+
+    T_before = T / (1 - alpha),    dL/dalpha = T_before q - S / (1 - alpha),    S <- S + T_before alpha q,
+
+where ``q`` is the splat's colour, depth and 1 weighted by the gradients of the pixel's sums. alpha is at most 0.99 and the division undoes
+the multiplication of the forward pass to rounding.
+
+Sums over the pixels of a tile go to one row per (splat, tile) pair, so that no two threads write to one place and the order of additions
+is fixed. They are moments of ``h = alpha dL/dalpha`` over the whitened coordinates ``s, t`` of the exponent, which stay small for needles.
+"""
+
+# Numba's decorators and vector types are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from alpasim_plugin.gaussians.constants import ALPHA_MAX
+from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.gaussians.raster.layout import PEAK, RECORD, TILE, B, G, R, U, V, Z
+from alpasim_plugin.gaussians.raster.raster_kernels import (
+    CUT,
+    STATE,
+    STATE_B,
+    STATE_D,
+    STATE_G,
+    STATE_R,
+    STATE_T,
+    block_coordinates,
+    composite_tile,
+    falloff,
+    start_tile,
+    touched_blocks,
+)
+
+_f = np.float32
+_ALPHA_MAX = _f(ALPHA_MAX)
+
+# What the forward pass keeps per block: transmittance and position of the last splat drawn, sixteen pixels each.
+KEPT_T, KEPT_LAST = 0, 16
+KEPT = 32
+# Columns of a block in the backward pass: the above, then the sum S and the gradients of colour, depth sum and alpha.
+_S, _GR, _GG, _GB, _GD, _GA = 32, 48, 64, 80, 96, 112
+_BACK = 128
+# One row per (splat, tile) pair: gradients of colour and depth, then the moments of h: 1, s, t, s s, s t, t t.
+PAIR_R, PAIR_G, PAIR_B, PAIR_Z, PAIR_H, PAIR_S, PAIR_T, PAIR_SS, PAIR_ST, PAIR_TT = range(10)
+PAIR = 10
+
+
+@njit(cache=True, nogil=True)
+def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha, depth_sum):
+    """Render tiles until none is left, without background; called by each thread.
+
+    Args:
+        cursor: int64 ``(1,)``, the next tile; shared by all threads.
+        tiles_x: Tiles in a row of tiles.
+        starts: See `binning.tile_offsets`.
+        lists: Ranks per tile.
+        records: Splats in the order of depth.
+        kept: float32 output, 16 x KEPT per tile, for `tile_gradients`.
+        colour: float32 output ``(H, W, 3)``, sum of weighted colours.
+        alpha: float32 output ``(H, W)``.
+        depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres.
+    """
+    state = np.empty(16 * STATE, np.float32)
+    last = np.empty(256, np.float32)
+    height, width = alpha.shape
+    while True:
+        tile = v.fetch_add(cursor, 0, 1)
+        if tile >= starts.shape[0] - 1:
+            return
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        live = start_tile(state, tile_x, tile_y, width, height)
+        last[:] = _f(-1.0)
+        x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
+        composite_tile(lists, starts[tile], starts[tile + 1], records, x0, y0, state, live, last)
+        for block in range(16):
+            at = (tile * 16 + block) * KEPT
+            v.store(kept, at + KEPT_T, v.absolute(v.load(state, block * STATE + STATE_T)))
+            v.store(kept, at + KEPT_LAST, v.load(last, block * 16))
+        for row in range(min(TILE, height - tile_y * TILE)):
+            y = tile_y * TILE + row
+            for column in range(min(TILE, width - tile_x * TILE)):
+                x = tile_x * TILE + column
+                at = ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
+                alpha[y, x] = _f(1.0) - abs(state[at + STATE_T])
+                depth_sum[y, x] = state[at + STATE_D]
+                colour[y, x, 0], colour[y, x, 1], colour[y, x, 2] = state[at + STATE_R], state[at + STATE_G], state[at + STATE_B]
+
+
+@njit(cache=True, nogil=True)
+def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth):
+    """Load a tile's state; return the bit mask of blocks where anything was drawn and the position behind the last splat drawn."""
+    pixels[:] = _f(0.0)
+    live, end = 0, 0
+    for block in range(16):
+        at = (tile * 16 + block) * KEPT
+        base = block * _BACK
+        for pixel in range(16):
+            x = tile_x * TILE + (block & 3) * 4 + (pixel & 3)
+            y = tile_y * TILE + (block >> 2) * 4 + (pixel >> 2)
+            here = base + pixel
+            last = kept[at + KEPT_LAST + pixel]
+            pixels[here + KEPT_T], pixels[here + KEPT_LAST] = kept[at + KEPT_T + pixel], last
+            if last >= _f(0.0):  # pixels outside of the image have none
+                live |= 1 << block
+                end = max(end, int(last) + 1)
+                pixels[here + _GR], pixels[here + _GG], pixels[here + _GB] = g_colour[y, x, 0], g_colour[y, x, 1], g_colour[y, x, 2]
+                pixels[here + _GD], pixels[here + _GA] = g_depth[y, x], g_alpha[y, x]
+    return live, end
+
+
+@njit(cache=True, nogil=True)
+def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
+    """Walk a tile's splats from the back and write a row of ``pairs`` for each that was drawn."""
+    zero, one = v.splat(_f(0.0)), v.splat(_f(1.0))
+    for i in range(end - 1, -1, -1):
+        v.prefetch(records, np.int64(lists[first + max(i - 8, 0)]) * RECORD)
+        at = np.int64(lists[first + i]) * RECORD
+        dx, dy = x0 - records[at + U], y0 - records[at + V]
+        todo = touched_blocks(records, at, dx, dy) & live
+        if todo == 0:
+            continue
+        place, peak = v.splat(_f(i)), v.splat(records[at + PEAK])
+        red, green, blue, depth = v.splat(records[at + R]), v.splat(records[at + G]), v.splat(records[at + B]), v.splat(records[at + Z])
+        to_red, to_green, to_blue, to_depth = zero, zero, zero, zero
+        m, m_s, m_t, m_ss, m_st, m_tt = zero, zero, zero, zero, zero, zero
+        while todo != 0:
+            block = v.lowest_bit(todo)
+            todo &= todo - 1
+            base = block * _BACK
+            s, t = block_coordinates(records, at, dx, dy, block)
+            y = v.fnma(s, s, v.fnma(t, t, peak))
+            drawn = (y >= v.splat(CUT)) & (place <= v.load(pixels, base + KEPT_LAST))
+            if v.bits(drawn) == 0:
+                continue
+            full = v.select(drawn, falloff(y), zero)
+            alpha = v.minimum(full, v.splat(_ALPHA_MAX))
+            inverse = one / (one - alpha)
+            before = v.load(pixels, base + KEPT_T) * inverse
+            g_red, g_green, g_blue = v.load(pixels, base + _GR), v.load(pixels, base + _GG), v.load(pixels, base + _GB)
+            g_depth = v.load(pixels, base + _GD)
+            q = v.fma(depth, g_depth, v.load(pixels, base + _GA))
+            q = v.fma(red, g_red, v.fma(green, g_green, v.fma(blue, g_blue, q)))
+            behind = v.load(pixels, base + _S)
+            weight = before * alpha
+            v.store(pixels, base + KEPT_T, before)
+            v.store(pixels, base + _S, v.fma(weight, q, behind))
+            to_red, to_green, to_blue = v.fma(weight, g_red, to_red), v.fma(weight, g_green, to_green), v.fma(weight, g_blue, to_blue)
+            to_depth = v.fma(weight, g_depth, to_depth)
+            # The clamp of alpha ends the gradient; colour and depth above still receive theirs.
+            h = v.select(full <= v.splat(_ALPHA_MAX), alpha * v.fnma(behind, inverse, before * q), zero)
+            h_s, h_t = h * s, h * t
+            m, m_s, m_t = m + h, m_s + h_s, m_t + h_t
+            m_ss, m_st, m_tt = v.fma(h_s, s, m_ss), v.fma(h_s, t, m_st), v.fma(h_t, t, m_tt)
+        row = (first + i) * PAIR
+        pairs[row + PAIR_R], pairs[row + PAIR_G], pairs[row + PAIR_B] = v.total(to_red), v.total(to_green), v.total(to_blue)
+        pairs[row + PAIR_Z] = v.total(to_depth)
+        pairs[row + PAIR_H], pairs[row + PAIR_S], pairs[row + PAIR_T] = v.total(m), v.total(m_s), v.total(m_t)
+        pairs[row + PAIR_SS], pairs[row + PAIR_ST], pairs[row + PAIR_TT] = v.total(m_ss), v.total(m_st), v.total(m_tt)
+
+
+@njit(cache=True, nogil=True)
+def tile_gradients(cursor, tiles_x, starts, lists, records, kept, g_colour, g_alpha, g_depth, pairs):
+    """Take the image's gradient to (splat, tile) pairs until no tile is left; called by each thread.
+
+    Args:
+        cursor: int64 ``(1,)``, the next tile; shared by all threads.
+        tiles_x: Tiles in a row of tiles.
+        starts: See `binning.tile_offsets`.
+        lists: Ranks per tile.
+        records: Splats in the order of depth.
+        kept: As `composite_tiles` wrote it.
+        g_colour: float32 ``(H, W, 3)``, gradient of the sum of weighted colours.
+        g_alpha: float32 ``(H, W)``.
+        g_depth: float32 ``(H, W)``, gradient of the sum of weighted depths.
+        pairs: float32 output, PAIR per entry of ``lists``, zero at the start.
+    """
+    pixels = np.empty(16 * _BACK, np.float32)
+    while True:
+        tile = v.fetch_add(cursor, 0, 1)
+        if tile >= starts.shape[0] - 1:
+            return
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        live, end = _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth)
+        x0, y0 = _f(tile_x * TILE) + _f(0.5), _f(tile_y * TILE) + _f(0.5)
+        _tile_backward(starts[tile], end, lists, records, x0, y0, pixels, live, pairs)

@@ -1,0 +1,289 @@
+"""Project prepared Gaussians, sixteen at a time: the fast twin of `alpasim_plugin.gaussians.raster.project`."""
+
+# Numba's decorators and vector types are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from alpasim_plugin.gaussians.constants import ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA
+from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.gaussians.raster.layout import (
+    BUNDLE,
+    CAM_CX,
+    CAM_CY,
+    CAM_FX,
+    CAM_FY,
+    CAM_HEIGHT,
+    CAM_LOD,
+    CAM_SLOPE_HIGH_X,
+    CAM_SLOPE_HIGH_Y,
+    CAM_SLOPE_LOW_X,
+    CAM_SLOPE_LOW_Y,
+    CAM_WIDTH,
+    EXPONENT_SCALE,
+    GEO_EXTENT,
+    GEO_FACTOR,
+    GEO_PEAK,
+    GEO_SIZE,
+    POSE_CENTRE,
+    POSE_COLOUR,
+    POSE_FAR,
+    POSE_NEAR,
+    POSE_ROTATION,
+    RECORD,
+    SPHERE_SIZE,
+)
+from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
+
+_f = np.float32
+_EPS = _f(EPS2D_PX2)
+_MARGIN_PX = _f(0.01)  # boxes and culls are grown by this: rounding must never cut a pixel that the alpha test would draw
+_LOWPASS_REACH_PX = EXTENT_MAX_SIGMA * EPS2D_PX2**0.5 + 0.5
+_CUT = (np.log2(ALPHA_MIN) + 4.0) / 8.0
+_BLOCK_HALF = _f(1.5)
+
+
+@njit(cache=True, nogil=True, inline="never")
+def bundle_is_out_of_view(sphere, at, pose, camera):
+    """Tell whether no Gaussian of a bundle can touch a pixel; errs only towards False.
+
+    A splat's half width on screen is at most 3.33 (f/z s sqrt(1 + slope^2) + sqrt(0.3)) for its largest scale s and the clamped slope, so
+    "right of the image" is the half space x - z (W - cx + 1.9)/f > 3.33 s sqrt(1 + slope^2), and likewise for the other edges.
+    """
+    dx, dy, dz = sphere[at] - pose[POSE_CENTRE], sphere[at + 1] - pose[POSE_CENTRE + 1], sphere[at + 2] - pose[POSE_CENTRE + 2]
+    radius, reach = sphere[at + 3], sphere[at + 4] * EXTENT_MAX_SIGMA
+    r = POSE_ROTATION
+    x = pose[r] * dx + pose[r + 1] * dy + pose[r + 2] * dz
+    y = pose[r + 3] * dx + pose[r + 4] * dy + pose[r + 5] * dz
+    z = pose[r + 6] * dx + pose[r + 7] * dy + pose[r + 8] * dz
+    if z + radius < pose[POSE_NEAR]:
+        return True
+    right = (camera[CAM_WIDTH] - camera[CAM_CX] + _LOWPASS_REACH_PX) / camera[CAM_FX]
+    left = (camera[CAM_CX] + _LOWPASS_REACH_PX) / camera[CAM_FX]
+    below = (camera[CAM_HEIGHT] - camera[CAM_CY] + _LOWPASS_REACH_PX) / camera[CAM_FY]
+    above = (camera[CAM_CY] + _LOWPASS_REACH_PX) / camera[CAM_FY]
+    slope_x = max(abs(camera[CAM_SLOPE_LOW_X]), abs(camera[CAM_SLOPE_HIGH_X]))
+    slope_y = max(abs(camera[CAM_SLOPE_LOW_Y]), abs(camera[CAM_SLOPE_HIGH_Y]))
+    reach_x, reach_y = reach * np.sqrt(1.0 + slope_x * slope_x), reach * np.sqrt(1.0 + slope_y * slope_y)
+    return (
+        x - z * right > reach_x + radius * np.sqrt(1.0 + right * right)
+        or -x - z * left > reach_x + radius * np.sqrt(1.0 + left * left)
+        or y - z * below > reach_y + radius * np.sqrt(1.0 + below * below)
+        or -y - z * above > reach_y + radius * np.sqrt(1.0 + above * above)
+    )
+
+
+@njit(cache=True, nogil=True)
+def colours_in_lanes(coefficients, width, index, out):
+    """Copy rows of ``width`` coefficients chosen by ``index`` into groups of ``width`` x 16 lanes; lanes left over are zero.
+
+    The colours are most of a cloud's bytes: this passes over them once, where array expressions would pass four times.
+    """
+    n_groups = out.shape[0] // (width * 16)
+    for group in range(n_groups):
+        for lane in range(16):
+            rank = group * 16 + lane
+            at = group * width * 16 + lane
+            if rank < index.shape[0]:
+                source = index[rank] * width
+                for k in range(width):
+                    out[at + k * 16] = coefficients[source + k]
+            else:
+                for k in range(width):
+                    out[at + k * 16] = np.float32(0.0)
+
+
+@njit(cache=True, nogil=True)
+def nodes_in_view(spheres, poses, camera):
+    """Return the positions of the nodes that may touch a pixel."""
+    kept = np.empty(spheres.shape[0], np.int64)
+    count = 0
+    for i in range(spheres.shape[0]):
+        if not bundle_is_out_of_view(spheres[i], 0, poses[i], camera):
+            kept[count] = i
+            count += 1
+    return kept[:count]
+
+
+@njit(cache=True, nogil=True)
+def _write_basis(basis, x, y, z, size):
+    """Write ``size`` spherical harmonics of sixteen unit directions."""
+    v.store(basis, 0, v.splat(_f(C0)))
+    if size > 1:
+        v.store(basis, 16, v.splat(_f(-C1)) * y)
+        v.store(basis, 32, v.splat(_f(C1)) * z)
+        v.store(basis, 48, v.splat(_f(-C1)) * x)
+    if size > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        two_zz = zz + zz
+        difference = xx - yy
+        v.store(basis, 64, v.splat(_f(C2[0])) * x * y)
+        v.store(basis, 80, v.splat(_f(-C2[0])) * y * z)
+        v.store(basis, 96, v.splat(_f(C2[1])) * (two_zz - xx - yy))
+        v.store(basis, 112, v.splat(_f(-C2[0])) * x * z)
+        v.store(basis, 128, v.splat(_f(C2[2])) * difference)
+        if size > 9:
+            three = v.splat(_f(3.0))
+            four_zz = two_zz + two_zz - xx - yy
+            v.store(basis, 144, v.splat(_f(-C3[0])) * y * (three * xx - yy))
+            v.store(basis, 160, v.splat(_f(C3[1])) * x * y * z)
+            v.store(basis, 176, v.splat(_f(-C3[2])) * y * four_zz)
+            v.store(basis, 192, v.splat(_f(C3[3])) * z * (two_zz - three * (xx + yy)))
+            v.store(basis, 208, v.splat(_f(-C3[2])) * x * four_zz)
+            v.store(basis, 224, v.splat(_f(C3[4])) * z * difference)
+            v.store(basis, 240, v.splat(_f(-C3[0])) * x * (xx - three * yy))
+
+
+@njit(cache=True, nogil=True)
+def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes):
+    """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask of those that reach the image."""
+    at = group * 48
+    dx = v.load(means, at) - v.splat(pose[POSE_CENTRE])
+    dy = v.load(means, at + 16) - v.splat(pose[POSE_CENTRE + 1])
+    dz = v.load(means, at + 32) - v.splat(pose[POSE_CENTRE + 2])
+    r = POSE_ROTATION
+    # Depth decides the order and is kept in float64 up to here; everything else tolerates float32 relative to the camera.
+    z64 = v.splat(pose[r + 6]) * dx + v.splat(pose[r + 7]) * dy + v.splat(pose[r + 8]) * dz
+    z = v.to_f32(z64)
+    mask = (z64 >= v.splat(pose[POSE_NEAR])) & (z64 <= v.splat(pose[POSE_FAR]))
+    if v.bits(mask) == 0:
+        return 0
+    dx, dy, dz = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)
+    r00, r01, r02 = v.splat(_f(pose[r])), v.splat(_f(pose[r + 1])), v.splat(_f(pose[r + 2]))
+    r10, r11, r12 = v.splat(_f(pose[r + 3])), v.splat(_f(pose[r + 4])), v.splat(_f(pose[r + 5]))
+    r20, r21, r22 = v.splat(_f(pose[r + 6])), v.splat(_f(pose[r + 7])), v.splat(_f(pose[r + 8]))
+    inverse_z = v.splat(_f(1.0)) / z
+    slope_x = v.fma(r00, dx, v.fma(r01, dy, r02 * dz)) * inverse_z
+    slope_y = v.fma(r10, dx, v.fma(r11, dy, r12 * dz)) * inverse_z
+    u = v.fma(v.splat(camera[CAM_FX]), slope_x, v.splat(camera[CAM_CX]))
+    w = v.fma(v.splat(camera[CAM_FY]), slope_y, v.splat(camera[CAM_CY]))
+    scale_x = v.splat(camera[CAM_FX]) * inverse_z
+    scale_y = v.splat(camera[CAM_FY]) * inverse_z
+    a = v.minimum(v.maximum(slope_x, v.splat(camera[CAM_SLOPE_LOW_X])), v.splat(camera[CAM_SLOPE_HIGH_X]))
+    b = v.minimum(v.maximum(slope_y, v.splat(camera[CAM_SLOPE_LOW_Y])), v.splat(camera[CAM_SLOPE_HIGH_Y]))
+
+    # Rows of J R; then rows m, n of M = J R R_q diag(s).
+    j0, j1, j2 = scale_x * v.fnma(a, r20, r00), scale_x * v.fnma(a, r21, r01), scale_x * v.fnma(a, r22, r02)
+    k0, k1, k2 = scale_y * v.fnma(b, r20, r10), scale_y * v.fnma(b, r21, r11), scale_y * v.fnma(b, r22, r12)
+    geo = group * (GEO_SIZE * 16)
+    f = geo + GEO_FACTOR * 16
+    a00, a01, a02 = v.load(geometry, f), v.load(geometry, f + 16), v.load(geometry, f + 32)
+    a10, a11, a12 = v.load(geometry, f + 48), v.load(geometry, f + 64), v.load(geometry, f + 80)
+    a20, a21, a22 = v.load(geometry, f + 96), v.load(geometry, f + 112), v.load(geometry, f + 128)
+    m0, n0 = v.fma(j0, a00, v.fma(j1, a10, j2 * a20)), v.fma(k0, a00, v.fma(k1, a10, k2 * a20))
+    m1, n1 = v.fma(j0, a01, v.fma(j1, a11, j2 * a21)), v.fma(k0, a01, v.fma(k1, a11, k2 * a21))
+    m2, n2 = v.fma(j0, a02, v.fma(j1, a12, j2 * a22)), v.fma(k0, a02, v.fma(k1, a12, k2 * a22))
+    mm = v.fma(m0, m0, v.fma(m1, m1, m2 * m2))
+    nn = v.fma(n0, n0, v.fma(n1, n1, n2 * n2))
+    mn = v.fma(m0, n0, v.fma(m1, n1, m2 * n2))
+    eps = v.splat(_EPS)
+    c11, c22 = mm + eps, nn + eps
+    extent = v.load(geometry, geo + GEO_EXTENT * 16)
+    radius_x, radius_y = extent * v.sqrt(c11), extent * v.sqrt(c22)
+    margin = v.splat(_MARGIN_PX)
+    half = v.splat(_f(0.5))
+    mask = mask & (u + radius_x + margin >= half) & (w + radius_y + margin >= half)
+    mask = mask & (u - radius_x - margin <= v.splat(camera[CAM_WIDTH] - _f(0.5)))
+    mask = mask & (w - radius_y - margin <= v.splat(camera[CAM_HEIGHT] - _f(0.5)))
+    mask = mask & (extent * v.sqrt(v.maximum(mm, nn)) >= v.splat(camera[CAM_LOD]))
+    chosen = v.bits(mask)
+    if chosen == 0:
+        return 0
+
+    # Variance of x given y, det / C22, from the Cauchy-Binet parts: scaled before squaring, so that it neither cancels nor overflows.
+    inverse_c22 = v.splat(_f(1.0)) / c22
+    root = v.sqrt(inverse_c22)
+    x01, x02, x12 = v.fnma(m1, n0, m0 * n1) * root, v.fnma(m2, n0, m0 * n2) * root, v.fnma(m2, n1, m1 * n2) * root
+    variance = v.fma(x01, x01, v.fma(x02, x02, x12 * x12)) + eps * ((c11 + nn) * inverse_c22)
+    deviation = v.sqrt(variance)
+    scale = v.splat(_f(EXPONENT_SCALE))
+    l11 = scale / deviation
+    slope = mn * inverse_c22
+    l12 = v.negative(l11 * slope)
+    l22 = scale * root
+    peak = v.load(geometry, geo + GEO_PEAK * 16)
+    block_half = v.splat(_BLOCK_HALF)
+    corner_s, corner_t = block_half * (l11 + v.absolute(l12)), block_half * l22
+    block_radius = v.sqrt(peak - v.splat(_f(_CUT))) + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t)) + v.splat(_f(1e-3))
+
+    c = POSE_COLOUR
+    tx = v.fma(v.splat(_f(pose[c])), dx, v.fma(v.splat(_f(pose[c + 1])), dy, v.splat(_f(pose[c + 2])) * dz))
+    ty = v.fma(v.splat(_f(pose[c + 3])), dx, v.fma(v.splat(_f(pose[c + 4])), dy, v.splat(_f(pose[c + 5])) * dz))
+    tz = v.fma(v.splat(_f(pose[c + 6])), dx, v.fma(v.splat(_f(pose[c + 7])), dy, v.splat(_f(pose[c + 8])) * dz))
+    length = v.splat(_f(1.0)) / v.sqrt(v.fma(tx, tx, v.fma(ty, ty, tz * tz)))
+    _write_basis(basis, tx * length, ty * length, tz * length, sh_size)
+    red, green, blue = half, half, half
+    colour = group * sh_size * 48
+    for k in range(sh_size):
+        value = v.load(basis, k * 16)
+        red = v.fma(value, v.load(sh, colour + k * 48), red)
+        green = v.fma(value, v.load(sh, colour + k * 48 + 16), green)
+        blue = v.fma(value, v.load(sh, colour + k * 48 + 32), blue)
+    zero = v.splat(_f(0.0))
+
+    v.store(lanes, 0, u)
+    v.store(lanes, 16, w)
+    v.store(lanes, 32, l11)
+    v.store(lanes, 48, l12)
+    v.store(lanes, 64, l22)
+    v.store(lanes, 80, peak)
+    v.store(lanes, 96, v.maximum(red, zero))
+    v.store(lanes, 112, v.maximum(green, zero))
+    v.store(lanes, 128, v.maximum(blue, zero))
+    v.store(lanes, 144, z)
+    v.store(lanes, 160, radius_x + margin)
+    v.store(lanes, 176, radius_y + margin)
+    v.store(lanes, 192, radius_x * mn / c11)
+    v.store(lanes, 208, slope)
+    v.store(lanes, 224, extent * deviation + margin)
+    v.store(lanes, 240, block_radius * block_radius)
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def project_node(cursor, means, geometry, sh, sh_size, index, spheres, first_id, pose, camera, records, ids):
+    """Project one node's Gaussians and append those that reach the image; called by each thread until no bundle is left.
+
+    Args:
+        cursor: int64 ``(2,)``: the next bundle, the number of records written; shared by all threads.
+        means: float64, groups of 3 x 16.
+        geometry: float32, groups of GEO_SIZE x 16.
+        sh: float32, groups of sh_size x 3 x 16.
+        sh_size: Coefficients per colour.
+        index: int64, position of each lane's Gaussian in the cloud.
+        spheres: float64, SPHERE_SIZE per bundle.
+        first_id: Added to ``index``; makes identities unique over nodes and ordered by node.
+        pose: See layout.
+        camera: See layout.
+        records: float32 output, RECORD per splat.
+        ids: int64 output, one per splat.
+    """
+    lanes = np.empty(RECORD * 16, np.float32)
+    basis = np.empty(16 * 16, np.float32)
+    kept = np.empty(BUNDLE * RECORD, np.float32)
+    kept_ids = np.empty(BUNDLE, np.int64)
+    n_groups = index.shape[0] // 16
+    n_bundles = (n_groups * 16 + BUNDLE - 1) // BUNDLE
+    while True:
+        bundle = v.fetch_add(cursor, 0, 1)
+        if bundle >= n_bundles:
+            return
+        if bundle_is_out_of_view(spheres, bundle * SPHERE_SIZE, pose, camera):
+            continue
+        count = 0
+        first = bundle * (BUNDLE // 16)
+        for group in range(first, min(first + BUNDLE // 16, n_groups)):
+            chosen = _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes)
+            while chosen != 0:
+                lane = v.lowest_bit(chosen)
+                chosen &= chosen - 1
+                for field in range(RECORD):
+                    kept[count * RECORD + field] = lanes[field * 16 + lane]
+                kept_ids[count] = index[group * 16 + lane] + first_id
+                count += 1
+        out = v.fetch_add(cursor, 1, count)
+        records[out * RECORD : (out + count) * RECORD] = kept[: count * RECORD]
+        ids[out : out + count] = kept_ids[:count]

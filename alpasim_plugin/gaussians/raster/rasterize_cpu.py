@@ -1,0 +1,221 @@
+"""Render on the CPU: project, sort, list per tile, composite; each stage on all threads."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
+from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
+from alpasim_plugin.gaussians.raster.binning import depth_order, fill_tiles, gather_and_count, tile_offsets
+from alpasim_plugin.gaussians.raster.layout import (
+    POSE_CENTRE,
+    POSE_COLOUR,
+    POSE_FAR,
+    POSE_NEAR,
+    POSE_ROTATION,
+    POSE_SIZE,
+    RECORD,
+    SPHERE_SIZE,
+    TILE,
+)
+from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
+from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
+from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
+from alpasim_plugin.gaussians.raster.workers import run_on_threads, thread_count
+from alpasim_plugin.types import F64
+
+
+class Buffers(threading.local):
+    """Arrays kept between frames, one set per calling thread: fresh memory would be paid for page by page in every frame."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, npt.NDArray[np.generic]] = {}
+
+    def get(self, name: str, size: int, dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
+        """Return an uninitialised array of at least ``size``."""
+        array = self._arrays.get(name)
+        if array is None or array.size < size:
+            array = self._arrays[name] = np.empty(size + size // 4, dtype)
+        return array
+
+
+_IDENTITY = np.eye(4)
+WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
+_buffers = Buffers()
+_prepared: weakref.WeakKeyDictionary[GaussianCloud, PreparedCloud] = weakref.WeakKeyDictionary()
+
+
+def rasterize_prepared(
+    nodes: Sequence[Node],
+    camera: PinholeCamera,
+    background: Background = (0.0, 0.0, 0.0),
+    *,
+    near_m: float = NEAR_M,
+    lod_px: float = 0.0,
+    threads: int | None = None,
+) -> RasterOutput:
+    """Render several prepared clouds, each at its rigid pose, in one image.
+
+    Args:
+        nodes: ``(prepared, T_world_node)`` pairs; None stands for the identity (a background in world coordinates). Equal depths are
+            drawn in the order of the nodes.
+        camera: From where.
+        background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
+        near_m: Gaussians whose centre is nearer are left out.
+        lod_px: Gaussians whose radius before the low-pass is smaller are left out; 0 draws all.
+        threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not depend on it.
+
+    Raises:
+        InputError: A transform is not rigid or the background does not fit.
+    """
+    threads = thread_count(threads)
+    behind = background_image(background, camera)
+    view = camera_numbers(camera, lod_px)
+    turned = np.array([prepared.sh_frame == "world" for prepared, _ in nodes], dtype=bool)
+    poses = node_poses([T for _, T in nodes], turned, camera, near_m)
+    in_view = nodes_in_view(np.array([prepared.sphere for prepared, _ in nodes]).reshape(-1, SPHERE_SIZE), poses, view)
+    total = sum(len(nodes[i][0]) for i in in_view)
+    records = _buffers.get("records", total * RECORD, np.float32)
+    ids = _buffers.get("ids", total, np.int64)
+    first_ids = np.cumsum([0, *(prepared.n_input for prepared, _ in nodes)])
+    cursor = np.zeros(2, np.int64)
+    for i in in_view:
+        prepared = nodes[i][0]
+        cursor[0] = 0
+        run_on_threads(
+            threads if len(prepared) > WORTH_THREADS else 1, project_node, cursor, prepared.means, prepared.geometry, prepared.sh,
+            prepared.sh_size, prepared.index, prepared.spheres, first_ids[i], poses[i], view, records, ids,
+        )  # fmt: skip
+    count = int(cursor[1])
+
+    tiles = list_per_tile(count, records, ids, camera, threads, _buffers)
+    shape = (camera.height, camera.width)
+    rgb, alpha, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    cursor[:] = 0
+    run_on_threads(threads, raster_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, behind, rgb, alpha, depth)
+    stats = {"gaussians": sum(p.n_input for p, _ in nodes), "visible": count, "pairs": tiles.pairs, "pairs_looked_at": int(cursor[1])}
+    return RasterOutput(rgb, alpha, depth, stats)
+
+
+def camera_numbers(camera: PinholeCamera, lod_px: float = 0.0) -> F32:
+    """Return a camera as the kernels read it, columns ``CAM_*``."""
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    return np.array(
+        [
+            *(camera.fx, camera.fy, camera.cx, camera.cy),
+            *(low_x, high_x, low_y, high_y),
+            *(camera.width, camera.height, lod_px),
+        ],
+        np.float32,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TileLists:
+    """Visible splats in the order of depth, and which of them each tile may show.
+
+    Attributes:
+        columns: Tiles in a row of tiles.
+        order: int64; its low 32 bits name the record of each rank.
+        ordered: float32, RECORD per rank.
+        starts: int64, where each tile's list begins, and the end of the last.
+        lists: int32, ranks, ascending within a tile.
+        pairs: Entries of ``lists`` in use.
+    """
+
+    columns: int
+    order: npt.NDArray[np.generic]
+    ordered: npt.NDArray[np.generic]
+    starts: npt.NDArray[np.int64]
+    lists: npt.NDArray[np.generic]
+    pairs: int
+
+
+def list_per_tile(
+    count: int, records: npt.NDArray[np.generic], ids: npt.NDArray[np.generic], camera: PinholeCamera, threads: int, buffers: Buffers
+) -> TileLists:
+    """Sort ``count`` projected records by depth and list them per tile; the arrays returned belong to ``buffers``."""
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    keys, spare = buffers.get("keys", count, np.int64), buffers.get("spare", count, np.int64)
+    order = depth_order(count, records, ids, records.view(np.int32), keys, spare)
+    ordered = buffers.get("ordered", count * RECORD, np.float32)
+    # At most 64 chunks of at least 2048 splats: enough to share out, few enough to keep their tile counts small.
+    chunk_size = max(2048, -(-count // 64))
+    n_chunks, n_tiles = -(-count // chunk_size), tiles_x * tiles_y
+    histogram = buffers.get("histogram", n_chunks * n_tiles, np.int64)[: n_chunks * n_tiles].reshape(n_chunks, n_tiles)
+    starts = np.empty(n_tiles + 1, np.int64)
+    cursor = np.zeros(2, np.int64)
+    workers = threads if count > WORTH_THREADS else 1
+    run_on_threads(workers, gather_and_count, cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram)
+    pairs = int(tile_offsets(histogram, starts))
+    lists = buffers.get("lists", pairs, np.int32)
+    cursor[:] = 0
+    run_on_threads(workers, fill_tiles, cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, lists)
+    return TileLists(tiles_x, order, ordered, starts, lists, pairs)
+
+
+def node_poses(
+    T_world_nodes: Sequence[npt.NDArray[np.floating] | None], turned: npt.NDArray[np.bool_], camera: PinholeCamera, near_m: float
+) -> F64:
+    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``; all differences of large coordinates happen here, in float64.
+
+    Args:
+        T_world_nodes: Rigid transforms; None is the identity.
+        turned: ``(N,)``, which nodes' colours are seen along world directions instead of the node's own.
+        camera: Seen from where.
+        near_m: Near plane, metres.
+
+    Raises:
+        InputError: A transform is not rigid.
+    """
+    poses = np.empty((len(T_world_nodes), POSE_SIZE))
+    given = [_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for T in T_world_nodes]
+    if not all(T.shape == (4, 4) for T in given) or not _all_rigid(np.array(given).reshape(-1, 4, 4)):
+        for T in given:  # the precise message is composed only where the cheap test of all nodes at once fails
+            require_rigid(T, "placing a node")
+    T_world_node = np.array(given).reshape(-1, 4, 4)
+    rotation = T_world_node[:, :3, :3]
+    poses[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
+    poses[:, POSE_CENTRE:POSE_COLOUR] = np.einsum("nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3])
+    poses[:, POSE_NEAR], poses[:, POSE_FAR] = near_m, FAR_M
+    poses[:, POSE_COLOUR:POSE_NEAR] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
+    return poses
+
+
+def _all_rigid(T: F64) -> bool:
+    """Tell whether all of ``(N, 4, 4)`` pass `require_rigid`."""
+    gram = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
+    return bool(
+        np.all(np.abs(gram - np.eye(3)) <= 1e-5)
+        and np.all(np.linalg.det(T[:, :3, :3]) > 0)
+        and np.isfinite(T).all()
+        and np.all(np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9)
+    )
+
+
+def rasterize_cpu(
+    cloud: GaussianCloud,
+    camera: PinholeCamera,
+    background: Background = (0.0, 0.0, 0.0),
+    *,
+    near_m: float = NEAR_M,
+    lod_px: float = 0.0,
+    threads: int | None = None,
+) -> RasterOutput:
+    """Render one cloud in world coordinates.
+
+    The prepared form of a cloud is kept as long as the cloud lives, so repeated frames of one cloud are fast. Arrays that a cloud was built
+    from are therefore not to be changed in place (those of the cloud itself are read-only).
+    """
+    prepared = _prepared.get(cloud)
+    if prepared is None:
+        prepared = _prepared[cloud] = prepare(cloud)
+    return rasterize_prepared([(prepared, None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads)

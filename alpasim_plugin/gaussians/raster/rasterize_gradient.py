@@ -1,0 +1,238 @@
+"""Render splats for training: one `torch.autograd.Function` whose forward and backward passes are compiled CPU kernels.
+
+On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.gradient_gsplat`). `rasterize_torch` is the readable twin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.constants import NEAR_M
+from alpasim_plugin.gaussians.raster.gradient_colour import colour_splats
+from alpasim_plugin.gaussians.raster.gradient_kernels import KEPT, PAIR, composite_tiles, tile_gradients
+from alpasim_plugin.gaussians.raster.gradient_project import pack, splat_gradients, sum_pairs
+from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, ScreenStatistics, Splats
+from alpasim_plugin.gaussians.raster.layout import BUNDLE, GEO_SIZE, POSE_CENTRE, RADIUS_X, RADIUS_Y, RECORD
+from alpasim_plugin.gaussians.raster.project_kernels import project_node
+from alpasim_plugin.gaussians.raster.rasterize_cpu import WORTH_THREADS, Buffers, TileLists, camera_numbers, list_per_tile, node_poses
+from alpasim_plugin.gaussians.raster.workers import run_on_threads, thread_count
+from alpasim_plugin.types import F64
+
+_DOING = "rendering splats for training"
+_LANES = 16
+F32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One camera as the kernels read it."""
+
+    camera: PinholeCamera
+    numbers: F32
+    pose: F64
+    threads: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Parameters:
+    """The splats' parameters as arrays that share memory with the tensors where types allow."""
+
+    means: F64
+    log_scales: F32
+    quaternions: F32
+    logits: F32
+    sh: F32
+
+    @classmethod
+    def of(cls, *tensors: Tensor) -> _Parameters:
+        means, *rest = tensors
+        arrays = (t.detach().to(torch.float32).contiguous().numpy() for t in rest)
+        return cls(means.detach().to(torch.float64).contiguous().numpy(), *arrays)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """What the forward pass keeps for the backward pass."""
+
+    tiles: TileLists
+    gaussian: npt.NDArray[np.int64]  # (M,) which Gaussian each rank shows
+    pixels: F32  # per tile, see gradient_kernels
+
+
+def _chunk(count: int) -> int:
+    """Return how many splats to take at once: at most 64 chunks, whatever the number of threads."""
+    return max(512, -(-count // 64))
+
+
+def _project(p: _Parameters, view: _View) -> tuple[TileLists, npt.NDArray[np.int64]]:
+    """Project, sort and list the splats, colours included."""
+    n = len(p.means)
+    groups = -(-n // _LANES)
+    lane_means, geometry = np.empty(groups * 3 * _LANES), np.zeros(groups * GEO_SIZE * _LANES, np.float32)
+    bad = pack(p.means, p.log_scales, p.quaternions, p.logits, lane_means, geometry)
+    if bad >= 0:
+        _refuse(p, bad)
+    buffers = Buffers()
+    records, ids = buffers.get("records", n * RECORD, np.float32), buffers.get("ids", n, np.int64)
+    # Colours follow for the visible ones alone, and bundles in the optimiser's order have no bounding spheres worth a test.
+    plain = np.zeros(groups * 3 * _LANES, np.float32)
+    everywhere = np.tile([0.0, 0.0, 0.0, np.inf, 0.0], -(-n // BUNDLE))
+    cursor = np.zeros(2, np.int64)
+    index = np.arange(groups * _LANES, dtype=np.int64)
+    workers = view.threads if n > WORTH_THREADS else 1
+    run_on_threads(
+        workers, project_node, cursor, lane_means, geometry, plain, 1, index, everywhere, 0, view.pose, view.numbers, records, ids
+    )
+    count = int(cursor[1])
+    cursor[:] = 0
+    centre = view.pose[POSE_CENTRE : POSE_CENTRE + 3]
+    run_on_threads(workers, colour_splats, cursor, _chunk(count), count, ids, p.means, centre, p.sh, records)
+    if cursor[1]:
+        _refuse(p, -1)
+    tiles = list_per_tile(count, records, ids, view.camera, view.threads, buffers)
+    gaussian = np.asarray(ids[tiles.order[:count] & 0xFFFFFFFF], np.int64)  # type: ignore[operator]
+    return tiles, gaussian
+
+
+def _refuse(p: _Parameters, bad: int) -> None:
+    """Raise the error about Gaussian ``bad``, or about a colour where that is below zero.
+
+    Raises:
+        InputError: Always.
+    """
+    cause = "a mean, scale, opacity or quaternion that is not finite, a quaternion of length zero or a scale beyond exp(20) m"
+    if bad < 0:
+        bad, cause = int(np.argmin(np.isfinite(p.sh).all(axis=(1, 2)))), "a colour that is not finite"
+    raise InputError(_DOING, f"{len(p.means)} splats", f"number {bad} has {cause}", "lower the learning rate, or drop such splats")
+
+
+class _Rasterize(torch.autograd.Function):
+    """Colour sum, alpha and depth sum of one view; the background is added outside."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, logits: Tensor, sh: Tensor, view: _View, screen: ScreenStatistics
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        p = _Parameters.of(means, log_scales, quaternions, logits, sh)
+        tiles, gaussian = _project(p, view)
+        shape = (view.camera.height, view.camera.width)
+        colour, alpha, depth_sum = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+        pixels = np.empty((len(tiles.starts) - 1) * _LANES * KEPT, np.float32)
+        cursor = np.zeros(1, np.int64)
+        run_on_threads(
+            view.threads, composite_tiles, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, pixels, colour, alpha, depth_sum
+        )
+        boxes = np.asarray(tiles.ordered[: len(gaussian) * RECORD]).reshape(-1, RECORD)[:, [RADIUS_X, RADIUS_Y]]
+        screen.radii[torch.from_numpy(gaussian)] = torch.from_numpy(np.ceil(boxes.max(axis=1, initial=0.0)).astype(np.int32))
+        ctx.save_for_backward(means, log_scales, quaternions, logits, sh)
+        ctx.view, ctx.screen, ctx.kept = view, screen, _Kept(tiles, gaussian, pixels)
+        return torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth_sum)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        view, kept, tensors = ctx.view, ctx.kept, ctx.saved_tensors
+        p = _Parameters.of(*tensors)
+        tiles = kept.tiles
+        g_colour, g_alpha, g_depth = (g.to(torch.float32).contiguous().numpy() for g in gradients)
+        pairs = np.zeros(tiles.pairs * PAIR, np.float32)
+        cursor = np.zeros(1, np.int64)
+        run_on_threads(
+            view.threads, tile_gradients, cursor, tiles.columns, tiles.starts, tiles.lists, tiles.ordered, kept.pixels, g_colour, g_alpha,
+            g_depth, pairs,
+        )  # fmt: skip
+        out = [np.zeros(a.shape, a.dtype) for a in (p.means, p.log_scales, p.quaternions, p.logits, p.sh)]
+        norm = np.zeros(len(p.means), np.float32)
+        sums = np.empty(len(p.means) * PAIR, np.float32)
+        workers = view.threads if len(kept.gaussian) > WORTH_THREADS else 1
+        cursor[:] = 0
+        run_on_threads(
+            workers, sum_pairs, cursor, _chunk(len(kept.gaussian)), kept.gaussian, tiles.starts, tiles.lists, pairs, tiles.ordered, sums
+        )
+        cursor[:] = 0
+        run_on_threads(
+            workers, splat_gradients, cursor, _chunk(len(p.means)), ctx.screen.radii.numpy(), sums, view.pose, view.numbers, p.means,
+            p.log_scales, p.quaternions, p.logits, p.sh, *out, norm,
+        )  # fmt: skip
+        ctx.screen.gradient_norm = torch.from_numpy(norm)
+        return (*(torch.from_numpy(g).to(t.dtype) for g, t in zip(out, tensors, strict=True)), None, None)
+
+
+def rasterize_gradient(
+    splats: Splats, camera: PinholeCamera, *, background: Tensor | None = None, near_m: float = NEAR_M, threads: int | None = None
+) -> GradientOutput:
+    """Render splats by the rule of `rasterize_reference`, with gradients of every parameter and of the background.
+
+    What ends the gradient is what ends the splat's part in the image: the alpha cut, the largest alpha (for opacity and shape, not for
+    colour and depth), the stop, the clamped slope in the covariance's Jacobian, a colour clamped at 0.
+
+    Args:
+        splats: What to draw; tensors on the CPU, or on a GPU where gsplat works.
+        camera: From where.
+        background: ``(3,)`` or ``(H, W, 3)``, 0..1; None is black. May require gradients.
+        near_m: Gaussians whose centre is nearer are left out.
+        threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients depend on it.
+
+    Returns:
+        The image with its graph. A second backward pass through the same graph needs ``retain_graph=True`` as usual; second derivatives
+        are not available.
+
+    Raises:
+        InputError: A splat that cannot be drawn, tensors on different devices, or a background that does not fit.
+        RendererError: The tensors are on a GPU and gsplat does not work there.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from alpasim_plugin.gaussians import GaussianCloud
+        >>> cloud = GaussianCloud([[0, 0, 5.0]], [[1.0, 0, 0, 0]], [[0.5, 0.5, 0.5]], [0.9], np.zeros((1, 1, 3)))
+        >>> splats = Splats.from_cloud(cloud)
+        >>> _ = splats.means.requires_grad_(True)
+        >>> out = rasterize_gradient(splats, PinholeCamera.from_hfov(32, 16, 1.0))
+        >>> out.alpha[:, :16].sum().backward()
+        >>> bool(splats.means.grad[0, 0] < 0), out.screen.gradient_norm.shape
+        (True, torch.Size([1]))
+    """
+    behind = _checked_background(background, splats, camera)
+    if splats.means.device.type != "cpu":
+        # Imported on use: it loads gsplat.
+        from alpasim_plugin.gaussians.raster.gradient_gsplat import rasterize_gradient_gsplat
+
+        return rasterize_gradient_gsplat(splats, camera, behind, near_m)
+    pose = node_poses([None], np.array([False]), camera, near_m)[0]
+    view = _View(camera, camera_numbers(camera), pose, thread_count(threads))
+    screen = ScreenStatistics(torch.zeros(len(splats), dtype=torch.int32))
+    colour, alpha, depth_sum = _Rasterize.apply(
+        splats.means, splats.log_scales, splats.quaternions, splats.logit_opacities, splats.sh, view, screen
+    )  # type: ignore[no-untyped-call]
+    rgb = colour if behind is None else colour + (1 - alpha)[..., None] * behind
+    depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
+    return GradientOutput(rgb, alpha, depth, screen)
+
+
+def _checked_background(background: Tensor | None, splats: Splats, camera: PinholeCamera) -> Tensor | None:
+    """Return the background in the type and on the device of the splats.
+
+    Raises:
+        InputError: Its shape does not fit, or the splats' tensors lie on different devices.
+    """
+    devices = {str(t.device) for t in (splats.means, splats.log_scales, splats.quaternions, splats.logit_opacities, splats.sh)}
+    if len(devices) > 1:
+        raise InputError(_DOING, f"{len(splats)} splats", f"tensors on {', '.join(sorted(devices))}", "move them all to one device")
+    if background is None:
+        return None
+    if background.shape not in ((3,), (camera.height, camera.width, 3)):
+        raise InputError(
+            _DOING,
+            f"a background of shape {tuple(background.shape)}",
+            f"a camera of {camera.width} x {camera.height} pixels",
+            f"give a tensor of shape (3,) or ({camera.height}, {camera.width}, 3)",
+        )
+    return background.to(splats.sh.device, torch.float32)

@@ -1,0 +1,249 @@
+"""Build road users as rigid clouds in the frame of their box: origin at the box centre, x length, y width, z height.
+
+A vehicle is lofted: stations along its length give the height of the belt line and the roof and the half widths there; strips between
+stations become body, glass and lights. People are a handful of ellipsoids. Everything is scaled to the actor's box, so that what is seen
+and what is hit are the same size. Colours come from the stream of the actor's id.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.scene.actor_shapes import STATIONS, Loft
+from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
+from alpasim_plugin.gaussians.scene.surfels import cloud_of, quad_surfels, rods, with_sheen
+from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F32, F64, Actor, Box, Scenario
+
+CELLS_M = (0.09, 0.22, 0.6)
+BODY_RGB = np.array(
+    [
+        *([0.78, 0.78, 0.78], [0.16, 0.16, 0.17], [0.55, 0.56, 0.58], [0.90, 0.90, 0.88], [0.50, 0.10, 0.10]),
+        *([0.13, 0.23, 0.45], [0.32, 0.34, 0.36], [0.20, 0.30, 0.24], [0.62, 0.55, 0.42]),
+    ]
+)
+TRUCK_RGB = np.array([[0.85, 0.85, 0.83], [0.70, 0.45, 0.18], [0.35, 0.45, 0.55]])
+BUS_RGB = np.array([[0.72, 0.16, 0.13], [0.20, 0.36, 0.60], [0.82, 0.80, 0.74]])
+CLOTHES_RGB = np.array(
+    [
+        *([0.15, 0.17, 0.25], [0.45, 0.12, 0.12], [0.20, 0.36, 0.24], [0.60, 0.58, 0.52]),
+        *([0.10, 0.10, 0.11], [0.70, 0.52, 0.16], [0.26, 0.40, 0.62]),
+    ]
+)
+SKIN_RGB = np.array([[0.80, 0.62, 0.50], [0.55, 0.38, 0.28], [0.36, 0.25, 0.19]])
+SKY_RGB = (0.72, 0.82, 0.92)
+GLASS_RGB = np.array([0.10, 0.12, 0.14])
+TYRE_RGB = np.array([0.07, 0.07, 0.075])
+HUB_RGB = np.array([0.50, 0.51, 0.53])
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def build_actors(scenario: Scenario) -> list[SceneNode]:
+    """Return one node per actor, named by the actor's id."""
+    return [build_actor(actor, scenario.scene_id, scenario.seed) for actor in scenario.actors]
+
+
+def build_actor(actor: Actor, scene_id: str, seed: int) -> SceneNode:
+    """Return the node of one actor at three levels of detail."""
+    rng = stream(scene_id, seed, f"scene/actor/{actor.actor_id}")
+    draw, noise = rng.random(8), rng.standard_normal(4096)
+    shape = _SHAPES.get(actor.label, _other)
+    levels = []
+    coarser = float(np.clip(actor.box.length_m / 5.0, 1.0, 2.0))
+    for cell_m in np.array(CELLS_M) * coarser:
+        cloud = GaussianCloud.concatenate([shape(actor.box, draw, noise, float(cell_m)), _shadow(actor.box, actor.label)])
+        levels.append(Level(float(cell_m), cloud))
+    return SceneNode(actor.actor_id, "actor", tuple(levels))
+
+
+def _shadow(box: Box, label: str) -> GaussianCloud:
+    """Lay a soft dark patch on the ground below: without it a body floats."""
+    wheels = label in ("car", "truck", "bus")
+    n = max(1, round(box.length_m / 1.2)) if wheels else 1
+    x = ((np.arange(n) + 0.5) / n - 0.5) * box.length_m
+    means = np.column_stack([x, np.zeros(n), np.full(n, 0.03 - box.height_m / 2)])
+    scales = np.tile([0.5 * box.length_m / n, 0.42 * box.width_m, 0.01], (n, 1))
+    return cloud_of(means, np.tile(IDENTITY, (n, 1)), scales, np.full((n, 3), 0.05), 0.75 if wheels else 0.45)
+
+
+def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
+    """Skin a loft and hang wheels, lights and plates on it."""
+    length, width, height = box.length_m, box.width_m, box.height_m
+    corners, rgb, gloss = loft.quads(body, GLASS_RGB)
+    scale = np.array([length, width, height])
+    quads = corners * scale + np.array([0.0, 0.0, -height / 2])
+    cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
+    # Light from above: roofs bright, flanks in between, undersides dark.
+    shade = 0.80 + 0.24 * normals[:, 2]
+    cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, _shaded(cloud.sh, shade[owner]))
+    parts = [with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB), _wheels(box, loft, cell_m), _lights(box, loft, cell_m)]
+    return GaussianCloud.concatenate(parts)
+
+
+def _shaded(sh: npt.NDArray[np.floating], shade: F64) -> F32:
+    return np.asarray(((sh * C0 + 0.5) * shade[:, None, None] - 0.5) / C0, dtype=np.float32)
+
+
+def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
+    """Draw wheels as dark discs with a pale hub, just proud of the flanks."""
+    radius = loft.wheel_m
+    x = np.repeat([loft.axles[0] * box.length_m, loft.axles[1] * box.length_m], 2)
+    y = np.tile([1.0, -1.0], 2) * (box.width_m / 2 - 0.02)
+    z = np.full(4, radius - box.height_m / 2)
+    if len(loft.axles) == 3:
+        x, y, z = np.append(x, [loft.axles[2] * box.length_m] * 2), np.append(y, y[:2]), np.append(z, z[:2])
+    n = len(x)
+    centre = np.column_stack([x, y, z])
+    disc = _blobs(centre, (0.52 * radius, 0.05, 0.52 * radius), TYRE_RGB)
+    if cell_m > 0.3:
+        return disc
+    angle = np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    rim = np.stack([np.cos(angle), np.zeros(10), np.sin(angle)], axis=1) * 0.74 * radius
+    tyre = _blobs((centre[:, None] + rim[None]).reshape(-1, 3), (0.19 * radius, 0.05, 0.19 * radius), TYRE_RGB)
+    outward = np.column_stack([np.zeros(n), 0.05 * np.sign(y), np.zeros(n)])
+    hub = _blobs(centre + outward, (0.26 * radius, 0.02, 0.26 * radius), HUB_RGB)
+    return GaussianCloud.concatenate([disc, tyre, hub])
+
+
+def _blobs(means: F64, scales: tuple[float, float, float], rgb: F64) -> GaussianCloud:
+    """Return Gaussians of one size, colour and orientation along the box's axes."""
+    n = len(means)
+    return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.tile(scales, (n, 1)), np.tile(rgb, (n, 1)))
+
+
+def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
+    """Draw head lamps, tail lamps and number plates on the two ends."""
+    half, z = box.length_m / 2, loft.lamp_z * box.height_m - box.height_m / 2
+    y = 0.36 * box.width_m
+    plate_z = loft.lamp_z * 0.62 * box.height_m - box.height_m / 2
+    end = half + 0.02
+    parts = [
+        _blobs(np.array([[end, y, z], [end, -y, z]]), (0.02, 0.10, 0.055), np.array([0.96, 0.96, 0.88])),
+        _blobs(np.array([[-end, y, z], [-end, -y, z]]), (0.02, 0.11, 0.065), np.array([0.80, 0.06, 0.05])),
+    ]
+    if cell_m < 0.3:
+        parts.append(_blobs(np.array([[-end, 0, plate_z], [end, 0, 1.05 * plate_z]]), (0.02, 0.14, 0.045), np.array([0.88, 0.88, 0.86])))
+    return GaussianCloud.concatenate(parts)
+
+
+def _car(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    kind = "van" if box.height_m > 1.95 else "suv" if box.height_m > 1.65 else ("hatch" if draw[1] < 0.4 else "sedan")
+    return _lofted(box, draw, noise, cell_m, STATIONS[kind], BODY_RGB[int(draw[0] * len(BODY_RGB))])
+
+
+def _truck(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    if box.length_m < 6.0 and box.height_m < 2.3:
+        return _lofted(box, draw, noise, cell_m, STATIONS["pickup"], BODY_RGB[int(draw[0] * len(BODY_RGB))])
+    return _lofted(box, draw, noise, cell_m, STATIONS["truck"], TRUCK_RGB[int(draw[0] * 3)])
+
+
+def _bus(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    return _lofted(box, draw, noise, cell_m, STATIONS["bus"], BUS_RGB[int(draw[0] * 3)])
+
+
+def _person(height_m: float, width_m: float, draw: F64, stride: float, z0: float, x0: float = 0.0, lean: float = 0.0) -> GaussianCloud:
+    """Return a standing or riding figure with its feet at ``(x0, 0, z0)``; ``lean`` and ``stride`` are shares of its height."""
+    h, w = height_m, min(max(width_m, 0.45), 0.75)
+    coat = CLOTHES_RGB[int(draw[2] * len(CLOTHES_RGB))]
+    legs = CLOTHES_RGB[int(draw[3] * len(CLOTHES_RGB))] * 0.8
+    skin = SKIN_RGB[int(draw[4] * len(SKIN_RGB))]
+    body = [  # x, y, z as shares of height, then sigma x, y, z as shares, then colour
+        (0.5 * lean, 0.0, 0.92, 0.040, 0.036, 0.048, skin),
+        (0.5 * lean - 0.01, 0.0, 0.955, 0.042, 0.038, 0.026, np.array([0.16, 0.12, 0.09])),
+        (0.3 * lean, 0.0, 0.75, 0.050, 0.075, 0.062, coat),
+        (0.2 * lean, 0.0, 0.62, 0.048, 0.066, 0.068, coat * 0.95),
+        (0.0, 0.0, 0.51, 0.050, 0.064, 0.045, legs),
+        (stride, 0.04, 0.36, 0.036, 0.034, 0.085, legs),
+        (-stride, -0.04, 0.36, 0.036, 0.034, 0.085, legs * 0.92),
+        (1.7 * stride, 0.04, 0.15, 0.030, 0.028, 0.085, legs * 0.9),
+        (-1.7 * stride, -0.04, 0.15, 0.030, 0.028, 0.085, legs * 0.85),
+        (1.9 * stride + 0.03, 0.04, 0.02, 0.050, 0.025, 0.015, np.array([0.12, 0.11, 0.10])),
+        (-1.9 * stride + 0.03, -0.04, 0.02, 0.050, 0.025, 0.015, np.array([0.12, 0.11, 0.10])),
+        (0.3 * lean - stride, 0.115, 0.66, 0.026, 0.024, 0.085, coat * 0.88),
+        (0.3 * lean + stride, -0.115, 0.66, 0.026, 0.024, 0.085, coat * 0.88),
+        (0.6 * lean - 1.5 * stride, 0.12, 0.50, 0.022, 0.020, 0.040, skin),
+        (0.6 * lean + 1.5 * stride, -0.12, 0.50, 0.022, 0.020, 0.040, skin),
+    ]
+    rows = np.array([[*part[:6], *part[6]] for part in body])
+    means = rows[:, :3] * [h, w / 0.33, h] + [x0, 0.0, z0]
+    scales = rows[:, 3:6] * [h, w / 0.33 * 0.9, h]
+    return cloud_of(means, np.tile(IDENTITY, (len(rows), 1)), scales, rows[:, 6:], 0.97)
+
+
+def _pedestrian(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    return _person(box.height_m, box.width_m, draw, 0.05 + 0.06 * draw[5], -box.height_m / 2)
+
+
+def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) -> GaussianCloud:
+    """Put a rider on two wheels and a frame."""
+    length, height = box.length_m, box.height_m
+    radius = min(0.34, 0.21 * length)
+    bottom = -height / 2
+    wheel_x = np.array([1.0, -1.0]) * (length / 2 - radius)
+    angle = np.linspace(0, 2 * np.pi, 20 if cell_m < 0.3 else 8, endpoint=False)
+    ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1) * radius
+    centres = np.array([[x, 0.0, bottom + radius] for x in wheel_x])
+    at = (centres[:, None] + ring[None]).reshape(-1, 3)
+    thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
+    tyres = _blobs(at, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
+    body = BODY_RGB[int(draw[0] * len(BODY_RGB))]
+    seat, bar = np.array([-0.12 * length, 0, bottom + 0.52 * height]), np.array([0.26 * length, 0, bottom + 0.60 * height])
+    pedal = np.array([-0.02 * length, 0, bottom + radius])
+    grip = np.array([0.0, 0.25, 0.0])
+    pairs = [(seat, centres[1]), (seat, pedal), (bar, pedal), (bar, centres[0]), (seat, bar), (bar + grip, bar - grip)]
+    start, end = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
+    frame = rods(start, end, 0.10 if heavy else 0.03, np.tile(body, (len(pairs), 1)), max(cell_m, 0.12))
+    rider = _person(0.80 * height, 0.55, draw, 0.06, bottom + 0.22 * height, -0.06 * length, 0.30)
+    return GaussianCloud.concatenate([tyres, frame, rider])
+
+
+def _cyclist(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    return _two_wheeler(box, draw, noise, cell_m, False)
+
+
+def _motorcycle(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    return _two_wheeler(box, draw, noise, cell_m, True)
+
+
+def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
+    """Draw a traffic cone where the box is small and slim, else a crate with warning stripes."""
+    length, width, height = box.length_m, box.width_m, box.height_m
+    if max(length, width) < 1.0:
+        n = 8 if cell_m < 0.3 else 4
+        z = (np.arange(n) + 0.5) / n
+        radius = 0.30 * min(length, width) * (1.05 - 0.8 * z)
+        rgb = np.where(((z > 0.4) & (z < 0.62))[:, None], [0.92, 0.92, 0.90], [0.90, 0.36, 0.08])
+        means = np.column_stack([np.zeros(n), np.zeros(n), (z - 0.5) * height])
+        return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb)
+    return _crate(length / 2, width / 2, height / 2, noise, cell_m)
+
+
+def _crate(x: float, y: float, z: float, noise: F64, cell_m: float) -> GaussianCloud:
+    """Return a striped box of half sizes x, y, z."""
+    faces, rgb_rows = [], []
+    for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        for k in range(4):
+            low, high = np.array([0, 0, -z + z * k / 2]), np.array([0, 0, -z + z * (k + 1) / 2])
+            side = np.array([-sy * x, sx * y, 0.0])
+            middle = np.array([sx * x, sy * y, 0.0])
+            faces.append([middle - side + low, middle + side + low, middle + side + high, middle - side + high])
+            rgb_rows.append([0.86, 0.84, 0.80] if k % 2 else [0.80, 0.42, 0.14])
+    faces.append([np.array(corner) for corner in ((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))])
+    rgb_rows.append([0.80, 0.60, 0.40])
+    return quad_surfels(np.array(faces), np.array(rgb_rows), cell_m, noise)[0]
+
+
+_SHAPES: dict[str, Callable[[Box, F64, F64, float], GaussianCloud]] = {
+    "car": _car,
+    "truck": _truck,
+    "bus": _bus,
+    "pedestrian": _pedestrian,
+    "cyclist": _cyclist,
+    "motorcycle": _motorcycle,
+    "other": _other,
+}

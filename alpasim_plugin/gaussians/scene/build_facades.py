@@ -1,0 +1,218 @@
+"""Build houses along the road: extruded boxes whose walls carry windows, doors and shop fronts.
+
+A wall is a grid of bays and floors, each bay a small pattern of cells; coarser levels use coarser patterns with the same mean look. Windows
+are cells, not holes: what a picture shows of a facade at street distances is colour and rhythm.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.scene.contours import contours
+from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, to_pixels
+from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quats_along
+from alpasim_plugin.geometry import arc_lengths, resample
+from alpasim_plugin.types import F64, I64, U8, Bool
+
+SETBACK_M = {False: 5.5, True: 24.0}  # by highway or not
+WITHIN_M = 75.0
+FLOOR_M, BAY_M = 3.1, 3.0
+WIDTH_M = (9.0, 19.0)
+DEPTH_M = 9.0
+CLEAR_M = 2.8  # no wall stands nearer to the road
+CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))  # cells per bay, and the cell size at which the level is chosen
+
+WALLS = np.array(
+    [
+        *([0.55, 0.30, 0.24], [0.63, 0.42, 0.33], [0.74, 0.68, 0.57], [0.80, 0.77, 0.72]),
+        *([0.58, 0.58, 0.58], [0.66, 0.60, 0.50], [0.47, 0.50, 0.54], [0.70, 0.52, 0.36]),
+    ]
+)
+GLASS = np.array([[0.16, 0.20, 0.26], [0.24, 0.31, 0.38], [0.36, 0.45, 0.52], [0.58, 0.55, 0.42]])
+AWNINGS = np.array([[0.60, 0.14, 0.12], [0.12, 0.32, 0.22], [0.13, 0.22, 0.45], [0.72, 0.60, 0.20], [0.30, 0.28, 0.28]])
+
+
+class Houses(NamedTuple):
+    """Boxes beside the road."""
+
+    front: F64  # (M, 2, 2) plan: the wall's two ends, seen from the road right then left
+    away: F64  # (M, 2) unit, plan
+    height_m: F64  # (M,)
+
+
+class _Walls(NamedTuple):
+    """Walls of all houses, plan coordinates."""
+
+    start: F64  # (W, 2)
+    end: F64  # (W, 2); outward is to the right of start to end
+    base: F64  # (W,) height of the foot, world
+    height_m: F64  # (W,)
+    house: I64  # (W,)
+    is_front: Bool  # (W,)
+
+
+def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
+    """Return the houses' nodes and where they stand."""
+    houses = place_houses(site)
+    if len(houses.front) == 0:
+        return [], houses
+    rng = site.rng("facade-style")
+    m = len(houses.front)
+    style = {
+        "wall": WALLS[rng.integers(len(WALLS), size=m)] * rng.uniform(0.88, 1.08, (m, 1)),
+        "trim": rng.uniform(0.75, 0.95, (m, 1)) * np.array([1.0, 0.98, 0.94]),
+        "shop": rng.random(m) < 0.45,
+        "awning": AWNINGS[rng.integers(len(AWNINGS), size=m)],
+        "wide": rng.random(m) < 0.35,
+    }
+    right, left = houses.front[:, 0], houses.front[:, 1]
+    back = DEPTH_M * houses.away
+    starts = np.concatenate([right, left, right + back, left + back])
+    ends = np.concatenate([left, left + back, right, right + back])
+    owner = np.tile(np.arange(m), 4)
+    is_front = np.arange(4 * m) < m
+    base = np.minimum(site.world(starts)[:, 2], site.world(ends)[:, 2])
+    top = (base[:m] + houses.height_m)[owner]  # on a slope the walls differ in height, the roof is level
+    seed = int(rng.integers(1 << 30))
+    walls = _Walls(starts, ends, base, top - base, owner, is_front)
+    levels = []
+    for cells, cell_m in CELLS:
+        cloud, wall = _walls(site, walls, style, cells, seed)
+        roof, house = _roofs(site, houses, style["wall"], base[:m], 1.0 if cells > 3 else 3.0)
+        levels.append((cell_m, GaussianCloud.concatenate([cloud, roof]), np.concatenate([owner[wall], house])))
+    return nodes_by_tile("house", levels), houses
+
+
+def place_houses(site: Site) -> Houses:
+    """Choose where houses stand: along the line at the setback, clear of the road, of actors and of each other."""
+    environment = site.scenario.environment
+    rng = site.rng("houses")
+    free = ((site.off_road_m > CLEAR_M) & ~site.taken).astype(np.uint8)
+    fronts, aways, heights = [], [], []
+    low_m, high_m = environment.building_height_m
+    for line in contours(site, SETBACK_M[site.highway], WITHIN_M):
+        length = float(arc_lengths(line)[-1])
+        s = float(rng.uniform(0, 4))
+        while s + WIDTH_M[0] < length:
+            width = float(rng.uniform(*WIDTH_M))
+            height = float(rng.uniform(low_m, high_m))
+            wanted = rng.random() < environment.buildings
+            gap = float(rng.choice([0.0, 0.0, 2.5, 5.0]))
+            a, b = resample(line, [s, min(s + width, length)])
+            s += width + gap
+            chord = b - a
+            size = float(np.linalg.norm(chord))
+            if not wanted or size < 0.8 * width or size < 6.0:
+                continue
+            away = np.array([chord[1], -chord[0]]) / size
+            ring = np.stack([a, b, b + DEPTH_M * away, a + DEPTH_M * away])
+            if _claim(free, ring, site):
+                fronts.append(np.stack([a, b]))
+                aways.append(away)
+                heights.append(height)
+    if not fronts:
+        return Houses(np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros(0))
+    return Houses(np.stack(fronts), np.stack(aways), np.array(heights))
+
+
+def _claim(free: U8, ring: F64, site: Site) -> bool:
+    """Take the ground of a house if all of it is free."""
+    centre = ring.mean(axis=0)
+    inner = to_pixels(centre + 0.96 * (ring - centre), site.low, CELL_M)
+    x0, y0 = inner.min(axis=0) >> SHIFT_BITS
+    x1, y1 = (inner.max(axis=0) >> SHIFT_BITS) + 2
+    h, w = free.shape
+    if x0 < 0 or y0 < 0 or x1 > w or y1 > h:
+        return False
+    mask = np.zeros((y1 - y0, x1 - x0), dtype=np.uint8)
+    shifted = inner - np.array([x0, y0]) * (1 << SHIFT_BITS)
+    cv2.fillConvexPoly(mask, shifted.astype(np.int32), 1, cv2.LINE_8, SHIFT_BITS)
+    part = free[y0:y1, x0:x1]
+    if np.any(part[mask > 0] == 0):
+        return False
+    part[mask > 0] = 0
+    return True
+
+
+def _walls(site: Site, walls: _Walls, style: dict[str, npt.NDArray[Any]], cells: int, seed: int) -> tuple[GaussianCloud, I64]:
+    """Cover walls with ``cells x cells`` Gaussians per bay and floor; returns the cloud and each Gaussian's wall."""
+    starts, ends, base, height, owner, is_front = walls
+    length = np.linalg.norm(ends - starts, axis=1)
+    bays = np.maximum(np.round(length / BAY_M), 1).astype(np.int64)
+    floors = np.maximum(np.round(height / FLOOR_M), 1).astype(np.int64)
+    wall, u, v = grid_cells(bays * cells, floors * cells)
+    nu, nv = (bays * cells)[wall], (floors * cells)[wall]
+    iu, iv = np.floor(u * nu).astype(np.int64), np.floor(v * nv).astype(np.int64)
+    bay, floor, cu, cv = iu // cells, iv // cells, iu % cells, iv % cells
+    house = owner[wall]
+    # One number per window, the same at every level of detail.
+    key = (wall * 7919 + bay * 104_729 + floor * 1_299_709 + seed) % 2_147_483_647
+    pick = (key * 48_271 % 2_147_483_647) / 2_147_483_647
+    glass = GLASS[np.minimum((pick * pick * 4).astype(np.int64), 3)]
+    wide = style["wide"][house]
+    fu, fv = (cu + 0.5) / cells, (cv + 0.5) / cells
+    first = np.where(wide, 0.17, 0.33)
+    front = is_front[wall]
+    shop = (floor == 0) & front & style["shop"][house]
+    entrance = (floor == 0) & front & ~style["shop"][house] & (bay == bays[wall] // 2)
+    nothing = np.zeros(len(wall), dtype=bool)
+    if cells >= 6:
+        share = ((fu > first) & (fu < 0.83) & (fv > 0.33) & (fv < 0.83)).astype(np.float64)
+        sill = (fu > first) & (fu < 0.83) & (fv > 0.17) & (fv < 0.33)
+        band, door = shop & (fv > 0.66) & (fv < 0.83), entrance & (fu > 0.33) & (fu < 0.66) & (fv < 0.66)
+        if cells > 6:  # glazing bars and a thinner sill
+            bar = (np.abs(fu - (first + 0.83) / 2) < 0.04) | (np.abs(fv - 0.62) < 0.04)
+            share *= np.where(bar, 0.55, 1.0)
+            sill &= fv > 0.25
+    elif cells == 3:
+        share = np.where(cu == 1, np.where(cv == 1, 1.0, np.where(cv == 2, 0.5, 0.0)), np.where(wide & (cv == 1), 0.3, 0.0))
+        sill, band, door = nothing, shop & (cv == 2), entrance & (cu == 1) & (cv <= 1)
+    else:
+        share = np.where(wide, 0.33, 0.25)
+        sill, band, door = nothing, shop, nothing
+    # Walls away from the street have fewer windows.
+    share = np.where(front, share, 0.6 * share * (bay % 2 == 0))
+    shop_share = ((fu > 0.12) & (fv < 0.66)) * 1.0 if cells >= 6 else np.where(cv <= 1, 0.75, 0.0)
+    share = np.where(shop, shop_share, share)
+    shade = np.where(front, 1.0, 0.80) * (0.86 + 0.14 * np.clip(v * 2.5, 0, 1))
+    texture = site.scenario.environment.texture
+    # The same hash by place gives every level the wall's large stains; the fine grain belongs to the finest level.
+    grain = site.rng(f"facade-grain-{cells}").standard_normal(len(wall)) * (0.035 if cells >= 6 else 0.015) * texture
+    rgb = style["wall"][house] * (shade + grain)[:, None]
+    rgb = np.where(sill[:, None] & front[:, None], style["trim"][house] * shade[:, None], rgb)
+    cornice = (iv == nv - 1) & (cells > 1)
+    rgb = np.where(cornice[:, None], style["trim"][house] * 0.92 * shade[:, None], rgb)
+    rgb = rgb + share[:, None] * (glass * np.where(front, 1.0, 0.85)[:, None] - rgb)
+    rgb = np.where(band[:, None], 0.5 * rgb + 0.5 * style["awning"][house] if cells == 1 else style["awning"][house], rgb)
+    rgb = np.where(door[:, None], style["awning"][house] * 0.6, rgb)
+
+    plan = starts[wall] + u[:, None] * (ends - starts)[wall]
+    z = base[wall] - 0.2 + v * (height[wall] + 0.2)
+    means = np.column_stack([site.frame.to_world(plan), z])
+    heading = site.frame.to_world(ends) - site.frame.to_world(starts)
+    direction = np.column_stack([heading, np.zeros(len(heading))])
+    quats = quats_along(direction)
+    scales = np.stack([SPREAD * length[wall] / nu, np.full(len(wall), 0.05), SPREAD * (height[wall] + 0.2) / nv], axis=1)
+    return cloud_of(means, quats[wall], scales, rgb), wall
+
+
+def _roofs(site: Site, houses: Houses, wall_rgb: F64, base: F64, cell_m: float) -> tuple[GaussianCloud, I64]:
+    """Cover the flat roofs, so that a house seen from above or afar is closed."""
+    a, b = houses.front[:, 0], houses.front[:, 1]
+    length = np.linalg.norm(b - a, axis=1)
+    n_u = np.maximum(np.round(length / cell_m / 2), 1).astype(np.int64)
+    n_v = np.full(len(a), max(1, round(DEPTH_M / cell_m / 2)), dtype=np.int64)
+    house, u, v = grid_cells(n_u, n_v)
+    plan = a[house] + u[:, None] * (b - a)[house] + v[:, None] * DEPTH_M * houses.away[house]
+    xy = site.frame.to_world(plan)
+    heading = site.frame.to_world(b) - site.frame.to_world(a)
+    quats = quats_along(np.column_stack([heading, np.zeros(len(heading))]))
+    scales = np.stack([SPREAD * (length / n_u)[house], SPREAD * DEPTH_M / n_v[house], np.full(len(house), 0.05)], axis=1)
+    means = np.column_stack([xy, (base + houses.height_m)[house] - 0.05])
+    return cloud_of(means, quats[house], scales, 0.55 * wall_rgb[house]), house

@@ -1,0 +1,238 @@
+"""Build what stands beside the road: kerbs or guard rails, trees, lamp poles, signs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
+from alpasim_plugin.gaussians.scene.contours import contours, places
+from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.scene.plan_image import KERB_M
+from alpasim_plugin.gaussians.scene.site import CELL_M, Site
+from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
+from alpasim_plugin.geometry import arc_lengths, resample
+from alpasim_plugin.types import F64, I64, Bool
+
+KERB_RGB = (0.66, 0.65, 0.62)
+RAIL_RGB = (0.62, 0.64, 0.66)
+TREE_LINE_M = {False: 1.6, True: 7.0}  # distance of street trees from the road's edge, by highway or not
+TILE_M = 32.0
+LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])
+Item = tuple[float, GaussianCloud, F64]  # cell size, cloud, plan position of each Gaussian's owner
+
+
+def build_street(site: Site, houses: Houses) -> list[SceneNode]:
+    """Return the nodes of everything beside the road but the houses."""
+    nodes = _nodes(site, "guard-rail" if site.highway else "kerb", _rails(site) if site.highway else _kerbs(site))
+    nodes += _nodes(site, "tree", _trees(site, houses))
+    return nodes + _nodes(site, "pole", _poles(site, houses)) + _nodes(site, "sign", _signs(site))
+
+
+def _nodes(site: Site, name: str, items: list[Item]) -> list[SceneNode]:
+    levels = []
+    for cell_m, cloud, at in items:
+        if len(cloud):
+            tile = np.floor((at - site.low) / TILE_M).astype(np.int64)
+            levels.append((cell_m, cloud, tile[:, 1] * 100_000 + tile[:, 0]))
+    return nodes_by_tile(name, levels)
+
+
+def _kerbs(site: Site) -> list[Item]:
+    """Stand a stone along the road's edge: a face towards the road and a top."""
+    items: list[Item] = []
+    lines = contours(site, 0.0, 60.0)
+    for cell_m, step in ((0.25, 0.5), (0.7, 1.0), (1.6, 2.0)):
+        spots = [places(line, step, step / 2) for line in lines if arc_lengths(line)[-1] > 2 * step]
+        if not spots:
+            return []
+        xy, along, away = (np.concatenate(c) for c in zip(*spots, strict=True))
+        rng = site.rng(f"kerb-{step}")
+        rgb = np.array(KERB_RGB) * (1 + 0.03 * rng.standard_normal((len(xy), 1)))
+        quats = quats_along(site.frame.turned(along))
+        # Contours run through the centres of the first cells off the road: half a cell behind the edge.
+        xy = xy - 0.5 * CELL_M * away
+        face = site.world(xy, 0.4 * KERB_M)
+        top = site.world(xy + 0.08 * away, KERB_M)
+        n = len(xy)
+        size = np.full(n, SPREAD * step)
+        clouds = [
+            cloud_of(face, quats, np.column_stack([size, np.full(n, 0.05), np.full(n, 0.08)]), 0.80 * rgb),
+            cloud_of(top, quats, np.column_stack([size, np.full(n, 0.09), np.full(n, 0.015)]), 1.05 * rgb),
+        ]
+        items.append((cell_m, GaussianCloud.concatenate(clouds), np.tile(xy, (2, 1))))
+    return items
+
+
+def _rails(site: Site) -> list[Item]:
+    """Run a guard rail along a fast road."""
+    items: list[Item] = []
+    lines = contours(site, 1.2, 60.0)
+    for cell_m, step in ((0.3, 1.0), (0.9, 2.0), (2.0, 4.0)):
+        spots = [places(line, step, step / 2) for line in lines if arc_lengths(line)[-1] > 8.0]
+        if not spots:
+            return []
+        xy, along, _ = (np.concatenate(c) for c in zip(*spots, strict=True))
+        n = len(xy)
+        quats = quats_along(site.frame.turned(along))
+        scales = np.column_stack([np.full(n, SPREAD * step), np.full(n, 0.03), np.full(n, 0.05)])
+        clouds, at = [], []
+        for height, shade in ((0.56, 0.8), (0.72, 1.0)):
+            clouds.append(cloud_of(site.world(xy, height), quats, scales, np.tile(np.array(RAIL_RGB) * shade, (n, 1))))
+            at.append(xy)
+        posts = xy[:: max(1, round(4.0 / step))]
+        foot = site.world(posts, 0.0)
+        clouds.append(rods(foot, foot + np.array([0, 0, 0.62]), 0.06, np.tile([0.45, 0.46, 0.47], (len(posts), 1)), 0.7))
+        at.append(posts)
+        items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(at)))
+    return items
+
+
+def _trees(site: Site, houses: Houses) -> list[Item]:
+    """Plant street trees along the road and woods where no houses stand."""
+    per_100m = site.scenario.environment.trees_per_100m
+    if per_100m <= 0:
+        return []
+    rng = site.rng("trees")
+    spots: list[F64] = []
+    for line in contours(site, TREE_LINE_M[site.highway], 70.0):
+        mean = 100.0 / per_100m
+        n = int(arc_lengths(line)[-1] / mean)
+        s = (np.arange(n) + rng.uniform(0.1, 0.9, n)) * mean
+        if n:
+            spots.append(resample(line, s))
+    street = np.concatenate(spots) if spots else np.zeros((0, 2))
+    street = street[_free(site, houses, street, 0.6 if not site.highway else 3.0)]
+    h, w = site.road.shape
+    n_wood = int(0.00022 * per_100m * h * w * 0.0625)
+    wood = site.low + rng.random((n_wood, 2)) * np.array([w, h]) * 0.25
+    wood = wood[_free(site, houses, wood, 17.0 if not site.highway else 14.0)]
+    at = np.concatenate([street, wood])
+    if len(at) == 0:
+        return []
+    m = len(at)
+    crown = rng.uniform(1.5, 2.4, m) * np.where(np.arange(m) < len(street), 1.0, 1.35)
+    stem = rng.uniform(2.1, 3.0, m)
+    leaf = LEAVES[rng.integers(len(LEAVES), size=m)] * rng.uniform(0.85, 1.15, (m, 1))
+    foot = site.world(at, 0.0 if site.highway else KERB_M)
+    items: list[Item] = []
+    for cell_m, count in ((0.25, 520), (0.36, 170), (0.8, 48), (1.8, 14)):
+        crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
+        top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
+        trunks = rods(foot, top, 0.13, np.tile([0.30, 0.24, 0.19], (m, 1)), 0.5 if count > 100 else 4.0)
+        trunk_owner = _nearest(trunks.means.astype(np.float64), foot)
+        items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), at[np.concatenate([owner, trunk_owner])]))
+    return items
+
+
+def _nearest(means: F64, foot: F64) -> I64:
+    return np.asarray(np.argmin(np.linalg.norm(means[:, None, :2] - foot[None, :, :2], axis=2), axis=1))
+
+
+def _crowns(site: Site, foot: F64, crown: F64, stem: F64, leaf: F64, count: int) -> tuple[GaussianCloud, I64]:
+    """Fill crowns with ``count`` blobs each, light above and dark below."""
+    rng = site.rng(f"crowns-{count}")
+    m = len(foot)
+    owner = np.repeat(np.arange(m), count)
+    direction = rng.standard_normal((m * count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    radius = rng.random(m * count) ** 0.4
+    local = direction * radius[:, None] * np.array([1.0, 1.0, 0.95])
+    size = crown[owner]
+    means = foot[owner] + local * size[:, None]
+    means[:, 2] += (stem + 0.85 * crown)[owner]
+    light = 0.78 + 0.34 * local[:, 2] + 0.16 * rng.standard_normal(m * count)
+    rgb = leaf[owner] * np.clip(light, 0.35, 1.5)[:, None]
+    # Coarser levels cover the same crown with fewer, larger blobs.
+    blob = size * {520: 0.095, 170: 0.16, 48: 0.25, 14: 0.42}[count]
+    scales = np.column_stack([blob, blob, 0.8 * blob]) * rng.uniform(0.7, 1.25, (m * count, 1))
+    quats = rng.standard_normal((m * count, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return cloud_of(means, quats, scales, rgb, 0.92), owner
+
+
+def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
+    """Return which places are off the road by ``clear_m``, not on actors' ground and outside houses."""
+    free = (site.look_up(site.off_road_m, at).astype(np.float64) >= clear_m) & ~site.look_up(site.taken, at).astype(bool)
+    for front, away in zip(houses.front, houses.away, strict=True):
+        d = at - front.mean(axis=0)
+        half = np.linalg.norm(front[1] - front[0]) / 2
+        along = np.array([-away[1], away[0]])
+        depth = d @ away
+        free &= ~((np.abs(d @ along) < half + 0.8) & (depth > -0.9) & (depth < DEPTH_M + 1.0))
+    return np.asarray(free)
+
+
+def _poles(site: Site, houses: Houses) -> list[Item]:
+    """Set lamp poles along the road and the poles that the map names."""
+    spacing = site.scenario.environment.poles_spacing_m
+    feet: list[F64] = []
+    arms: list[F64] = []
+    rng = site.rng("poles")
+    if spacing > 0:
+        for line in contours(site, 0.7 if not site.highway else 2.0, 60.0):
+            spot = places(line, spacing, float(rng.uniform(2.0, min(spacing, 12.0))))
+            free = _free(site, houses, spot.xy, 0.3)
+            feet.append(spot.xy[free])
+            arms.append(-spot.away[free])
+    mapped = [p for p in site.scenario.lane_map.poles if len(p) > 1]
+    at = np.concatenate(feet) if feet else np.zeros((0, 2))
+    if len(at) == 0 and not mapped:
+        return []
+    arm = np.concatenate(arms) if arms else at
+    foot = site.world(at)
+    top = foot + np.array([0, 0, 6.8])
+    tip = site.world(at + 1.7 * arm)
+    tip[:, 2] = top[:, 2] + 0.35
+    starts = [foot, top, *[p[:-1] for p in mapped]]
+    ends = [top, tip, *[p[1:] for p in mapped]]
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    owner = np.concatenate([at, at, *[site.frame.to_plan(p[:-1]) for p in mapped]])
+    items: list[Item] = []
+    for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
+        length = np.linalg.norm(end - start, axis=1)
+        poles = rods(start, end, 0.085, np.tile([0.36, 0.38, 0.38], (len(start), 1)), step)
+        piece, _, _ = grid_cells(np.maximum(np.round(length / step), 1).astype(np.int64), np.ones(len(start), dtype=np.int64))
+        lamps = len(tip)
+        lamp_scales = np.tile([0.22, 0.22, 0.07], (lamps, 1))
+        lamp = cloud_of(tip, np.tile([1.0, 0, 0, 0], (lamps, 1)), lamp_scales, np.tile([0.85, 0.85, 0.80], (lamps, 1)))
+        items.append((cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at])))
+    return items
+
+
+def _signs(site: Site) -> list[Item]:
+    """Hang the map's signs: a coloured plate with a pale rim, and a post down to the ground where it is near."""
+    signs = site.scenario.lane_map.signs
+    if not signs:
+        return []
+    rng = site.rng("signs")
+    corners, rgbs, feet, tops, at = [], [], [], [], []
+    for T, box in signs:
+        sizes = np.array([box.length_m, box.width_m])
+        thin = int(np.argmin(sizes))
+        side = np.zeros(3)
+        side[1 - thin] = max(float(sizes[1 - thin]), 0.3) / 2
+        up = np.array([0, 0, max(box.height_m, 0.3) / 2])
+        normal = np.zeros(3)
+        normal[thin] = 0.03
+        colour = np.array([[0.75, 0.12, 0.10], [0.10, 0.28, 0.62], [0.88, 0.72, 0.12], [0.10, 0.42, 0.26]])[rng.integers(4)]
+        for shift, share, rgb in ((0.0, 1.0, np.array([0.88, 0.88, 0.86])), (1.0, 0.72, colour), (-1.0, 0.72, colour)):
+            local = np.stack([-side - up, side - up, side + up, -side + up]) * share + shift * normal
+            corners.append(local @ T[:3, :3].T + T[:3, 3])
+            rgbs.append(rgb)
+            at.append(T[:2, 3])
+        foot = site.world(site.frame.to_plan(T[None, :2, 3]))[0]
+        if 0.5 < T[2, 3] - foot[2] < 4.5:
+            feet.append(foot)
+            tops.append(T[:3, 3])
+    plan = site.frame.to_plan(np.array(at))
+    items: list[Item] = []
+    for cell_m, size in ((0.12, 0.15), (0.4, 0.5)):
+        plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
+        clouds, where = [plates], [plan[owner]]
+        if feet:
+            posts = rods(np.stack(feet), np.stack(tops), 0.04, np.tile([0.45, 0.46, 0.47], (len(feet), 1)), 3.0)
+            clouds.append(posts)
+            where.append(site.frame.to_plan(posts.means.astype(np.float64)))
+        items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(where)))
+    return items

@@ -1,0 +1,77 @@
+"""Dress a scenario in Gaussians: one call from a map, tracks and an environment to a scene graph."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.scene.build_actors import build_actors
+from alpasim_plugin.gaussians.scene.build_facades import build_facades
+from alpasim_plugin.gaussians.scene.build_road import build_road
+from alpasim_plugin.gaussians.scene.build_street import build_street
+from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.scene.paint import paint_strokes
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.site import HeightAt, make_site
+from alpasim_plugin.gaussians.scene.sky import make_sky
+from alpasim_plugin.gaussians.sh import dc_from_rgb
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.types import F64, Scenario
+
+FILE_TILE_M = 16.0
+LIGHT = {"clear": (1.0, 1.0, 1.0), "overcast": (0.86, 0.88, 0.91), "dusk": (0.74, 0.63, 0.62)}  # on everything but the sky, by sky
+
+
+def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
+    """Build the scene of a scenario; the same scenario gives bit-identical Gaussians.
+
+    Args:
+        scenario: Map, tracks, environment and seed. Where it names a background file this function draws actors and sky only; give the
+            file's Gaussians to `with_background`.
+        height_at: Ground height under ``(N, 2+)`` world points, ``(N,)`` metres.
+    """
+    sky = make_sky(scenario.environment.sky, stream(scenario.scene_id, scenario.seed, "scene/sky"))
+    light = np.array(LIGHT[scenario.environment.sky])
+    actors = [lit(node, light) for node in build_actors(scenario)]
+    if scenario.background is not None:
+        return SceneGraph([], actors, sky)
+    site = make_site(scenario, height_at)
+    nodes = build_road(site, paint_strokes(site))
+    facades, houses = build_facades(site)
+    return SceneGraph([lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky)
+
+
+def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) -> SceneGraph:
+    """Return the scene with a Gaussian model as its background, cut into blocks that are culled one by one.
+
+    Args:
+        graph: Actors and sky.
+        cloud: The model in its file's frame.
+        T_world_file: ``(4, 4)`` rotation, translation and one scale for all axes.
+    """
+    placed = placed_cloud(cloud, T_world_file)
+    tile = np.floor(placed.means[:, :2] / FILE_TILE_M).astype(np.int64)
+    nodes = nodes_by_tile("file", [(0.0, placed, tile[:, 1] * 1_000_003 + tile[:, 0])])
+    return SceneGraph(nodes, list(graph.actors.values()), graph.sky, graph.sh_frame, graph.cell_px)
+
+
+def lit(node: SceneNode, light: F64) -> SceneNode:
+    """Return the node with all colours multiplied by ``light (3,)``."""
+    if np.all(light == 1.0):
+        return node
+    levels = []
+    for level in node.levels:
+        c = level.cloud
+        sh = c.sh * light
+        sh[:, 0] += dc_from_rgb(0.5 * light)  # colour is 0.5 + C0 dc: the half is lit as well
+        levels.append(Level(level.cell_m, GaussianCloud(c.means, c.quats, c.scales, c.opacities, sh.astype(np.float32))))
+    return SceneNode(node.name, node.kind, tuple(levels), node.far_m)
+
+
+def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
+    """Move a cloud by a similarity transform; its colours turn with it."""
+    scale = float(np.cbrt(np.linalg.det(T_world_file[:3, :3])))
+    rigid = np.asarray(T_world_file, dtype=np.float64).copy()
+    rigid[:3, :3] /= scale
+    scaled = GaussianCloud(cloud.means * scale, cloud.quats, cloud.scales * scale, cloud.opacities, cloud.sh)
+    return scaled.transformed(rigid)

@@ -1,0 +1,182 @@
+"""Draw a scene of many parts: cull each part against the view, choose its level of detail, render what is left once.
+
+Nodes are background parts in world coordinates and rigid actors in the frame of their box. Culling and level of detail are decided per
+node, before any Gaussian is touched: a node's sphere must meet the view, and its level is the coarsest whose cells stay below `CELL_PX`
+pixels at the node's nearest point. Order of drawing at equal depth is background nodes in the order given, then actors by id.
+
+The sky is no Gaussian: its image stands behind everything and is blended with what transparency is left. ``alpha`` is therefore the
+accumulated opacity of the scene *without* the sky (0 in the open sky), which is what the paper's opacity-mixed source needs; with
+``sky_in_alpha`` the sky counts as opaque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from alpasim_plugin.errors import RendererError
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, ShFrame, prepare
+from alpasim_plugin.gaussians.raster.rasterize import Backend, rasterize
+from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
+from alpasim_plugin.gaussians.scene.nodes import SceneNode
+from alpasim_plugin.gaussians.scene.sky import Sky
+from alpasim_plugin.types import F64, Bool
+
+CELL_PX = 3.5
+Change = Callable[[SceneNode, int], GaussianCloud]  # (node, level index) -> the cloud to draw in its place
+
+
+class SceneGraph:
+    """A scene ready to be rendered from anywhere.
+
+    Args:
+        background: Nodes in world coordinates.
+        actors: Nodes in box frames; the name is the actor's id.
+        sky: What stands behind everything.
+        sh_frame: Axes of the actors' view-dependent colour: ``object`` (it turns with the actor; scenes built here) or ``world`` (as
+            reconstructions of recorded drives are optimised).
+        cell_px: Larger is faster and coarser.
+        change: Replaces a node's cloud at its first use; None draws the nodes as they are.
+    """
+
+    def __init__(
+        self,
+        background: Sequence[SceneNode],
+        actors: Sequence[SceneNode],
+        sky: Sky,
+        sh_frame: ShFrame = "object",
+        cell_px: float = CELL_PX,
+        change: Change | None = None,
+    ) -> None:
+        self.background = tuple(background)
+        self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
+        self.sky = sky
+        self.sh_frame: ShFrame = sh_frame
+        self.cell_px = cell_px
+        self._change = change
+        self._centre, self._radius = _spheres(self.background)
+        self._far = np.array([node.far_m for node in self.background])
+        self._actor_centre, self._actor_radius = _spheres(list(self.actors.values()))
+        self._actor_index = {name: i for i, name in enumerate(self.actors)}
+        self._prepared: dict[tuple[str, int], PreparedCloud] = {}
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians at the finest level."""
+        return sum(len(node.levels[0].cloud) for node in (*self.background, *self.actors.values()))
+
+    def render(
+        self,
+        camera: PinholeCamera,
+        actor_poses: Mapping[str, F64],
+        threads: int | None = None,
+        backend: Backend = "cpu",
+        sky_in_alpha: bool = False,
+    ) -> RasterOutput:
+        """Render one view.
+
+        Args:
+            camera: From where.
+            actor_poses: Actor id to ``T_world_box (4, 4)`` of the actors present.
+            threads: Thread count of the CPU backend; None leaves it as it is.
+            backend: ``cpu`` uses nodes prepared once; any other backend gets all chosen Gaussians as one cloud.
+            sky_in_alpha: Count the sky as opaque.
+
+        Returns:
+            Colour with sky, alpha, depth, and ``stats`` with ``visible``, ``nodes`` (drawn) and ``nodes_total``.
+
+        Raises:
+            RendererError: A pose for an actor that the scene does not hold.
+        """
+        chosen = self._choose(camera, actor_poses)
+        behind = self.sky.image(camera)
+        if backend == "cpu":
+            nodes: list[Node] = [(self._prepare(node, level), T) for node, level, T in chosen]
+            out = rasterize_prepared(nodes, camera, behind, threads=threads)
+        else:
+            out = rasterize(self._joined(chosen), camera, behind, backend)
+        stats = {**out.stats, "nodes": len(chosen), "nodes_total": len(self.background) + len(actor_poses)}
+        return replace(out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats)
+
+    def cloud_for(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> GaussianCloud:
+        """Return what `render` draws as one cloud in world coordinates: the slow twin of the prepared path."""
+        return self._joined(self._choose(camera, actor_poses))
+
+    def changed(self, change: Change, more_actors: Sequence[SceneNode], cell_px: float) -> SceneGraph:
+        """Return a variant of the scene with other clouds in the same nodes, and further actors.
+
+        Culling uses the unchanged nodes' spheres, so a change should move Gaussians little compared with their node.
+        """
+        return SceneGraph(self.background, [*self.actors.values(), *more_actors], self.sky, self.sh_frame, cell_px, change)
+
+    def _joined(self, chosen: list[tuple[SceneNode, int, F64 | None]]) -> GaussianCloud:
+        clouds = []
+        for node, level, T in chosen:
+            cloud = self._cloud(node, level)
+            clouds.append(cloud if T is None else cloud.transformed(T, self.sh_frame == "object"))
+        return GaussianCloud.concatenate(clouds)
+
+    def _choose(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> list[tuple[SceneNode, int, F64 | None]]:
+        unknown = sorted(set(actor_poses) - set(self.actors))
+        if unknown:
+            raise RendererError(
+                "rendering a scene",
+                f"poses of {len(actor_poses)} actors",
+                f"actor {unknown[0]!r} has no model in this scene",
+                "pass poses of the scenario's own actors only",
+            )
+        eye, f = camera.centre_world, max(camera.fx, camera.fy)
+        distance = np.linalg.norm(self._centre - eye, axis=1) - self._radius
+        seen = in_view(camera, self._centre, self._radius) & (distance < self._far)
+        chosen: list[tuple[SceneNode, int, F64 | None]] = []
+        for i in np.flatnonzero(seen):
+            node = self.background[i]
+            chosen.append((node, self._level(node, float(distance[i]), f), None))
+        present = [name for name in self.actors if name in actor_poses]
+        if present:
+            index = [self._actor_index[name] for name in present]
+            poses = np.stack([np.asarray(actor_poses[name], dtype=np.float64) for name in present])
+            centre = np.einsum("nij,nj->ni", poses[:, :3, :3], self._actor_centre[index]) + poses[:, :3, 3]
+            radius = self._actor_radius[index]
+            distance = np.linalg.norm(centre - eye, axis=1) - radius
+            for i in np.flatnonzero(in_view(camera, centre, radius)):
+                node = self.actors[present[i]]
+                chosen.append((node, self._level(node, float(distance[i]), f), poses[i]))
+        return chosen
+
+    def _level(self, node: SceneNode, distance_m: float, focal_px: float) -> int:
+        allowed_m = self.cell_px * max(distance_m, 0.0) / focal_px
+        fit = [i for i, level in enumerate(node.levels) if level.cell_m <= allowed_m]
+        return fit[-1] if fit else 0
+
+    def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
+        key = (node.name, level)
+        if key not in self._prepared:
+            self._prepared[key] = prepare(self._cloud(node, level), sh_frame=self.sh_frame)
+        return self._prepared[key]
+
+    def _cloud(self, node: SceneNode, level: int) -> GaussianCloud:
+        return node.levels[level].cloud if self._change is None else self._change(node, level)
+
+
+def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
+    """Return which spheres ``(N, 3)``, ``(N,)`` in the world meet the camera's view volume (conservative at its corners)."""
+    p = centre @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    x, y, z = p.T
+    seen = z > -radius
+    for slope, coordinate, sign in (
+        (camera.cx / camera.fx, x, 1.0),
+        ((camera.width - camera.cx) / camera.fx, x, -1.0),
+        (camera.cy / camera.fy, y, 1.0),
+        ((camera.height - camera.cy) / camera.fy, y, -1.0),
+    ):
+        seen &= sign * coordinate + slope * z > -radius * np.hypot(1.0, slope)
+    return np.asarray(seen)
+
+
+def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:
+    return np.array([node.sphere[0] for node in nodes]).reshape(-1, 3), np.array([node.sphere[1] for node in nodes])

@@ -1,0 +1,56 @@
+"""Tell sky from holes in a reconstruction: where the cameras of the logged drive saw sky, a transparent pixel is nothing missing.
+
+Alpha alone cannot: it is zero in the open sky and zero where a reconstruction has nothing to show. Pipelines on recorded drives fill the
+sky from segmented log images (OneFixer, App. A). Here the log views' own alpha is that segmentation. The sky is far away, so a view of
+it is carried to another camera by rotation alone; within half the views' spacing the skyline moves by less than a pixel of the small views
+beyond some 20 m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.scene.log_views import LogView
+from alpasim_plugin.geometry import inverse
+from alpasim_plugin.types import F32
+
+
+@dataclass(frozen=True, eq=False)
+class SkyView:
+    """Where one logged camera saw sky: ``sky (H, W)`` float32, 1 where it did."""
+
+    camera: PinholeCamera
+    sky: F32
+
+
+class SkyMask:
+    """What the nearest log view of a like direction saw of the sky.
+
+    Args:
+        views: Of cameras that may look in different directions; without any, nothing is sky.
+    """
+
+    def __init__(self, views: Sequence[LogView | SkyView]) -> None:
+        self._views = tuple(views)
+        T = np.array([inverse(view.camera.T_camera_world) for view in views]).reshape(-1, 4, 4)
+        self._axes, self._eyes = T[:, :3, 2], T[:, :3, 3]  # (V, 3) world
+
+    def share(self, camera: PinholeCamera) -> F32:
+        """Return how much of every pixel ``(H, W)`` is sky, 0 to 1; beyond the view's border its outermost pixels go on."""
+        if not self._views:
+            return np.zeros((camera.height, camera.width), dtype=np.float32)
+        T = inverse(camera.T_camera_world)
+        R, eye = T[:3, :3], T[:3, 3]
+        turned_away = self._axes @ R[:, 2] < 0.5
+        nearest = int(np.argmin(np.linalg.norm(self._eyes - eye, axis=1) + 1e6 * turned_away))
+        view = self._views[nearest]
+        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # the warp counts from pixel centres, cameras from the corner
+        to_view = np.linalg.inv(half) @ view.camera.K @ view.camera.T_camera_world[:3, :3] @ R @ np.linalg.inv(camera.K) @ half
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        warped = cv2.warpPerspective(view.sky, to_view, (camera.width, camera.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(warped, dtype=np.float32)

@@ -1,0 +1,111 @@
+"""Adapt the decoder of a trained bundle to its generator, in one folder: bundle in, bundle out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of, save_bundle
+from alpasim_plugin.fixers.networks import streaming_dit
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.nets import TinyVAE
+from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, read_metadata
+from alpasim_plugin.training.decoder_finetune import PainterRecipe, PainterTask, Rollouts
+from alpasim_plugin.training.fixer_run import BUNDLE_FILE, half
+from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
+from alpasim_plugin.training.model_card import ModelCard, curves
+from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.perceptual_term import Distance
+from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
+
+DOING = "adapting a decoder"
+
+
+def train_painter(
+    bundle: Path,
+    data: Path,
+    out: Path,
+    form: ClipForm,
+    recipe: PainterRecipe,
+    schedule: Schedule,
+    distance: tuple[str, Distance] | None = None,
+    prepared: Callable[[str, int, int], None] | None = None,
+    report: Callable[[int, Mapping[str, float]], None] | None = None,
+) -> Path:
+    """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors and its card.
+
+    Args:
+        bundle: A trained fixer whose decoder is the autoencoder's own and sees the render.
+        data: Folder of pairs; its ``train`` split is used.
+        out: Folder of the run; latents and rollouts of the clips are kept beside it.
+        form, recipe, schedule: Clips, batches, optimisation.
+        distance: Name and function of the perceptual term.
+        prepared: Called with what is being made (latents, rollouts), how many are done and in all.
+        report: Called after every update with its number and the log's numbers.
+
+    Raises:
+        InputError: Not such a bundle, no data, or a crop that does not fit.
+        InfrastructureError: A loss that is not finite.
+    """
+    settings = bundle_settings(bundle)
+    tensors = load_weights(bundle, dtype=torch.float32)
+    parts = parts_of(tensors)
+    vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
+    net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
+
+    def tell(what: str) -> Callable[[int, int], None] | None:
+        return None if prepared is None else lambda done, count: prepared(what, done, count)
+
+    clips = LatentClips(PairDataset(data, "train").sequences, vae, form, out.parent / "latents", tell("latents"))
+    rollouts = Rollouts(clips, net, settings.block_latents, settings.window, settings.uses_map, out.parent / "rollouts", tell("rollouts"))
+    task = PainterTask(vae, rollouts, recipe, distance)
+    facts = {**task.facts, "init": file_sha256(bundle)}
+    trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
+    trainer.run(report)
+    path = out / BUNDLE_FILE
+    made: dict[str, dict[str, Tensor]] = {
+        "dit": {key: half(value) for key, value in parts["dit"].items()},
+        "vae": {key: half(value) for key, value in trainer.averaged().items()},
+    }
+    note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
+    save_bundle(path, made, settings, trained=True, note=note)
+    rows, hours = curves(out / LOG_FILE)
+    about = {"pairs": "rendered scenes, split train", "clips": len(clips), "form": asdict(form)}
+    training = {"what": "decoder alone, on the generator's rollouts", "schedule": asdict(schedule), **facts}
+    ModelCard(f"OneFixer weights: {note}", about, training, rows, hours).write(path)
+    return path
+
+
+def bundle_settings(bundle: Path) -> OneFixerSettings:
+    """Return the settings that a bundle was trained for.
+
+    Raises:
+        InputError: Not a bundle whose generator rolls out and whose decoder can be adapted.
+    """
+    name, overrides = bundle_fixer(bundle)
+    settings = fixer_settings(name, overrides)
+    if not isinstance(settings, OneFixerSettings):
+        raise InputError(DOING, str(bundle), f"it is for {name}, which has no networks", "give a bundle of 'simrun train fixer'")
+    found = [
+        text
+        for text, wrong in (
+            ("its generator has no history", settings.history == "none"),
+            ("its decoder does not see the render", settings.decoder.kind != "render"),
+            (f"its autoencoder is {settings.vae.kind}", settings.vae.kind != "tiny"),
+            # The rollouts are made in one step on a finalised history from Eq. 1's source.
+            (f"its history is {settings.history}", settings.history == "last-forward"),
+            (f"it takes {len(settings.steps)} steps", len(settings.steps) != 1),
+            (f"it keeps a sink of {settings.sink}", settings.sink != 0),
+            ("its source holds the render where that is transparent", settings.holes != "noise"),
+        )
+        if wrong
+    ]
+    if found:
+        raise InputError(DOING, str(bundle), "; ".join(found), "give a bundle that 'simrun train fixer' made with a history")
+    return settings
