@@ -4,9 +4,9 @@ The copy of the clip at hand has no camera extrinsics. The mounts in ``cosmos_mo
 (`fit_mount`): six numbers a camera that make our lines, boundaries and poles fall on the published ones in five frames; all 57 frames are
 compared.
 
-    python -m tests.fixers.cosmos_agreement FOLDER            prints the table
-    python -m tests.fixers.cosmos_agreement FOLDER --pictures docs/img   makes the pictures of docs/conditioning.md
-    python -m tests.fixers.cosmos_agreement FOLDER --fit      estimates the mounts anew (minutes)
+    python -m tests.semantic_map.cosmos_agreement FOLDER            prints the table
+    python -m tests.semantic_map.cosmos_agreement FOLDER --pictures docs/img   makes the pictures of docs/conditioning.md
+    python -m tests.semantic_map.cosmos_agreement FOLDER --fit      estimates the mounts anew (minutes)
 
 FOLDER holds ``example`` and ``example_outputs`` of Cosmos-Drive-Dreams (CC-BY-4.0, (c) NVIDIA).
 """

@@ -1,4 +1,4 @@
-"""The semantic map against the publisher's renders of a recorded clip; see `tests.fixers.cosmos_agreement` for what is compared."""
+"""The semantic map against the publisher's renders of a recorded clip; see `tests.semantic_map.cosmos_agreement` for what is compared."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-from tests.fixers.cosmos_agreement import AS_PUBLISHED, OPENGL, SOLID, compare, mounts, read_clip
 
 from alpasim_plugin.geometry import se2
 from alpasim_plugin.semantic_map.draw import draw_map
@@ -19,6 +18,7 @@ from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.types import Box
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, project_ftheta, read_lenses
 from scenarios.reading import SourceFiles
+from tests.semantic_map.cosmos_agreement import AS_PUBLISHED, OPENGL, SOLID, compare, mounts, read_clip
 
 
 @pytest.fixture(scope="module")

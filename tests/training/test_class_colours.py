@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.fixers.test_conditioning import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.style import COLOURS
 from alpasim_plugin.training.class_colours import OTHERS, recolour_boxes
+from tests.semantic_map.test_draw import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
 
 LABELS = {"truck": "truck", "cyclist": "rider", "pedestrian": "person", "other": "dog"}
 
