@@ -9,11 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.interfaces import Aggregation as Aggregation
+from alpasim_plugin.interfaces import BlockRule as BlockRule
+from alpasim_plugin.interfaces import Controller as Controller
+from alpasim_plugin.interfaces import Direction as Direction
+from alpasim_plugin.interfaces import Evaluator as Evaluator
+from alpasim_plugin.interfaces import Fixer as Fixer
+from alpasim_plugin.interfaces import MetricInfo as MetricInfo
+from alpasim_plugin.interfaces import Policy as Policy
+from alpasim_plugin.interfaces import Renderer as Renderer
+from alpasim_plugin.interfaces import Source as Source
 from alpasim_plugin.map_types import F64 as F64
 from alpasim_plugin.map_types import Box as Box
 from alpasim_plugin.map_types import HeightField as HeightField
@@ -27,9 +37,6 @@ F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
-
-Aggregation = Literal["mean", "median", "max", "min", "last"]
-Direction = Literal["lower", "higher", "none"]
 
 
 # --- motion ---------------------------------------------------------------------------------------------------------
@@ -272,6 +279,7 @@ class Scenario:
     content_hash: str = ""
     notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
     alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+    source_part: str | None = None  # the source that read the log, as named; None: a built road
 
     @property
     def scene(self) -> Scene:
@@ -336,52 +344,3 @@ class MetricSeries:
     unit: str  # "" for rates and flags
     direction: Direction
     reason: str = ""  # why values are invalid, if any is
-
-
-# --- the four seams -------------------------------------------------------------------------------------------------
-
-
-@runtime_checkable
-class Renderer(Protocol):
-    """One rollout's renderer session. What else a session may offer to the loop: `alpasim_plugin.runtime.offers`."""
-
-    def render(self, request: RenderRequest) -> Frame:
-        """Render one frame."""
-        ...
-
-
-@runtime_checkable
-class Fixer(Protocol):
-    """Repairs frames causally: it sees the past and the current block only."""
-
-    def reset(self, seed: int) -> None:
-        """Forget all history."""
-        ...
-
-    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
-        """Return as many frames as came in, with the same times."""
-        ...
-
-
-@runtime_checkable
-class Policy(Protocol):
-    """Plans from observations."""
-
-    sensors: Sequence[SensorSpec]
-
-    def reset(self, seed: int, route: Route) -> None:
-        """Start a new rollout."""
-        ...
-
-    def act(self, observation: Observation) -> Plan:
-        """Return the plan in the rig frame of the observation."""
-        ...
-
-
-@runtime_checkable
-class Evaluator(Protocol):
-    """Pure: a log in, series out."""
-
-    def __call__(self, rollout: RolloutLog, scene: Scene) -> Sequence[MetricSeries]:
-        """Score one rollout."""
-        ...

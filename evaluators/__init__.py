@@ -6,26 +6,42 @@ Example:
     ``metrics = aggregate(rows)``.
 """
 
-from evaluators import collision as _collision
-from evaluators import image_health as _image_health
-from evaluators import offroad as _offroad
-from evaluators import plan as _plan
-from evaluators import route as _route
-from evaluators.aggregate.censoring import censoring
-from evaluators.aggregate.paired import paired
-from evaluators.aggregate.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
-from evaluators.aggregate.summary import aggregate
-from evaluators.base import EVALUATORS, EVALUATORS_VERSION, score
-from evaluators.collision import ContactEvent, contact_events
-from evaluators.metrics import METRICS, MetricInfo
-from evaluators.presets import PRESETS, Preset, preset
+from __future__ import annotations
 
-# Importing an evaluator's module registers it.
-_BUILTIN = (_collision, _offroad, _route, _plan, _image_health)
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from evaluators.aggregate.summary import aggregate  # not on first use: its package bears the same name
+
+if TYPE_CHECKING:
+    from evaluators.aggregate.censoring import censoring
+    from evaluators.aggregate.paired import paired
+    from evaluators.aggregate.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
+    from evaluators.base import resolve_evaluators, score, series
+    from evaluators.collision import ContactEvent, contact_events
+    from evaluators.metrics import METRICS, MetricInfo
+    from evaluators.presets import PRESETS, Preset, preset
+
+_HOMES = {
+    "METRICS": "metrics",
+    "PRESETS": "presets",
+    "ContactEvent": "collision",
+    "MetricInfo": "metrics",
+    "Preset": "presets",
+    "Reduction": "aggregate.reduce",
+    "RolloutValue": "aggregate.reduce",
+    "censoring": "aggregate.censoring",
+    "contact_events": "collision",
+    "paired": "aggregate.paired",
+    "preset": "presets",
+    "reduce_rollout": "aggregate.reduce",
+    "resolve_evaluators": "base",
+    "rollout_values": "aggregate.reduce",
+    "score": "base",
+    "series": "base",
+}
 
 __all__ = [
-    "EVALUATORS",
-    "EVALUATORS_VERSION",
     "METRICS",
     "PRESETS",
     "ContactEvent",
@@ -39,6 +55,14 @@ __all__ = [
     "paired",
     "preset",
     "reduce_rollout",
+    "resolve_evaluators",
     "rollout_values",
     "score",
+    "series",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f"evaluators.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,26 +1,53 @@
-"""The entry point `score`, the registry of evaluators, and the checks that a log must pass before any number is taken from it."""
+"""The entry point `score`, and the checks that a log must pass before any number is taken from it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.errors import EvaluatorError, SimrunError
-from alpasim_plugin.registry import Registry
+from alpasim_plugin.parts import PartSpec, build, names, resolve
+from alpasim_plugin.parts.builtin import BUILTIN
 from alpasim_plugin.types import I64, Bool, Evaluator, MetricSeries, RolloutLog, Scene, Trajectory
-from evaluators.metrics import info
+from evaluators.metrics import declare, info
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset
 
-EVALUATORS: Registry[Evaluator] = Registry("evaluator", "simrun.evaluators")
-EVALUATORS_VERSION = 1  # raise with every change of an evaluator, a preset or a reduction that can change a number
+
+def resolve_evaluators(more: Sequence[str] = ()) -> tuple[PartSpec, ...]:
+    """Resolve every registered evaluator and declare the metrics that they bring.
+
+    Args:
+        more: Further evaluators, as ``package.module:Class``.
+
+    Raises:
+        InputError: An evaluator cannot be imported, or two are named alike.
+        EvaluatorError: Two declare one metric differently.
+    """
+    return _declared((*names("evaluator"), *more))
 
 
-def score(rollout: RolloutLog, scene: Scene, preset: str | Preset = "paper") -> list[MetricSeries]:
-    """Score one rollout with every registered evaluator.
+def resolve_plugins() -> tuple[PartSpec, ...]:
+    """Resolve the evaluators of other packages alone, which makes their metrics known."""
+    return _declared([name for name in names("evaluator") if name not in BUILTIN["evaluator"]])
+
+
+def _declared(chosen: Sequence[str]) -> tuple[PartSpec, ...]:
+    specs = tuple(resolve("evaluator", name) for name in chosen)
+    for spec in specs:
+        for metric, facts in spec.metrics.items():
+            declare(metric, facts)
+    return specs
+
+
+def score(
+    rollout: RolloutLog, scene: Scene, preset: str | Preset = "paper", evaluators: Sequence[PartSpec] | None = None
+) -> list[MetricSeries]:
+    """Score one rollout.
 
     A value is NaN and ``valid`` is False where an evaluator has no ground to give one; ``reason`` then says why.
 
@@ -28,6 +55,7 @@ def score(rollout: RolloutLog, scene: Scene, preset: str | Preset = "paper") -> 
         rollout: What was driven.
         scene: Map and recorded drive.
         preset: Name of a preset or a `Preset`.
+        evaluators: From `resolve_evaluators`; None for every registered one.
 
     Returns:
         One series per metric, over the whole log including the warm-up.
@@ -39,13 +67,13 @@ def score(rollout: RolloutLog, scene: Scene, preset: str | Preset = "paper") -> 
     chosen = find_preset(preset)
     check_rollout(rollout)
     out: dict[str, MetricSeries] = {}
-    for name in EVALUATORS:
-        evaluator = EVALUATORS.get(name)(chosen)
-        for one in run_evaluator(name, evaluator, rollout, scene):
+    for spec in resolve_evaluators() if evaluators is None else evaluators:
+        for metric, facts in spec.metrics.items():
+            declare(metric, facts)  # a worker process has not resolved the part, it only builds it
+        for one in run_evaluator(spec.name, build(spec, preset=chosen), rollout, scene):
             if one.name in out:
-                raise EvaluatorError(
-                    "scoring a rollout", f"evaluator {name!r}", f"metric {one.name!r} was given twice", "rename one of them"
-                )
+                found = f"metric {one.name!r} was given twice"
+                raise EvaluatorError("scoring a rollout", f"evaluator {spec.name!r}", found, "rename one of them")
             out[one.name] = one
     return list(out.values())
 
@@ -176,17 +204,10 @@ def _check_size(who: str, length_m: float, width_m: float, rollout: RolloutLog) 
         )
 
 
-def register(name: str, help_text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a function ``(rollout, scene, preset) -> series`` as an evaluator; used as a decorator."""
+def with_preset(function: Callable[..., list[MetricSeries]]) -> Callable[[Preset], Any]:
+    """Return the factory of an evaluator that is a function ``(rollout, scene, preset) -> series``."""
 
-    def add(function: Callable[[RolloutLog, Scene, Preset], list[MetricSeries]]) -> Callable[..., Any]:
-        @EVALUATORS.register(name, help_text)
-        def factory(chosen: Preset) -> Evaluator:
-            def evaluator(rollout: RolloutLog, scene: Scene) -> list[MetricSeries]:
-                return function(rollout, scene, chosen)
+    def factory(preset: Preset) -> Any:
+        return partial(function, preset=preset)
 
-            return evaluator
-
-        return function
-
-    return add
+    return factory

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
-from evaluators.base import handover_us, register, series
+from evaluators.base import handover_us, series, with_preset
 from evaluators.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset
@@ -66,7 +66,6 @@ def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tupl
     )
 
 
-@register("collision", "contact with other actors, by side, and the least gap")
 def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the ``collision_*`` flags and ``min_distance_to_obstacle_m`` per step, and ``contact_*`` where motion is searched too."""
     origin = origin_of(rollout.ego, preset)
@@ -125,3 +124,6 @@ def _any_per_step(step: I64, n_steps: int) -> Bool:
     out = np.zeros(n_steps, dtype=np.bool_)
     out[step] = True
     return out
+
+
+FACTORY = with_preset(evaluate_collision)

@@ -12,7 +12,7 @@ import numpy as np
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.pixels import is_black
 from alpasim_plugin.types import U8, LoggedImage, MetricSeries, RolloutLog, Scene
-from evaluators.base import register, series
+from evaluators.base import series, with_preset
 from evaluators.presets import Preset
 
 FROZEN_MOVE_M = 0.1  # the ego's way between two images after which they cannot be equal
@@ -38,7 +38,6 @@ def decode(image: LoggedImage) -> U8:
     return np.asarray(pixels, dtype=np.uint8)
 
 
-@register("image_health", "black and frozen camera images")
 def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give ``img_is_black`` and ``img_is_frozen``, one row per image time: 1 if any camera's image of that time is. No images, no rows."""
     images = [image for image in rollout.images if preset.image_camera in (None, image.camera)]
@@ -80,3 +79,6 @@ def _at_or_after_steps(images: list[LoggedImage], rollout: RolloutLog) -> list[M
     ends = np.array([image.end_us for image in images], dtype=np.int64)
     t_us = rollout.ego.t_us[rollout.ego.t_us <= ends[-1]]
     return [series("img_is_black", t_us, black[np.searchsorted(ends, t_us, side="left")])]
+
+
+FACTORY = with_preset(evaluate_images)

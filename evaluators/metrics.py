@@ -7,25 +7,14 @@ which takes these facts from here, so a name cannot carry two units.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
 
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.pixels import BLACK_MAX
 from alpasim_plugin.types import Aggregation, Direction
-
-
-@dataclass(frozen=True)
-class MetricInfo:
-    """What one metric means."""
-
-    unit: str  # "" for flags and ratios
-    direction: Direction  # the better side
-    aggregation: Aggregation  # over the scored steps of one rollout
-    help: str
-    is_flag: bool = False  # 0 or 1 per step; its mean over rollouts is a rate
-    derived: bool = False  # exists per rollout only, computed in the reduction
-    is_headline: bool = False  # reports lead with it
-    is_share: bool = False  # a fraction that is printed in percent; flags are anyway
+from alpasim_plugin.types import MetricInfo as MetricInfo
 
 
 def _flag(
@@ -78,6 +67,7 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
     "progress_clipped_rel": MetricInfo("", "higher", "last", "progress at the last scored step", derived=True, is_share=True),
 }
 
+OWN = frozenset(METRICS)
 _MIN_ADE_NAME = re.compile(r"min_ade@(\d+\.\d+)s\((gt|self)\)")
 
 
@@ -100,7 +90,7 @@ def info(name: str) -> MetricInfo:
         target = "the recording" if match[2] == "gt" else "the driven path"
         return replace(METRICS[MIN_ADE.format(0.5, "gt")], help=f"mean error over {match[1]} s of the best sampled plan against {target}")
     raise EvaluatorError(
-        "looking up a metric", f"name {name!r}", "no evaluator declares it", "add it with evaluators.metrics.declare, or check the spelling"
+        "looking up a metric", f"name {name!r}", "no evaluator declares it", "name it in the evaluator's `metrics`, or check the spelling"
     )
 
 
@@ -113,3 +103,14 @@ def declare(name: str, facts: MetricInfo) -> None:
     if METRICS.get(name, facts) != facts:
         raise EvaluatorError("declaring a metric", f"name {name!r}", "it is declared already with other facts", "choose another name")
     METRICS[name] = facts
+
+
+def declared() -> dict[str, dict[str, Any]]:
+    """Return the facts of all metrics that third-party evaluators have declared, for ``run.json``."""
+    return {name: asdict(facts) for name, facts in METRICS.items() if name not in OWN}
+
+
+def declare_from(info: Mapping[str, Any]) -> None:
+    """Declare the third-party metrics that a run's ``run.json`` describes, so that it can be read where its plug-ins are not installed."""
+    for name, facts in info.get("metrics", {}).items():
+        declare(name, MetricInfo(**facts))

@@ -19,7 +19,7 @@ import shapely
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.geometry import wrap_angle, yaw_from_quat
 from alpasim_plugin.types import F64, Bool, MetricSeries, RolloutLog, Scene
-from evaluators.base import register, series
+from evaluators.base import series, with_preset
 from evaluators.footprint import Geometries, ego_footprints, origin_of
 from evaluators.presets import Preset
 from evaluators.road import Road, road_of
@@ -82,7 +82,6 @@ def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Boo
     return out if preset.wrong_lane_rule == "any_opposes" else out & ~agreed
 
 
-@register("offroad", "off the road, wrong lane, gap to the lanes' border")
 def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give ``offroad``, ``wrong_lane`` and ``min_distance_to_lane_boundary_m`` per step; a missing map is invalid, never zero."""
     t_us = rollout.ego.t_us
@@ -134,3 +133,6 @@ def _no_map(rollout: RolloutLog, preset: Preset, found: str) -> EvaluatorError:
         found,
         "score with a scene that has a map, or with a preset that can do without (paper, alpasim)",
     )
+
+
+FACTORY = with_preset(evaluate_offroad)

@@ -13,7 +13,7 @@ import shapely
 
 from alpasim_plugin.geometry import interpolate, matrix_from_quat
 from alpasim_plugin.types import F64, I64, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
-from evaluators.base import register, series
+from evaluators.base import series, with_preset
 from evaluators.footprint import ActorTable, ego_footprints_at, held, origin_of
 from evaluators.metrics import MIN_ADE
 from evaluators.presets import Preset
@@ -60,7 +60,6 @@ def plan_table(trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, 
     return PlanTable(t_us, centre, np.arctan2(forward[:, 1], forward[:, 0]), start)
 
 
-@register("plan", "steadiness, open-loop collisions and minADE of the plans")
 def evaluate_plans(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give ``plan_deviation``, ``open_loop_collision`` and ``min_ade@...`` per policy answer; empty answers have no row."""
     plans = [plan for plan in rollout.plans if len(plan.trajectory)]
@@ -189,3 +188,6 @@ def _covers(samples: PlanTable, k: int, t_us: I64) -> bool:
 def _errors(samples: PlanTable, k: int, t_us: I64, target_xyz: F64, preset: Preset) -> F64:
     off = held(samples.position(k, t_us), preset) - target_xyz
     return np.asarray(np.linalg.norm(off[:, : 3 if preset.min_ade_with_z else 2], axis=1))
+
+
+FACTORY = with_preset(evaluate_plans)

@@ -13,7 +13,7 @@ import shapely
 
 from alpasim_plugin.geometry import arc_lengths, interpolate, offset_trajectory
 from alpasim_plugin.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
-from evaluators.base import register, relevant, series
+from evaluators.base import relevant, series, with_preset
 from evaluators.footprint import ego_footprints, held, origin_of
 from evaluators.presets import Preset
 
@@ -94,7 +94,6 @@ def progress_so_far(path: F64, points: F64) -> F64:
     return out
 
 
-@register("route", "distance from the recorded path and progress along it")
 def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give the recording-based metrics and ``eval_relevant`` per step."""
     t_us = rollout.ego.t_us
@@ -140,3 +139,6 @@ def driven(ego: F64, first: int) -> F64:
     """Return metres driven ``(T,)`` along positions ``(T, 2)`` since step ``first``, 0 before it."""
     s = arc_lengths(ego)
     return np.asarray(np.maximum(s - s[first], 0.0))
+
+
+FACTORY = with_preset(evaluate_route)

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import POLICIES, plan_times, seconds
+from alpasim_plugin.types import Observation, Plan, Policy, Route, Scenario, SensorSpec
+from policies.base import plan_times, seconds
 
 
-@POLICIES.register("constant-velocity", "straight on at the present speed; sees nothing")
-class ConstantVelocity:
+class ConstantVelocity(Policy):
     """Keep the present heading and speed. Looks at no camera, no route and no actor."""
 
     sensors: Sequence[SensorSpec] = ()

@@ -11,8 +11,8 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, CameraSpec, Frame, Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import POLICIES, plan_times, seconds
+from alpasim_plugin.types import F64, CameraSpec, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from policies.base import plan_times, seconds
 from policies.camera_frame import camera_frame
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
@@ -52,8 +52,7 @@ def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
     )
 
 
-@POLICIES.register("lane-camera", "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior")
-class LaneCamera:
+class LaneCamera(Policy):
     """Keep the lane that the paint shows and stop for what stands on it.
 
     It reads the newest frame of one camera, its own motion, and the route. The lateral position comes from the paint: the route's weight

@@ -11,8 +11,8 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, U8, Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import POLICIES, plan_times, seconds
+from alpasim_plugin.types import F64, U8, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from policies.base import plan_times, seconds
 from policies.camera_frame import camera_frame
 from policies.lane_camera import front_camera
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, sampled, wander
@@ -27,7 +27,7 @@ MAX_DOUBT_M, MAX_DOUBT_SPEED = 0.5, 0.15
 STANDS_MPS = 0.3
 
 
-class Learned:
+class Learned(Policy):
     """Ask a network for a path and a speed profile; drive a sample of its answer.
 
     It reads two frames of one camera, 0.5 s apart, the car's speed, the first speed of the drive as the wanted one, and one of five
@@ -36,15 +36,16 @@ class Learned:
 
     Args:
         scenario: Gives the camera, the scene's id for the random streams, and nothing else.
-        weights: File that ``simrun train policy`` wrote; None takes the class's ``loads``. In runs, name a subclass whose
-            ``loads`` is the file: a rollout's content key holds that file's digest.
+        weights: File that ``simrun train policy`` wrote; None takes the class's ``files``. In runs, name a subclass whose
+            ``files`` name the file: a rollout's key holds that file's digest.
         temperature: Scale of the network's own standard deviations when a plan is drawn; 0 drives the mean.
 
     Raises:
         InputError: No camera looks ahead, the weights are not there or not of this network, or the temperature is negative.
     """
 
-    loads: ClassVar[Path] = WEIGHTS  # part of a rollout's content key
+    files: ClassVar[tuple[Path, ...]] = (WEIGHTS,)  # part of a rollout's key
+    trained = True
 
     def __init__(self, scenario: Scenario, weights: Path | str | None = None, temperature: float = 1.0) -> None:
         from policies.learned_net import knot_weights, load_net, path_grid  # torch is loaded only where it is needed
@@ -54,7 +55,7 @@ class Learned:
         self.camera = front_camera(scenario, "learned")
         self.sensors: Sequence[SensorSpec] = (SensorSpec(self.camera.name),)
         self.scene_id, self.temperature = scenario.scene_id, float(temperature)
-        self.net = load_net(type(self).loads if weights is None else Path(weights))
+        self.net = load_net(type(self).files[0] if weights is None else Path(weights))
         self.grid_m, self.weights = path_grid(), knot_weights()
         self.reset(0, scenario.route)
 
@@ -137,7 +138,3 @@ class LearnedMean(Learned):
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario, temperature=0.0)
-
-
-POLICIES.register("learned", "a network taught on clean frames: one front camera, its speed, a command such as left-ahead")(Learned)
-POLICIES.register("learned-mean", "the same network, driven by its mean answer: every seed drives alike")(LearnedMean)

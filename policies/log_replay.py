@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from alpasim_plugin.geometry import interpolate, inverse, yaw_of
-from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import POLICIES, plan_times
+from alpasim_plugin.types import Observation, Plan, Policy, Route, Scenario, SensorSpec
+from policies.base import plan_times
 
 
-@POLICIES.register("log-replay", "the recorded ego poses, exactly; sees nothing")
-class LogReplay:
+class LogReplay(Policy):
     """Answer the recorded future in the rig frame. With the perfect controller the rollout is the log.
 
     It knows the scenario's ego log, so it is a reference and not a policy under test. Where the log ends before the horizon the plan
@@ -20,7 +19,7 @@ class LogReplay:
     """
 
     sensors: Sequence[SensorSpec] = ()
-    controller = "perfect"  # read by the runtime: which controller this policy is meant for
+    controller = "perfect"
 
     def __init__(self, scenario: Scenario) -> None:
         self.log = scenario.ego_log

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Observation, Plan, Route, Scenario, SensorSpec
-from policies.base import POLICIES, plan_times, seconds
+from alpasim_plugin.types import F64, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from policies.base import plan_times, seconds
 from policies.paths import curve_speeds, follow, make_path, smooth_line, speed_profile
 
 MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
 
 
-@POLICIES.register("pure-pursuit", "along the route at the initial speed, slower in curves; sees nothing")
-class PurePursuit:
+class PurePursuit(Policy):
     """Follow the route at the speed of the first observation, slower where curves ask for it.
 
     Blind by design: it looks at no camera and knows no actor, so it drives into whatever stands on its route. It measures what vehicle,

@@ -15,6 +15,8 @@ import numpy as np
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.config import Document, apply_overrides, load_yaml, validate
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.parts.spec import digest
 from alpasim_plugin.types import (
     BackgroundFile,
     Behaviour,
@@ -31,14 +33,15 @@ from alpasim_plugin.world.ground import flat
 from scenarios.build import build, last_us
 from scenarios.cameras import camera_spec
 from scenarios.schema import ScenarioSpec, VehicleSpec
-from scenarios.sources import SOURCES, detect, read_log
+from scenarios.schema_road import SHIPPED
+from scenarios.sources import detect, read_log, source_digest
 from scenarios.variation import draw, jitter
 
 DOING = "reading a scenario"
 LIBRARY = Path(__file__).resolve().parent
 
 
-def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = ()) -> Scenario:
+def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = (), source: str | None = None) -> Scenario:
     """Load a scenario file, a recorded log, or a shipped scenario by name.
 
     Args:
@@ -46,6 +49,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
             ``smoke/straight``.
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id.
         overrides: ``key=value`` with dotted keys, applied before validation.
+        source: Who reads a recorded log, as `alpasim_plugin.parts.resolve` takes it; None finds the source that recognises the path.
 
     Returns:
         The scenario. The same input and seed give a bit-identical one.
@@ -54,7 +58,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
         InputError: Anything wrong with the input, with file, line and column where there is one.
     """
     path = find(path_or_name)
-    document = _document(path)
+    document = _document(path, source)
     if isinstance(document.data, dict) and "scenarios" in document.data:
         raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "use load_suite, or run it with simrun")
     document = apply_overrides(document, overrides, DOING)
@@ -106,12 +110,12 @@ def shipped_names() -> dict[str, Path]:
     return out
 
 
-def _document(path: Path) -> Document:
-    kind = detect(path)
+def _document(path: Path, source: str | None) -> Document:
+    kind = source or detect(path)
     if kind == "yaml":
         return load_yaml(path, DOING)
-    data = {"version": 1, "log": {kind: str(path.resolve())}}
-    return Document(data, {}, str(path))
+    log = {kind: str(path.resolve())} if kind in SHIPPED else {"source": kind, "path": str(path.resolve())}
+    return Document({"version": 1, "log": log}, {}, str(path))
 
 
 def _default_id(path: Path) -> str:
@@ -156,10 +160,10 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
     from alpasim_plugin.world.route import route_from_log
 
     assert spec.log is not None
-    kind, text = spec.log.source
-    path = document.folder_of(("log", kind)) / text if document.marks else Path(text)
+    kind, text, key = spec.log.recorded
+    path = document.folder_of(("log", key)) / text if document.marks else Path(text)
     if not path.exists():
-        raise document.error(DOING, ("log", kind), f"{path} does not exist", "correct the path; it is relative to the scenario file")
+        raise document.error(DOING, ("log", key), f"{path} does not exist", "correct the path; it is relative to the scenario file")
     record = read_log(kind, path, spec.log.ego)
     behaviour = Behaviour("idm") if spec.log.actors == "idm" else Behaviour("replay")
     actors = () if spec.log.actors == "none" else tuple(
@@ -182,7 +186,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
         _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
         _rates(spec), start, end, spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
-        _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map,
+        _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map, kind,
     )  # fmt: skip
 
 
@@ -246,6 +250,15 @@ def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None
     return BackgroundFile(str(path), matrix)
 
 
+def code_digest_of(scenario: Scenario) -> str | None:
+    """Return what identifies the code that made a scenario: this package's, and that of its source; None where it has no digest."""
+    own = own_code_digest("scenarios.load")
+    if scenario.source_part is None:
+        return own
+    source = source_digest(scenario.source_part)
+    return None if source is None else digest([own, source])
+
+
 def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: str = "") -> str:
     """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of every data file.
 
@@ -253,8 +266,8 @@ def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: st
     """
     content = spec.model_dump(mode="json", exclude={"description", "tags"})
     if spec.log is not None:
-        kind, _ = spec.log.source
-        content["log"][kind] = "given by its content"
+        _, _, key = spec.log.recorded
+        content["log"][key] = "given by its content"
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
     digest = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
@@ -264,4 +277,4 @@ def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: st
     return digest.hexdigest()
 
 
-__all__ = ["SOURCES", "find", "load_scenario", "shipped_names"]
+__all__ = ["find", "load_scenario", "shipped_names"]

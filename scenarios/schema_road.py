@@ -105,6 +105,9 @@ class RoadSpec(Part):
     segments: tuple[SegmentSpec, ...] = Field(min_length=1, description="Segments in driving order.")
 
 
+SHIPPED = ("argoverse", "commonroad", "cosmos", "usdz")
+
+
 class LogSpec(Part):
     """A recorded drive. Exactly one of the sources is given; relative paths start at this file's folder."""
 
@@ -112,21 +115,26 @@ class LogSpec(Part):
     commonroad: str | None = Field(default=None, min_length=1, description="CommonRoad XML file.")
     cosmos: str | None = Field(default=None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip.")
     usdz: str | None = Field(default=None, min_length=1, description="AlpaSim scene file.")
+    source: str | None = Field(
+        default=None, min_length=1, description="A source of an installed package, or package.module:Class; it reads path."
+    )
+    path: str | None = Field(default=None, min_length=1, description="File or folder that source reads.")
     ego: int | str | None = Field(default=None, description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.")
     actors: Literal["replay", "idm", "none"] = Field(default="replay", description="Replay the recorded traffic, let it react, or drop it.")
 
     @model_validator(mode="after")
     def _one(self) -> LogSpec:
-        given = [k for k in ("argoverse", "commonroad", "cosmos", "usdz") if getattr(self, k) is not None]
+        given = [key for key in (*SHIPPED, "source") if getattr(self, key) is not None]
         if len(given) != 1:
-            raise ValueError(f"{len(given)} sources ({', '.join(given) or 'none'}) | give one of argoverse, commonroad, cosmos, usdz")
+            raise ValueError(f"{len(given)} sources ({', '.join(given) or 'none'}) | give one of {', '.join(SHIPPED)}, or source and path")
+        if (self.source is None) != (self.path is None):
+            raise ValueError("only one of source and path | give both, or one of the shipped sources")
         return self
 
     @property
-    def source(self) -> tuple[str, str]:
-        """Return (kind, path)."""
-        for kind in ("argoverse", "commonroad", "cosmos", "usdz"):
-            path = getattr(self, kind)
-            if path is not None:
-                return kind, str(path)
-        raise AssertionError("validated above")
+    def recorded(self) -> tuple[str, str, str]:
+        """Return the source, the path, and the key under which the path stands."""
+        if self.source is not None:
+            return self.source, str(self.path), "path"
+        (kind,) = (kind for kind in SHIPPED if getattr(self, kind) is not None)
+        return kind, str(getattr(self, kind)), kind

@@ -16,18 +16,19 @@ from alpasim_plugin.config import Document, load_yaml, validate
 from alpasim_plugin.errors import InputError
 from scenarios.load import LIBRARY, shipped_names
 from scenarios.schema_base import Part
-from scenarios.sources import SOURCES
+from scenarios.sources import source_of
 
 DOING = "reading a suite"
 
 
 @dataclass(frozen=True)
 class ScenarioRef:
-    """One scenario to load: ``load_scenario(path, seed, overrides)``."""
+    """One scenario to load: ``load_scenario(path, seed, overrides, source)``."""
 
     path: str
     seed: int | None = None  # scene seed; None: the file's own
     overrides: tuple[str, ...] = ()
+    source: str | None = None  # who reads a recorded log; None: the source that recognises it
 
 
 class SuiteItem(Part):
@@ -57,8 +58,13 @@ def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
     return _expand(str(path_or_name), None, ())
 
 
-def expand(item: str, overrides: Sequence[str] = ()) -> list[ScenarioRef]:
-    """Return what one command-line argument stands for, with overrides on top of the suite's own."""
+def expand(item: str, overrides: Sequence[str] = (), source: str | None = None) -> list[ScenarioRef]:
+    """Return what one command-line argument stands for, with overrides on top of the suite's own.
+
+    With a ``source`` the argument is the path of one recorded log, which that source reads.
+    """
+    if source is not None:
+        return [ScenarioRef(item, None, tuple(overrides), source)]
     return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
 
 
@@ -76,7 +82,7 @@ def suites() -> dict[str, Path]:
 def _expand(text: str, base: Path | None, chain: tuple[Path, ...]) -> list[ScenarioRef]:
     path = _locate(text, base)
     if path.is_dir():
-        if any(source.matches(path) for source in SOURCES.values()):
+        if source_of(path) is not None:
             return [ScenarioRef(str(path))]
         files = [f for f in sorted(path.iterdir()) if f.suffix in (".yaml", ".yml") and "scenarios" not in _head(f)]
         if not files:

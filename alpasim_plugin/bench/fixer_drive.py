@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.bench.fixer_speed import Clip
-from alpasim_plugin.fixers import BlockFixer, make_fixer
+from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
 from alpasim_plugin.fixers.onefixer import OneFixer
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -17,7 +17,7 @@ from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.types import U8, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.types import U8, CameraSpec, Fixer, Frame, Renderer, RenderRequest
 from policies import make_policy
 from scenarios.load import load_scenario
 
@@ -98,10 +98,10 @@ def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
 
 
 @dataclass
-class _Tap:
+class _Tap(Fixer):
     """A fixer that remembers the blocks it took into its history, and its stages' times."""
 
-    fixer: BlockFixer
+    fixer: Fixer
     device: str
     given: list[Sequence[Frame]] = field(default_factory=list)
     maps: list[Sequence[U8]] = field(default_factory=list)
@@ -127,12 +127,12 @@ class _Tap:
         return fixed
 
 
-class _Watched:
+class _Watched(Renderer):
     """A renderer that remembers the frames it handed out and the fixer's time for each."""
 
     def __init__(self, renderer: FixedRenderer) -> None:
         self._renderer = renderer
-        self.lookahead, self.chunk = renderer.lookahead, renderer.chunk
+        self.lookahead, self.block = renderer.lookahead, renderer.block
         self.frames: list[Frame] = []
         self.ms: list[float] = []
 

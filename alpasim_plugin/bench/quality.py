@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers import BlockFixer
-from alpasim_plugin.fixers.card import Card
 from alpasim_plugin.fixers.refine import StreamTally, refine_frames
-from alpasim_plugin.types import I64, U8, Frame
+from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.parts import PartSpec
+from alpasim_plugin.types import I64, U8, Fixer, Frame
 from evaluators.video import clip_quality
 from evaluators.video.perceptual import PictureDistance
 from evaluators.video.summary import TRUTH
@@ -48,15 +48,15 @@ class Arm:
     """One row of the table: the render as it is (``3dgs``), the truth, or a fixer under a label."""
 
     label: str
-    card: Card | None = None  # None for 3dgs and the truth
+    spec: PartSpec | None = None  # None for 3dgs and the truth
 
     def __post_init__(self) -> None:
-        if self.card is None and self.label not in (RAW, TRUTH):
+        if self.spec is None and self.label not in (RAW, TRUTH):
             raise InputError("choosing what to measure", f"arm {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
 
     def content(self) -> dict[str, Any]:
         """Return everything that decides its pictures."""
-        return {"label": self.label, "fixer": self.card and self.card.content()}
+        return {"label": self.label, "fixer": self.spec and self.spec.digest}
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mappi
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def roll(clip: QualityClip, arm: Arm, fixer: BlockFixer | None) -> Rolled:
+def roll(clip: QualityClip, arm: Arm, fixer: Fixer | None) -> Rolled:
     """Run an arm over a clip.
 
     Args:
@@ -99,12 +99,12 @@ def roll(clip: QualityClip, arm: Arm, fixer: BlockFixer | None) -> Rolled:
     Raises:
         InputError: A fixer that is missing, or given where none runs.
     """
-    if (fixer is None) != (arm.card is None):
+    if (fixer is None) != (arm.spec is None):
         raise InputError("rolling a clip", f"arm {arm.label!r}", "a fixer too many or too few", "give a session exactly for a fixer's arm")
-    if fixer is None or arm.card is None:
+    if fixer is None or arm.spec is None or not isinstance(arm.spec.settings, FixerSettings):
         return Rolled(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
     tally, frames = StreamTally(), []
-    for block in refine_frames(_frames(clip, arm.card.settings.uses_map), fixer):
+    for block in refine_frames(_frames(clip, arm.spec.settings.uses_map), fixer):
         tally.add(block)
         frames += [frame.rgb for frame in block.fixed]
     return Rolled(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.compose import parse_renderer
+from alpasim_plugin.parts import resolve, resolve_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
 from alpasim_plugin.runtime.past import find_rollout
 from alpasim_plugin.runtime.plan import slug
@@ -18,7 +18,6 @@ from alpasim_plugin.runtime.probe import probe_rollout
 from alpasim_plugin.runtime.probe_files import PROBE_JSON
 from alpasim_plugin.runtime.probe_write import write_probe
 from alpasim_plugin.runtime.store import read_json
-from policies.base import find_policy
 
 FORK_EPILOG = """
 Examples:
@@ -109,8 +108,8 @@ def _gap(pair: dict[str, dict[str, float]], key: str) -> dict[str, float] | None
 
 def _check_names(renderers: list[str] | tuple[str, ...], policy: str | None) -> None:
     for name in renderers:
-        parse_renderer(name)
+        resolve_renderer(name)
     if policy is not None:
-        find_policy(policy)
+        resolve("policy", policy)
     if any("," in name for name in renderers):
         raise InputError("choosing a renderer", f"--renderer {renderers[0]}", "several names", "name one")

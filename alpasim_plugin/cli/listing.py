@@ -8,27 +8,29 @@ from typing import Annotated, Literal
 
 import typer
 
-from alpasim_plugin.renderers import RENDERERS
-from evaluators import METRICS
-from policies import POLICIES
-from scenarios.suite import shipped
+from alpasim_plugin.parts import names, resolve
 
 EPILOG = "Example: `simrun list scenarios`"
 
+Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators", "sources", "scenarios", "metrics"]
+
 
 def list_parts(
-    kind: Annotated[Literal["renderers", "fixers", "policies", "scenarios", "metrics"], typer.Argument(help="What to list.")],
+    kind: Annotated[Listed, typer.Argument(help="What to list.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """List renderers, fixers, policies, shipped scenarios or metrics, one a line with one line of help."""
+    """List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help."""
     del debug
     tables: dict[str, Callable[[], dict[str, str]]] = {
-        "renderers": RENDERERS.names,
+        "renderers": lambda: names("renderer"),
         "fixers": _fixers,
-        "policies": POLICIES.names,
-        "scenarios": shipped,
-        "metrics": lambda: {name: facts.help for name, facts in METRICS.items()},
+        "policies": lambda: names("policy"),
+        "controllers": lambda: names("controller"),
+        "evaluators": lambda: names("evaluator"),
+        "sources": lambda: names("source"),
+        "scenarios": _scenarios,
+        "metrics": _metrics,
     }
     known = tables[kind]()
     if as_json:
@@ -41,7 +43,18 @@ def list_parts(
 
 def _fixers() -> dict[str, str]:
     """Return every fixer with its help and whose weights it has; as a renderer each stands for ``NAME+3dgs``."""
-    from alpasim_plugin.fixers import FIXERS  # loads torch
-    from alpasim_plugin.fixers.card import fixer_card
+    return {name: f"{help_text} [{resolve('fixer', name).note}]" for name, help_text in names("fixer").items()}
 
-    return {name: f"{help_text} [{fixer_card(name).note}]" for name, help_text in FIXERS.names().items()}
+
+def _scenarios() -> dict[str, str]:
+    from scenarios.suite import shipped
+
+    return shipped()
+
+
+def _metrics() -> dict[str, str]:
+    from evaluators.base import resolve_plugins
+    from evaluators.metrics import METRICS
+
+    resolve_plugins()
+    return {name: facts.help for name, facts in METRICS.items()}

@@ -88,7 +88,13 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
     )
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
     line = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}".replace("\u00a0", " ") + f" -> {root}"
-    return "\n".join([line, *(f"{name}: {card.label}, {card.settings.mode}" for name, card in plan.cards.items())])
+    return "\n".join([line, *fixer_labels(plan)])
+
+
+def fixer_labels(plan: RunPlan) -> list[str]:
+    """Name the fixers of a run, whose weights they have, and how they keep time with the loop."""
+    named = [(spec.name, spec.fixer) for spec in plan.renderers if spec.fixer is not None]
+    return [f"{name}: {fixer.label}, {getattr(fixer.settings, 'mode', '')}" for name, fixer in named]
 
 
 def describe(manifest: dict[str, Any], reused: bool) -> str:

@@ -20,13 +20,12 @@ from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, roll, r
 from alpasim_plugin.cli.jobs import spread
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.fixers.card import fixer_card
 from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.nets.lpips import TRUNKS
 from alpasim_plugin.nets.perceptual import NAME, shipped_weights
 from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistance, available, load_distance, weights_folder
+from alpasim_plugin.parts import build, resolve
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
 from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
@@ -114,7 +113,7 @@ def quality(
     summary = summarise([read_json(work.row_file)["row"] for work in todo], baseline)
     summary["run"] = {
         "data": str(data), "split": split, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
-        "fixers": {arm.label: arm.card and arm.card.as_dict() for arm in arms}, "networks": dict(networks),
+        "fixers": {arm.label: arm.spec and arm.spec.as_dict() for arm in arms}, "networks": dict(networks),
         "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
     }  # fmt: skip
     write_results(summary, todo, out)
@@ -146,7 +145,7 @@ def parse_arms(text: str, overrides: Sequence[str]) -> tuple[Arm, ...]:
             arms[label] = Arm(label)
             continue
         name, settings = bundle_fixer(fixer) if fixer.endswith(".safetensors") else (fixer, ())
-        arms[label] = Arm(label, fixer_card(name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
+        arms[label] = Arm(label, resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
     if own or not arms:
         raise InputError(DOING, f"--set {next(iter(own), '')}", "no fixer of this label", f"the arms are {', '.join(arms) or 'none'}")
     return tuple(arms.values())
@@ -179,11 +178,11 @@ def finish(work: Work) -> dict[str, Any]:
             return dict(stored["row"])
     torch.set_num_threads(work.threads)
     cv2.setNumThreads(work.threads)
-    card = work.arm.card
+    spec = work.arm.spec
     fixer = None
-    if card is not None:
+    if spec is not None:
         scene = str(sequence.info.get("scene_id", sequence.name))
-        fixer = make_fixer(card.name, card.settings, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
+        fixer = build(spec, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
     rolled = roll(clip, work.arm, fixer)
     for i in at:
         done, png = cv2.imencode(".png", cv2.cvtColor(rolled.video[i], cv2.COLOR_RGB2BGR))

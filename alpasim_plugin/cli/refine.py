@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers import BlockFixer, fixer_settings, make_fixer
+from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_video
+from alpasim_plugin.types import Fixer
 
 INTERRUPTED = 130
 LINE_EVERY_S = 10.0
@@ -56,7 +57,7 @@ def refine(
     del debug
     settings = fixer_settings(fixer, fixer_overrides(overrides or ()))
 
-    def session() -> BlockFixer:
+    def session() -> Fixer:
         made = make_fixer(fixer, settings, scene_id=SCENE, seed=seed, device=device, threads=threads)
         if not made.trained and not as_json:
             print(untrained_notice(made.label), file=sys.stderr)

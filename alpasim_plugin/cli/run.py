@@ -12,16 +12,14 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.progress import make_progress
+from alpasim_plugin.cli.progress import fixer_labels, make_progress
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
-from alpasim_plugin.runtime.compose import parse_renderer
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from evaluators import PRESETS
 from evaluators.report import fixer_lines, render_table
-from policies.base import find_policy
 from scenarios.suite import expand
 
 INTERRUPTED = 130
@@ -43,8 +41,12 @@ Examples:
 
 def run(
     scenarios: Annotated[list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")],
-    renderer: Annotated[str, typer.Option("--renderer", help="Renderers, comma-separated; `onefixer`, or `FIXER+RENDERER`.")] = "3dgs",
-    policy: Annotated[str, typer.Option("--policy", help="Policies, comma-separated; `package.module:Class` works too.")] = "lane-camera",
+    renderer: Annotated[
+        str, typer.Option("--renderer", help="Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.")
+    ] = "3dgs",
+    policy: Annotated[
+        str, typer.Option("--policy", help="Policies, comma-separated: a name, `package.module:Class` or `file.py:Class`.")
+    ] = "lane-camera",
     seeds: Annotated[str, typer.Option("--seeds", help="How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
@@ -55,6 +57,13 @@ def run(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="Override a scenario key, or with `fixer.` a fixer's: key=value. Repeatable.")
     ] = None,
+    controller: Annotated[
+        str | None, typer.Option("--controller", help="What moves the ego along its plans; by default the policy's.")
+    ] = None,
+    evaluators: Annotated[
+        list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
+    ] = None,
+    source: Annotated[str | None, typer.Option("--source", help="Who reads the recorded log: a name, or package.module:Class.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue in a folder that another command began.")] = False,
     baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
@@ -73,16 +82,13 @@ def run(
         raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is built", "use --executor local")
     names = [name.strip() for name in renderer.split(",") if name.strip()]
     drivers = [name.strip() for name in policy.split(",") if name.strip()]
-    for name in drivers:
-        find_policy(name)
     _check_preset(preset)
     if baseline is not None and baseline not in names:
         raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")
-    for name in names:
-        parse_renderer(name)
     of_scene, of_fixer = split_overrides(overrides or ())
-    refs = [ref for item in scenarios for ref in expand(item, of_scene)]
-    plan = make_plan(refs, names, drivers, parse_seeds(seeds), RunOptions(preset, images, video, device, baseline, of_fixer))
+    refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
+    options = RunOptions(preset, images, video, device, baseline, of_fixer, controller, tuple(evaluators or ()))
+    plan = make_plan(refs, names, drivers, parse_seeds(seeds), options)
     root = out or default_folder(plan)
     if dry_run:
         _print_plan(plan, root, workers, as_json)
@@ -93,6 +99,8 @@ def run(
         print(f"interrupted; finished rollouts are in {root}; the same command continues", file=sys.stderr)
         raise typer.Exit(INTERRUPTED) from None
     _print_result(result, as_json)
+    if plan.undigested and not as_json:
+        print(f"not reused by the next command: {', '.join(plan.undigested)} cannot be identified from here (--resume reuses it)")
     raise typer.Exit(result.exit_code)
 
 
@@ -140,13 +148,14 @@ def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -
     per_cell = len(plan.renderers) * len(plan.policies) * len(plan.seeds)
     facts = {
         "out": str(root),
-        "key": plan.key,
+        "key": plan.command_key,
         "rollouts": len(plan.cells),
         "scenes": list(plan.scenarios),
-        "renderers": list(plan.renderers),
-        "fixers": [f"{name}: {card.label}, {card.settings.mode}" for name, card in plan.cards.items()],
-        "policies": list(plan.policies),
+        "renderers": [spec.name for spec in plan.renderers],
+        "fixers": fixer_labels(plan),
+        "policies": [spec.name for spec in plan.policies],
         "seeds": list(plan.seeds),
+        "never_reused": list(plan.undigested),
         "camera_frames": int(frames * per_cell),
         "workers": threads.workers,
         "threads_per_worker": threads.per_worker,

@@ -17,6 +17,7 @@ from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
 from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
 from evaluators import preset as find_preset
+from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.report import render_table
 
@@ -39,6 +40,9 @@ def score(
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     settings: Annotated[Path | None, typer.Option("--settings", help="AlpaSim's eval-config.yaml, with --preset alpasim.")] = None,
     rails: Annotated[bool, typer.Option("--rails/--no-rails", help="Lanes by their rails, or their centres widened by 1.85 m.")] = True,
+    evaluators: Annotated[
+        list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after logs and preset.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
@@ -63,7 +67,9 @@ def score(
         if not (quiet or as_json):
             print(f"[{done}/{len(found)}] {manifest['rollout']}: {describe(manifest, reused=False)}", file=sys.stderr, flush=True)
 
-    result = execute_score(found, KnownScenes(scene, rails), chosen, own, out, ["simrun", *sys.argv[1:]], on_done)
+    result = execute_score(
+        found, KnownScenes(scene, rails), chosen, own, resolve_evaluators(evaluators or ()), out, ["simrun", *sys.argv[1:]], on_done
+    )
     _print(result, as_json)
     raise typer.Exit(result.exit_code)
 

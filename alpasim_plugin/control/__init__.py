@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.control.base import Controller
-from alpasim_plugin.control.bicycle import BicycleState, Command
-from alpasim_plugin.control.perfect import PerfectController
-from alpasim_plugin.control.tracker import PlanTracker
-from alpasim_plugin.registry import Registry
-from alpasim_plugin.types import Vehicle
+from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.types import Controller, Vehicle
 
-CONTROLLERS: Registry[Controller] = Registry("controller", "simrun.controllers")
-CONTROLLERS.register("bicycle", "kinematic bicycle that follows the plan with preview, within the vehicle's limits")(PlanTracker)
-CONTROLLERS.register("perfect", "the ego is exactly where its plan says")(PerfectController)
-
-__all__ = ["CONTROLLERS", "BicycleState", "Command", "Controller", "PerfectController", "PlanTracker", "make_controller"]
+__all__ = ["Controller", "make_controller"]
 
 
 def make_controller(name: str, vehicle: Vehicle) -> Controller:
-    """Return the controller of a name for a vehicle.
+    """Return a controller for a vehicle.
+
+    Args:
+        name: A controller as `alpasim_plugin.parts.resolve` takes it.
+        vehicle: What it moves.
 
     Raises:
         InputError: No controller has that name.
     """
-    return CONTROLLERS.get(name)(vehicle)
+    controller: Controller = build(resolve("controller", name), vehicle=vehicle)
+    return controller

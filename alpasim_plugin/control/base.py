@@ -1,8 +1,6 @@
-"""What every controller shares: the protocol, the checks on a plan, and the move from a world pose to the plane and back."""
+"""What every controller shares: the checks on a plan, and the move from a world pose to the plane and back."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 
@@ -12,24 +10,6 @@ from alpasim_plugin.geometry import se2, yaw_of
 from alpasim_plugin.types import EgoState, Trajectory, Vehicle
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
-
-
-class Controller(Protocol):
-    """Moves the ego along a plan. Pure: the answer depends on the arguments only."""
-
-    def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
-        """Return the state at ``to_us``.
-
-        Args:
-            state: The true state now.
-            plan: Absolute rig poses in the world with their times; None: there is no plan yet, brake gently to a stop.
-            to_us: When to arrive; later than ``state.t_us``.
-
-        Raises:
-            PolicyError: The plan is empty, not finite, or its times do not increase.
-            InputError: ``to_us`` is not later than ``state.t_us``.
-        """
-        ...
 
 
 def check_plan(plan: Trajectory) -> None:

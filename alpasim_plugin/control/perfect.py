@@ -6,10 +6,10 @@ import numpy as np
 
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop
 from alpasim_plugin.geometry import interpolate, wrap_angle, yaw_of
-from alpasim_plugin.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.types import Controller, EgoState, Trajectory, Vehicle
 
 
-class PerfectController:
+class PerfectController(Controller):
     """Put the ego onto the plan's pose at the asked time, interpolated; before the first and after the last pose those are held."""
 
     def __init__(self, vehicle: Vehicle) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop, planar, spatial
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.control.reference import Reference, build_reference
-from alpasim_plugin.types import F64, EgoState, Trajectory, Vehicle
+from alpasim_plugin.types import F64, Controller, EgoState, Trajectory, Vehicle
 
 MAX_LATERAL_MPS2 = 8.0  # beyond it tyres slip and a kinematic bicycle is no model of a car
 CONTROL_S = 0.05  # how often the law looks again within one call
@@ -36,7 +36,7 @@ _MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
 _CUMULATE = np.tril(np.ones((NODES, NODES)))
 
 
-class PlanTracker:
+class PlanTracker(Controller):
     """Drive a kinematic bicycle along the plan within the vehicle's limits.
 
     A plan that ends is held at its last pose, so a short plan brakes. The vehicle reverses only for a plan that drives backwards by more

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from alpasim_plugin.fixers.base import BlockFixer
 from alpasim_plugin.fixers.block_runner import Workshop
 from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.types import Fixer, Frame, RenderRequest, Scenario
 
 FixedRenderer = SpeculativeRenderer | ChunkRenderer
 
 
 def fixed_renderer(
     render: Callable[[RenderRequest], Frame],
-    make_fixer: Callable[[], BlockFixer],
+    make_fixer: Callable[[], Fixer],
     settings: FixerSettings,
     scenario: Scenario,
     threads: int | None = None,

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets.checkpoints import StateDict, load_weights, read_metadata, save_weights
+from alpasim_plugin.nets.checkpoints import StateDict, load_weights, save_weights
+from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 FORMAT = "simrun-fixer-1"

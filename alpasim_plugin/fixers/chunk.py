@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from alpasim_plugin.errors import RendererError
-from alpasim_plugin.fixers.base import BlockFixer
 from alpasim_plugin.fixers.block_runner import Workshop
-from alpasim_plugin.types import Frame, RenderRequest
+from alpasim_plugin.types import Fixer, Frame, Renderer, RenderRequest
 
 
-class ChunkRenderer:
+class ChunkRenderer(Renderer):
     """A renderer session that takes all frames of a block at once, of all cameras.
 
     Args:
@@ -19,11 +18,9 @@ class ChunkRenderer:
         fixer: At the start of its history.
     """
 
-    lookahead = 0
-
-    def __init__(self, workshop: Workshop, fixer: BlockFixer) -> None:
+    def __init__(self, workshop: Workshop, fixer: Fixer) -> None:
         self.workshop, self.fixer = workshop, fixer
-        self.chunk = (fixer.blocks.first, fixer.blocks.then)
+        self.block = fixer.blocks
         self.frames = self.blocks = 0
 
     @property

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from alpasim_plugin.fixers.base import FIXERS, BlockRule
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import group_views
-from alpasim_plugin.types import U8, Frame
+from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
-@FIXERS.register("identity", "passes frames on unchanged")
-class IdentityFixer:
+class IdentityFixer(Fixer):
     """Return every frame as it came.
 
     Args:
@@ -20,7 +18,7 @@ class IdentityFixer:
     """
 
     settings_model = FixerSettings
-    trained = False
+    note = "no network"
 
     def __init__(self, settings: FixerSettings, scene_id: str = "", seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
         self.settings = settings

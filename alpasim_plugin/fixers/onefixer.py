@@ -13,7 +13,6 @@ import torch
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.base import FIXERS, BlockRule
 from alpasim_plugin.fixers.networks import LATENT, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState, no_clock
@@ -22,7 +21,7 @@ from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import DOING, SIDE, Views, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE as LATENT_SIDE
 from alpasim_plugin.nets.clips import crop_clip
-from alpasim_plugin.types import U8, Frame
+from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
 @dataclass(frozen=True)
@@ -47,11 +46,7 @@ class Draft:
     state: PipelineState
 
 
-@FIXERS.register("onefixer-2b", "one-step causal fixer of the size of OmniDreams single view; needs its weights")
-@FIXERS.register("onefixer-s", "one-step causal fixer for a small GPU")
-@FIXERS.register("onefixer-tiny", "one-step causal fixer for a CPU, 256x144")
-@FIXERS.register("onefixer", "one-step causal fixer, the size for a CPU (onefixer-tiny)")
-class OneFixer:
+class OneFixer(Fixer):
     """Repair the frames of one rollout block by block.
 
     Args:
@@ -63,8 +58,6 @@ class OneFixer:
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
     """
-
-    settings_model = OneFixerSettings
 
     def __init__(self, settings: FixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
         if not isinstance(settings, OneFixerSettings):

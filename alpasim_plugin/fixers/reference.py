@@ -12,7 +12,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.base import BlockRule
 from alpasim_plugin.fixers.networks import LATENT, Networks, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -21,7 +20,7 @@ from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.clips import on_grid
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names
-from alpasim_plugin.types import U8, Frame
+from alpasim_plugin.types import U8, BlockRule, Frame
 
 
 class Recording(Protocol):

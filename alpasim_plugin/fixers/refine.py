@@ -10,8 +10,7 @@ from itertools import islice
 
 import numpy as np
 
-from alpasim_plugin.fixers.base import BlockFixer
-from alpasim_plugin.types import U8, Frame
+from alpasim_plugin.types import U8, Fixer, Frame
 
 FULL_SCALE = 255.0  # grey levels
 
@@ -25,7 +24,7 @@ class FixedBlock:
     seconds: float
 
 
-def refine_frames(frames: Iterable[tuple[Frame, U8 | None]], fixer: BlockFixer) -> Iterator[FixedBlock]:
+def refine_frames(frames: Iterable[tuple[Frame, U8 | None]], fixer: Fixer) -> Iterator[FixedBlock]:
     """Fix a stream block by block; the last block may be shorter.
 
     Args:

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from alpasim_plugin.config import apply_overrides, load_yaml, validate
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets import schedule
 from alpasim_plugin.yaml_marks import Document
 
 DOING = "reading the settings of a fixer"
@@ -37,6 +38,11 @@ class FixerSettings(Part):
     tolerance_m: float = Field(default=0.02, ge=0, description="Speculative: largest camera displacement from the predicted pose.")
     tolerance_deg: float = Field(default=0.1, ge=0, description="Speculative: largest camera rotation from the predicted pose.")
     uses_map: bool = Field(default=False, description="Whether the semantic map is drawn and given to the fixer.")
+
+    @classmethod
+    def load(cls, name: str, overrides: Sequence[str] = ()) -> Self:
+        """Return the settings of a fixer's name; see `load_settings`."""
+        return load_settings(name, cls, overrides)
 
 
 class DiTSettings(Part):
@@ -93,6 +99,11 @@ class WeightsSettings(Part):
     prompt: str | None = Field(default=None, description="Safetensors with 'text' (tokens, text_width).")
     sha256: DigestSettings = Field(default=DigestSettings(), description="Expected digests by the keys above.")
 
+    def path(self, part: str) -> Path | None:
+        """Return where a part's weights lie: ``bundle``, ``dit``, ``vae``, ``decoder`` or ``prompt``; None where it has no file."""
+        path: str | None = getattr(self, part)
+        return None if path is None else Path(path)
+
     @model_validator(mode="after")
     def _one_source(self) -> WeightsSettings:
         parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self, key) is not None]
@@ -127,6 +138,12 @@ class OneFixerSettings(FixerSettings):
     codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
     graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
     fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
+
+    @field_validator("steps", mode="before")
+    @classmethod
+    def _counted(cls, value: Any) -> Any:
+        """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
+        return schedule.names(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
     @model_validator(mode="after")
     def _consistent(self) -> OneFixerSettings:

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.errors import RendererError
-from alpasim_plugin.fixers.base import BlockFixer
 from alpasim_plugin.fixers.block_runner import Shot, Workshop
 from alpasim_plugin.fixers.prediction_error import Deviation, deviation, same_view
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.types import Frame, RenderRequest
+from alpasim_plugin.types import Fixer, Frame, Renderer, RenderRequest
 
 
 @dataclass
@@ -42,7 +41,7 @@ class Tally:
         return counts | {"forecast_error": _spread(self.forecasts), "shown_error": _spread(self.shown)}
 
 
-class SpeculativeRenderer:
+class SpeculativeRenderer(Renderer):
     """A renderer session whose frames are fixed block by block and handed out one by one.
 
     Cameras whose frames fall due at the same times go through the fixer together, as views of one batch; cameras of another rhythm have
@@ -54,14 +53,12 @@ class SpeculativeRenderer:
         settings: Tolerances.
     """
 
-    chunk: tuple[int, int] | None = None
-
-    def __init__(self, workshop: Workshop, make_fixer: Callable[[], BlockFixer], settings: FixerSettings) -> None:
+    def __init__(self, workshop: Workshop, make_fixer: Callable[[], Fixer], settings: FixerSettings) -> None:
         self.workshop, self.settings = workshop, settings
         self._make = make_fixer
-        self._spare: BlockFixer | None = make_fixer()
+        self._spare: Fixer | None = make_fixer()
         self.label, self.trained, blocks = self._spare.label, self._spare.trained, self._spare.blocks
-        self.lookahead = max(blocks.first, blocks.then) - 1
+        self.lookahead = max(1, max(blocks.first, blocks.then) - 1)  # at least the next frame: cameras are told apart by their rhythm
         self._rhythms: dict[tuple[int, ...], _Rhythm] = {}
         self._rhythm_of: dict[str, _Rhythm] = {}
         self.tally = Tally()
@@ -112,7 +109,7 @@ class _Rhythm:
     """Cameras in step with each other, and the block in progress."""
 
     workshop: Workshop
-    fixer: BlockFixer
+    fixer: Fixer
     settings: FixerSettings
     tally: Tally
     cameras: list[str] = field(default_factory=list)

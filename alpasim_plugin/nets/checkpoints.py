@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -63,22 +63,6 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     if dtype is None:
         return tensors
     return {key: convert(key, value, dtype, str(path)) for key, value in tensors.items()}
-
-
-def read_metadata(path: str | Path) -> dict[str, str]:
-    """Return the text entries in a safetensors file's header.
-
-    Raises:
-        InputError: No file, or anything but safetensors (a pickle, for example).
-    """
-    doing, do = "reading the header of a safetensors file", "give a whole .safetensors file"
-    if not Path(path).is_file():
-        raise InputError(doing, str(path), "no such file", do)
-    try:
-        with safe_open(path, framework="pt") as file:
-            return dict(file.metadata() or {})
-    except (SafetensorError, ValueError) as error:
-        raise InputError(doing, str(path), f"not safetensors: {error}", do) from error
 
 
 def save_weights(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:

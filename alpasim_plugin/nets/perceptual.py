@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.checkpoints import load_weights, read_metadata, save_weights, weight
+from alpasim_plugin.nets.checkpoints import load_weights, save_weights, weight
+from alpasim_plugin.nets.headers import read_metadata
 
 NAME = "perceptual-syn"
 FORMAT = "simrun-perceptual-1"

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.registry import Registry
+from alpasim_plugin.parts import build, resolve
 from alpasim_plugin.types import Renderer, Scenario
-
-RENDERERS: Registry[Renderer] = Registry("renderer", "simrun.renderers")
 
 
 def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "cpu", threads: int | None = None) -> Renderer:
     """Make one rollout's renderer.
 
-    A factory takes ``(scenario, seed, device, threads)``; scenes are built once per process and shared between renderers.
+    Scenes are built once per process and shared between renderers.
 
     Args:
-        name: A registered renderer.
+        name: A renderer as `alpasim_plugin.parts.resolve` takes it.
         scenario: What is rendered.
         seed: The rollout's seed: what wanders from frame to frame depends on it, the scene does not.
         device: ``cpu`` or ``cuda``.
@@ -24,4 +22,5 @@ def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "c
         InputError: Unknown name or device.
         RendererError: The device does not work.
     """
-    return RENDERERS.get(name)(scenario, seed, device, threads)
+    renderer: Renderer = build(resolve("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads)
+    return renderer

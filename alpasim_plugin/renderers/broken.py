@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 
-from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.types import U8, Frame, Renderer, RenderRequest, Scenario
 
@@ -24,7 +24,7 @@ LATE_US = 1_000_000
 Spoil = Callable[[U8], U8]
 
 
-class BrokenRenderer:
+class BrokenRenderer(Renderer):
     """Render the clean scene and spoil every frame on its own."""
 
     def __init__(self, clean: CleanRenderer, spoil: Spoil) -> None:
@@ -36,7 +36,7 @@ class BrokenRenderer:
         return replace(frame, rgb=self.spoil(frame.rgb))
 
 
-class ShiftedRenderer:
+class ShiftedRenderer(Renderer):
     """Render the clean scene from a camera that stands beside its place, as a wrong extrinsic calibration or map offset would."""
 
     def __init__(self, clean: CleanRenderer, right_m: float) -> None:
@@ -49,7 +49,7 @@ class ShiftedRenderer:
         return self.clean.render(replace(request, T_world_camera=moved))
 
 
-class StaleRenderer:
+class StaleRenderer(Renderer):
     """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or the first one for ever."""
 
     def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
@@ -82,25 +82,21 @@ def blurred(rgb: U8) -> U8:
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1]), dtype=np.uint8)
 
 
-def _register_spoiled(name: str, spoil: Spoil, help_text: str) -> None:
-    @RENDERERS.register(name, help_text)
-    def _make(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-        return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), spoil)
+def _spoiled(scenario: Scenario, seed: int, device: str, threads: int | None, *, spoil: Spoil) -> Renderer:
+    return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), spoil)
 
 
-def _register_stale(name: str, age_us: int | None, help_text: str) -> None:
-    @RENDERERS.register(name, help_text)
-    def _make(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-        return StaleRenderer(CleanRenderer(scenario, seed, device, threads), age_us)
+def _stale(scenario: Scenario, seed: int, device: str, threads: int | None, *, age_us: int | None) -> Renderer:
+    return StaleRenderer(CleanRenderer(scenario, seed, device, threads), age_us)
 
 
-@RENDERERS.register("broken-shifted", f"deliberate fault: seen from {SHIFT_M} m to the right")
-def _shifted(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
+def shifted_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
+    """Make the renderer ``broken-shifted``."""
     return ShiftedRenderer(CleanRenderer(scenario, seed, device, threads), SHIFT_M)
 
 
-_register_spoiled("broken-black", black, "deliberate fault: black frames")
-_register_spoiled("broken-mirrored", mirrored, "deliberate fault: left and right swapped")
-_register_spoiled("broken-blurred", blurred, "deliberate fault: strong blur")
-_register_stale("broken-frozen", None, "deliberate fault: the first frame for ever")
-_register_stale("broken-late", LATE_US, f"deliberate fault: pictures {LATE_US / 1e6:g} s old")
+black_renderer = partial(_spoiled, spoil=black)
+mirrored_renderer = partial(_spoiled, spoil=mirrored)
+blurred_renderer = partial(_spoiled, spoil=blurred)
+frozen_renderer = partial(_stale, age_us=None)
+late_renderer = partial(_stale, age_us=LATE_US)

@@ -28,7 +28,6 @@ from alpasim_plugin.gaussians.scene.nodes import SceneNode
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
 from alpasim_plugin.geometry import interpolate, inverse
-from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.world.ground import height_at
 
@@ -42,7 +41,7 @@ T = TypeVar("T")
 _cache: OrderedDict[str, object] = OrderedDict()
 
 
-class CleanRenderer:
+class CleanRenderer(Renderer):
     """Render the scene as built.
 
     Attributes:
@@ -96,11 +95,6 @@ class SurrogateRenderer(CleanRenderer):
     def _change(self, w: float, node: SceneNode, level: int) -> GaussianCloud:
         change = self.surrogate.actor if node.kind == "actor" else self.surrogate.background
         return change(node, level, node.levels[level].cloud, w)
-
-
-@RENDERERS.register("clean", "the Gaussian scene as built")
-def _clean(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-    return CleanRenderer(scenario, seed, device, threads)
 
 
 def backend_of(device: str) -> Backend:

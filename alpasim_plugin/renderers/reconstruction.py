@@ -14,7 +14,6 @@ from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
 from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky_mask import SkyMask, SkyView
-from alpasim_plugin.renderers.base import RENDERERS
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory
 from alpasim_plugin.renderers.reconstruction_files import read_model
@@ -34,7 +33,7 @@ class Model:
     sky: SkyMask
 
 
-class ReconstructionRenderer:
+class ReconstructionRenderer(Renderer):
     """Render a reconstruction of the scenario's logged drive; it is fitted now if nobody has yet.
 
     Attributes:
@@ -56,8 +55,8 @@ class ReconstructionRenderer:
         return Frame(request.t_us, request.camera.name, out.to_uint8(), shown, out.depth)
 
 
-@RENDERERS.register("3dgs", "a reconstruction of the logged drive: error grows with the distance from its path")
-def _3dgs(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
+def reconstruction_renderer(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
+    """Make the renderer ``3dgs``: what the scenario's degradation names."""
     amount = scenario.degradation
     if amount.kind == "none" or (amount.kind == "surrogate" and amount.severity == 0):
         return CleanRenderer(scenario, seed, device, threads)

@@ -9,7 +9,7 @@ import numpy as np
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import I64, Scenario, SensorSpec
+from alpasim_plugin.types import I64, BlockRule, Scenario, SensorSpec
 
 DOING = "setting up a loop in whole blocks of frames"
 
@@ -40,10 +40,10 @@ class Cadence:
         return question is not None and (self.whole_blocks or question - t_us < period_us)
 
 
-def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], chunk: tuple[int, int] | None = None) -> Cadence:
-    """Return the cadence of a rollout: the policy's own period, or with ``chunk`` one question at the end of each block of frames.
+def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], block: BlockRule | None = None) -> Cadence:
+    """Return the cadence of a rollout: the policy's own period, or with ``block`` one question at the end of each block of frames.
 
-    ``chunk`` is AlpaSim's rule for video models: the control step is the block, and a plan is committed for the whole next one. The
+    ``block`` is AlpaSim's rule for video models: the control step is the block, and a plan is committed for the whole next one. The
     recorded drive has to be forced until the first block is complete, since nobody was asked before. A policy without cameras has no
     blocks and keeps its own period. Nothing is asked at the last instant: no drive follows it.
 
@@ -51,15 +51,15 @@ def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec]
         clock: Ticks of the rollout.
         scenario: Rates and warm-up.
         sensors: Cameras the policy listens to.
-        chunk: Frames of the first block and of each later one.
+        block: Frames of the first block and of each later one.
 
     Raises:
         InputError: Cameras of different periods, a warm-up shorter than the first block, or a scenario in which no block ends.
     """
     end_us = clock.start_us + clock.n_steps * clock.rates.control_us
-    if chunk is None or not sensors:
+    if block is None or not sensors:
         return Cadence(np.array([tick.t_us for tick in clock.ticks() if tick.policy_due and not tick.is_last], dtype=np.int64))
-    first, then = chunk
+    first, then = block.first, block.then
     periods = {sensor.interval_us or scenario.rates.camera_us for sensor in sensors}
     if len(periods) > 1:
         raise InputError(

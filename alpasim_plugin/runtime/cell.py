@@ -14,16 +14,14 @@ import cv2
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import SimrunError
-from alpasim_plugin.runtime.compose import card_of, make_renderer
-from alpasim_plugin.runtime.offers import facts_of
+from alpasim_plugin.parts import build, complete
+from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
 from alpasim_plugin.types import Policy, Renderer, Scenario
-from evaluators import EVALUATORS_VERSION
-from policies import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
@@ -37,27 +35,28 @@ class Parts:
     Attributes:
         session: Names the rollout in its log; equal rollouts have equal names.
         names: What the log's header says of each service.
-        controller: None takes what the policy asks for.
+        controller: Moves the ego.
     """
 
     renderer: Renderer
     policy: Policy
     session: str
     names: Mapping[str, str]
-    controller: Controller | None = None
+    controller: Controller
 
 
 PartsOf = Callable[[Cell, RunOptions, Scenario, int], Parts]
 
 
 def own_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
-    """Make the parts that a cell names."""
-    card = card_of(cell.renderer, options.fixer)
+    """Build the parts that a cell holds."""
+    name, fixer = cell.renderer.name, cell.renderer.fixer
     return Parts(
-        make_renderer(cell.renderer, scenario, cell.seed, options.device, threads, options.fixer),
-        make_policy(cell.policy, scenario),
+        make_renderer(cell.renderer, scenario, cell.seed, options.device, threads),
+        build(cell.policy, scenario=scenario),
         cell.rollout_key,
-        {"sensorsim": cell.renderer if card is None else f"{cell.renderer} ({card.label})", "egodriver": cell.policy},
+        {"sensorsim": name if fixer is None else f"{name} ({fixer.label})", "egodriver": cell.policy.name},
+        build(cell.controller, vehicle=scenario.vehicle),
     )
 
 
@@ -70,10 +69,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of
     began = time.perf_counter()
     cv2.setNumThreads(1)  # its pool is outside the thread budget, and frames are too small to gain from it
     manifest: dict[str, Any] = {
-        "renderer": cell.renderer,
-        "policy": cell.policy,
-        "scene": cell.scene,
-        "seed": cell.seed,
+        **cell.names,
         "path": cell.folder.as_posix(),
         "rollout_key": cell.rollout_key,
         "score_key": cell.score_key,
@@ -86,7 +82,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of
         parts = parts_of(cell, options, scenario, threads)
         with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
             run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
-        manifest |= recorder.facts() | {"fixer": facts_of(parts.renderer)}
+        manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"
@@ -112,11 +108,13 @@ def rescore_cell(cell: Cell, options: RunOptions, root: Path) -> dict[str, Any]:
     return manifest
 
 
-def finished(cell: Cell, root: Path) -> dict[str, Any] | None:
+def finished(cell: Cell, root: Path, trusted: bool = False) -> dict[str, Any] | None:
     """Return the manifest of a cell whose rollout is done and was shaped by the same content; else None.
 
-    Failed rollouts are not finished: they run again.
+    Failed rollouts are not finished: they run again. So do rollouts with a part whose content cannot be known, unless they are ``trusted``.
     """
+    if cell.undigested and not trusted:
+        return None
     path = root / cell.folder / MANIFEST
     if not path.exists():
         return None
@@ -125,16 +123,14 @@ def finished(cell: Cell, root: Path) -> dict[str, Any] | None:
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
-    scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset)
-    keys = {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed}
-    write_table(folder / "steps.parquet", [keys | row for row in scored.steps], STEPS_SCHEMA)
-    scores = {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
-    return scores | {"evaluators_version": EVALUATORS_VERSION}
+    scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators)
+    write_table(folder / "steps.parquet", [cell.names | row for row in scored.steps], STEPS_SCHEMA)
+    return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
 
 
 @lru_cache(maxsize=4)
 def _scenario(ref: ScenarioRef) -> Scenario:
-    return load_scenario(ref.path, ref.seed, ref.overrides)
+    return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
 
 
 def _unforeseen(error: Exception) -> dict[str, str]:

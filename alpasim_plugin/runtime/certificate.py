@@ -52,7 +52,7 @@ def certify(
     cell, manifest = min(repeatable, key=lambda pair: (pair[1]["steps"], pair[0].rollout_key))
     log_sha256 = sha256((root / cell.folder / LOG_NAME).read_bytes())
     facts = {
-        "cell": {"renderer": cell.renderer, "policy": cell.policy, "scene": cell.scene, "seed": cell.seed},
+        "cell": dict(cell.names),
         "path": cell.folder.as_posix(),
         "rollout_key": cell.rollout_key,
         "score_key": cell.score_key,

@@ -47,28 +47,35 @@ def thread_budget(workers: int | None, n_cells: int) -> Threads:
     return Threads(chosen, max(1, cores // chosen))
 
 
-def execute(plan: RunPlan, root: Path, threads: Threads, on_done: OnDone) -> list[dict[str, Any]]:
+def execute(plan: RunPlan, root: Path, threads: Threads, on_done: OnDone, trusted: bool = False) -> list[dict[str, Any]]:
     """Bring every cell to a manifest and return the manifests in the plan's order.
 
     Cells finished earlier are reused; those scored under another preset are scored again from their logs. KeyboardInterrupt passes
     through after the workers have been stopped; what was finished stays on disk.
+
+    Args:
+        plan: The run.
+        root: Its folder.
+        threads: Workers, and threads of each.
+        on_done: Called with each manifest.
+        trusted: Reuse rollouts with parts that have no digest too.
     """
-    manifests: dict[Cell, dict[str, Any]] = {}
+    manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
     for cell in plan.cells:
-        manifest = finished(cell, root)
+        manifest = finished(cell, root, trusted)
         if manifest is None:
             todo.append(cell)
             continue
         if manifest.get("score_key") != cell.score_key:
             manifest = rescore_cell(cell, plan.options, root)
-        manifests[cell] = manifest
+        manifests[cell.folder] = manifest
         on_done(manifest, True)
     runner = _run_here if threads.workers == 1 else _run_pool
     for cell, manifest in runner(todo, plan.options, root, threads):
-        manifests[cell] = manifest
+        manifests[cell.folder] = manifest
         on_done(manifest, False)
-    return [manifests[cell] for cell in plan.cells]
+    return [manifests[cell.folder] for cell in plan.cells]
 
 
 def _run_here(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Threads) -> Iterator[tuple[Cell, dict[str, Any]]]:
@@ -90,7 +97,7 @@ def _run_pool(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Th
             suspects += in_flight.values()
             left = [cell for cell in left if cell not in suspects]
     for cell in suspects:
-        manifest_now = finished(cell, root)  # written just before its worker died, perhaps
+        manifest_now = finished(cell, root, trusted=True)  # written just before its worker died, perhaps
         try:
             yield cell, manifest_now or next(_one_pool([cell], options, root, Threads(1, threads.per_worker), {}))[1]
         except BrokenProcessPool:
@@ -160,10 +167,7 @@ def _lost_worker(cell: Cell, root: Path) -> dict[str, Any]:
         "look for the out-of-memory killer in the system log, or use --workers 1",
     )
     manifest = {
-        "renderer": cell.renderer,
-        "policy": cell.policy,
-        "scene": cell.scene,
-        "seed": cell.seed,
+        **cell.names,
         "path": cell.folder.as_posix(),
         "rollout_key": cell.rollout_key,
         "score_key": cell.score_key,

@@ -16,16 +16,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from alpasim_plugin.control import make_controller
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Difference, Trace, first_difference, trace_log
+from alpasim_plugin.parts import digest, resolve, resolve_renderer
 from alpasim_plugin.runtime.cell import MANIFEST, Parts, own_parts, run_cell
-from alpasim_plugin.runtime.compose import card_of
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.past import PastRollout
-from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, digest, score_key
+from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.run import RunResult, write_run_info
 from alpasim_plugin.runtime.store import read_json, write_json
@@ -53,14 +52,12 @@ class Change:
         parts = [self.renderer or "", self.policy or "", f"seed {self.seed}" if self.seed is not None else ""]
         return f"{', '.join(part for part in parts if part) or UNCHANGED} from {self.after_us * 1e-6:g} s"
 
-    def of(self, cell: Cell) -> Cell:
-        """Return the cell whose parts take over."""
-        return replace(
-            cell,
-            renderer=self.renderer or cell.renderer,
-            policy=self.policy or cell.policy,
-            seed=cell.seed if self.seed is None else self.seed,
-        )
+    def of(self, cell: Cell, fixer: Sequence[str]) -> Cell:
+        """Return the cell whose parts take over; ``fixer`` are the run's settings of fixers."""
+        renderer = cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
+        policy = cell.policy if self.policy is None else resolve("policy", self.policy)
+        controller = cell.controller if self.policy is None else resolve("controller", policy.controller)
+        return replace(cell, renderer=renderer, policy=policy, controller=controller, seed=cell.seed if self.seed is None else self.seed)
 
 
 def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
@@ -83,31 +80,23 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     """
     _check(past, change, root)
     began = time.perf_counter()
-    options = replace(past.options, video=video, baseline=past.cell.renderer)
+    options = replace(past.options, video=video, baseline=past.cell.renderer.name)
+    then = change.of(past.cell, options.fixer)
     original = _copied(past, root)
-    fork = Cell(
-        change.label, past.cell.policy, past.cell.scene, past.cell.seed, past.cell.ref, digest([past.cell.rollout_key, asdict(change)]), ""
-    )
-    fork = replace(fork, score_key=score_key(fork.rollout_key, options.preset))
+    key = digest([past.cell.rollout_key, asdict(change), then.renderer.digest, then.policy.digest, then.controller.digest])
+    label = replace(then.renderer, name=change.label)
+    fork = replace(past.cell, renderer=label, rollout_key=key, score_key=score_key(key, options.preset, past.cell.evaluators))
     threads = thread_budget(1, 1)
     at_us = past.scenario.start_us + change.after_us
-    manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, change))
+    manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change))
     if manifest["status"] == "ok":
         manifest["fork"] = asdict(change) | {"of": past.name} | _compared(past, change, at_us, root / fork.folder)
         write_json(root / fork.folder / MANIFEST, manifest)
-    parts = ((past.cell.renderer, past.cell.renderer), (fork.renderer, change.of(past.cell).renderer))
-    plan = RunPlan(
-        (past.cell, fork),
-        {past.cell.scene: past.scenario},
-        (past.cell.renderer, fork.renderer),
-        (past.cell.policy,),
-        (past.cell.seed,),
-        options,
-        {name: card for name, part in parts if (card := card_of(part, options.fixer)) is not None},
-    )
+    cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
+    plan = RunPlan(cells, {past.cell.scene: past.scenario}, renderers, (past.cell.policy,), (past.cell.seed,), options)
     write_run_info(root, plan, command, threads)
     write_json(root / "run.json", read_json(root / "run.json") | {"fork": manifest.get("fork")})
-    summary = write_tables(root, [original, manifest], options.preset, past.cell.renderer, threads, time.perf_counter() - began)
+    summary = write_tables(root, [original, manifest], options.preset, past.cell.renderer.name, threads, time.perf_counter() - began)
     write_flips(root)
     write_summary_md(root)
     write_junit(root)
@@ -137,22 +126,20 @@ def _copied(past: PastRollout, root: Path) -> dict[str, Any]:
     return manifest
 
 
-def _parts(own: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
+def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
     """Make the original's parts and those that take over, joined at the instant; a part that stays the same is one object."""
-    del fork
-    then, at_us = change.of(own), scenario.start_us + change.after_us
+    at_us = scenario.start_us + change.after_us
     before = own_parts(own, options, scenario, threads)
     after = before if then == own else own_parts(then, options, scenario, threads)
     same_renderer = (then.renderer, then.seed) == (own.renderer, own.seed)
     same_policy = (then.policy, then.seed) == (own.policy, own.seed)
-    first, second = (make_controller(getattr(p.policy, "controller", "bicycle"), scenario.vehicle) for p in (before, after))
     next_policy = before.policy if same_policy else after.policy
     return Parts(
         SwitchedRenderer(before.renderer, before.renderer if same_renderer else after.renderer, at_us),
         SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario.rates.camera_us),
-        own.rollout_key if then == own else digest([own.rollout_key, asdict(change)]),
+        own.rollout_key if then == own else fork.rollout_key,
         before.names if then == own else after.names,
-        SwitchedController(first, second, at_us),
+        SwitchedController(before.controller, after.controller, at_us),
     )
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
 from alpasim_plugin.pixels import is_black
-from alpasim_plugin.runtime.offers import batch_of
 from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest
 
 
@@ -23,7 +22,7 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
         return []
     name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
     try:
-        frames = list(batch_of(renderer)(requests))
+        frames = list(renderer.render_batch(requests))
     except SimrunError:
         raise
     except Exception as error:

@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.compose import card_of
+from alpasim_plugin.parts import resolve_renderer
 from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.types import Scenario
@@ -38,7 +38,7 @@ class PastRollout:
     @property
     def name(self) -> str:
         """Give the name by which `find_rollout` finds it."""
-        return rollout_name(self.cell.renderer, self.cell.policy, self.cell.scene, self.cell.seed)
+        return rollout_name(self.cell.renderer.name, self.cell.policy.name, self.cell.scene, self.cell.seed)
 
 
 def rollout_name(renderer: str, policy: str, scene: str, seed: int) -> str:
@@ -66,10 +66,10 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRoll
     where = scenario or stated.get("path")
     if where is None:
         raise InputError(DOING, f"{root / 'run.json'}", "it does not say where the scenario lies", "name it with --scenario PATH")
-    ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())))
+    ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())), stated.get("source"))
     options = _options(info)
     # Settings of fixers may belong to another renderer of the run; a plan refuses settings that no renderer takes.
-    own = options if card_of(row["renderer"], options.fixer) is not None else replace(options, fixer=())
+    own = options if resolve_renderer(row["renderer"], options.fixer).fixer is not None else replace(options, fixer=())
     plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row["scene"])
@@ -87,7 +87,8 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRoll
 def _options(info: Mapping[str, Any]) -> RunOptions:
     """Return the options of an earlier run."""
     stated = {f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]}
-    return RunOptions(**stated | {"baseline": None, "video": "none", "fixer": tuple(stated.get("fixer", ()))})
+    listed = {key: tuple(stated.get(key, ())) for key in ("fixer", "evaluators")}
+    return RunOptions(**stated | {"baseline": None, "video": "none"} | listed)
 
 
 def _row(root: Path, name: str) -> dict[str, Any]:

@@ -1,29 +1,23 @@
-"""What a run consists of: the cells renderer x policy x scene x seed, each with a content key."""
+"""What a run consists of: the cells renderer x policy x scene x seed, each with its parts resolved and a key of their content."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.renderers.reconstruction import model_key
-from alpasim_plugin.runtime.compose import BASE, card_of, parse_renderer
+from alpasim_plugin.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
+from alpasim_plugin.parts.source import own_code_digest
 from alpasim_plugin.types import Scenario
-from evaluators import EVALUATORS_VERSION
-from policies.base import loaded_by
-from scenarios.load import load_scenario
+from evaluators import resolve_evaluators
+from evaluators.presets import preset
+from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
-if TYPE_CHECKING:
-    from alpasim_plugin.fixers.card import Card
-
 SLUG_LENGTH = 80
-LOG_VERSION = 1  # raise when a rollout made by an older version must not be reused
 
 
 @dataclass(frozen=True)
@@ -36,24 +30,34 @@ class RunOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     baseline: str | None = None
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
+    controller: str | None = None  # None: what each policy asks for
+    evaluators: tuple[str, ...] = ()  # package.module:Class of evaluators beside the registered ones
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One rollout to run."""
+    """One rollout to run: what its parts are, and what identifies it."""
 
-    renderer: str
-    policy: str
+    renderer: RendererSpec
+    policy: PartSpec
+    controller: PartSpec
     scene: str  # scene id
     seed: int
     ref: ScenarioRef
+    evaluators: tuple[PartSpec, ...]
     rollout_key: str  # content of everything that shapes the log
     score_key: str  # rollout_key plus what shapes the scores
+    undigested: tuple[str, ...] = ()  # parts whose behaviour is decided elsewhere: the rollout is never reused unasked
 
     @property
     def folder(self) -> Path:
         """Give the rollout's folder below the run folder."""
-        return Path("rollouts", slug(self.renderer), slug(self.policy), slug(self.scene), str(self.seed))
+        return Path("rollouts", slug(self.renderer.name), slug(self.policy.name), slug(self.scene), str(self.seed))
+
+    @property
+    def names(self) -> dict[str, str | int]:
+        """Give the cell as tables name it."""
+        return {"renderer": self.renderer.name, "policy": self.policy.name, "scene": self.scene, "seed": self.seed}
 
 
 @dataclass(frozen=True)
@@ -62,16 +66,33 @@ class RunPlan:
 
     cells: tuple[Cell, ...]
     scenarios: dict[str, Scenario]
-    renderers: tuple[str, ...]
-    policies: tuple[str, ...]
+    renderers: tuple[RendererSpec, ...]
+    policies: tuple[PartSpec, ...]
     seeds: tuple[int, ...]
     options: RunOptions
-    cards: Mapping[str, Card] = field(default_factory=dict)  # renderer -> the fixer in its name
 
     @property
-    def key(self) -> str:
-        """Give a short hash of all rollouts and options: the same command has the same key, however its logs are scored by now."""
-        return digest([[cell.rollout_key for cell in self.cells], asdict(self.options)])[:12]
+    def command_key(self) -> str:
+        """Give a short hash of what was asked for: the same command has the same one, whatever its parts contain by now."""
+        asked = [[*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides] for cell in self.cells]
+        return digest([asked, asdict(self.options)])[:12]
+
+    @property
+    def content(self) -> str:
+        """Give a short hash of what shapes the results: it changes with any part."""
+        return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
+
+    @property
+    def parts(self) -> tuple[PartSpec, ...]:
+        """Give every part that the run builds, each once."""
+        found = [part for cell in self.cells for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)]
+        found += [part for cell in self.cells[:1] for part in cell.evaluators]
+        return tuple({(part.kind, part.name): part for part in found if part is not None}.values())
+
+    @property
+    def undigested(self) -> tuple[str, ...]:
+        """Give the parts without a digest."""
+        return tuple(dict.fromkeys(part for cell in self.cells for part in cell.undigested))
 
 
 def make_plan(
@@ -81,27 +102,30 @@ def make_plan(
     seeds: Sequence[int],
     options: RunOptions,
 ) -> RunPlan:
-    """Load every scenario and lay out the cells, scene by scene so that workers reuse what they built.
+    """Load every scenario, resolve every part, and lay out the cells, scene by scene so that workers reuse what they built.
 
     Raises:
-        InputError: A scenario is bad, two scenarios share an id, or a name is given twice.
+        InputError: A scenario or a part is bad, two scenarios share an id, or a name is given twice.
     """
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
         twice = sorted({str(value) for value in values if list(values).count(value) > 1})
         if not values or twice:
             found = f"{', '.join(twice)} twice" if twice else "none"
             raise InputError("planning a run", f"{what}s {', '.join(map(str, values)) or '(none)'}", found, f"name every {what} once")
-    same = [str(parse_renderer(name)) for name in renderers]
+    rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
+    same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
         raise InputError("planning a run", f"renderers {list(renderers)}", f"they stand for {same}", "name every renderer once")
-    cards = {name: card for name in renderers if (card := card_of(name, options.fixer)) is not None}
-    if options.fixer and not cards:
+    if options.fixer and all(spec.fixer is None for spec in rendering):
         found = f"no fixer among the renderers {list(renderers)}"
         raise InputError("planning a run", f"--set fixer.{options.fixer[0]}", found, "leave it out, or name a fixer")
+    driving = tuple(resolve("policy", name) for name in policies)
+    moving = {spec.name: resolve("controller", options.controller or spec.controller) for spec in driving}
+    scoring = resolve_evaluators(options.evaluators)
     scenarios: dict[str, Scenario] = {}
     origin: dict[str, ScenarioRef] = {}
     for ref in refs:
-        scenario = load_scenario(ref.path, ref.seed, ref.overrides)
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         other = origin.get(scenario.scene_id)
         if other is not None:
             raise InputError(
@@ -111,30 +135,43 @@ def make_plan(
                 "give one of them another id, or name it once",
             )
         scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
-    contents = {policy: loaded_by(policy) for policy in policies}
-    models = {scene_id: model_key(scenario) for scene_id, scenario in scenarios.items()}  # what 3dgs shows, where it is fitted
-    cells = []
-    for scene_id, scenario in scenarios.items():
-        for renderer in renderers:
-            for policy in policies:
-                for seed in seeds:
-                    shaped_by = [LOG_VERSION, scenario.content_hash, renderer, policy, seed, options.images, options.device]
-                    shaped_by += [model] if (model := models[scene_id]) and parse_renderer(renderer).base == BASE else []
-                    shaped_by += [content] if (content := contents[policy]) else []
-                    rollout_key = digest([*shaped_by, cards[renderer].content()] if renderer in cards else shaped_by)
-                    keys = rollout_key, score_key(rollout_key, options.preset)
-                    cells.append(Cell(renderer, policy, scene_id, seed, origin[scene_id], *keys))
-    return RunPlan(tuple(cells), scenarios, tuple(renderers), tuple(policies), tuple(seeds), options, cards)
+    cells = [
+        _cell(scenario, origin[scene_id], renderer, policy, moving[policy.name], seed, scoring, options)
+        for scene_id, scenario in scenarios.items()
+        for renderer in rendering
+        for policy in driving
+        for seed in seeds
+    ]
+    return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
 
 
-def score_key(rollout_key: str, preset: str) -> str:
-    """Return the content key of a rollout's scores: another preset or other evaluators give another one."""
-    return digest([rollout_key, preset, EVALUATORS_VERSION])
+def _cell(
+    scenario: Scenario,
+    ref: ScenarioRef,
+    renderer: RendererSpec,
+    policy: PartSpec,
+    controller: PartSpec,
+    seed: int,
+    evaluators: tuple[PartSpec, ...],
+    options: RunOptions,
+) -> Cell:
+    content = {
+        f"renderer {renderer.name}": renderer.digest,
+        f"policy {policy.name}": policy.digest,
+        f"controller {controller.name}": controller.digest,
+        f"source of {scenario.scene_id}": code_digest_of(scenario),
+    }
+    loop = own_code_digest("alpasim_plugin.runtime.rollout")
+    rollout_key = digest([loop, scenario.content_hash, content, seed, options.images, options.device])
+    undigested = tuple(what for what, known in content.items() if known is None)
+    cell = Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, "", undigested)
+    return replace(cell, score_key=score_key(rollout_key, options.preset, evaluators))
 
 
-def digest(value: object) -> str:
-    """Return a SHA-256 over the canonical JSON of a value."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
+def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:
+    """Return the content key of a rollout's scores: another preset, or other code of an evaluator or of the reduction, gives another."""
+    own = own_code_digest("alpasim_plugin.runtime.scoring")
+    return digest([rollout_key, preset(preset_name).as_dict(), own, [(spec.name, spec.digest) for spec in evaluators]])
 
 
 def slug(name: str) -> str:

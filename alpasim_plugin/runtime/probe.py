@@ -18,10 +18,10 @@ from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import first_difference, trace_log
+from alpasim_plugin.parts import resolve_renderer
 from alpasim_plugin.runtime.cell import own_parts
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan
-from alpasim_plugin.runtime.offers import chunk_of, lookahead_of, spent_by
 from alpasim_plugin.runtime.past import PastRollout
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
@@ -70,19 +70,18 @@ class Probe:
     pairs: tuple[Pair, ...]
 
 
-class _Eyes:
+class _Eyes(Renderer):
     """Renders every request with all renderers and gives the loop the driving one's frames."""
 
     def __init__(self, renderers: Mapping[str, Renderer], driver: str) -> None:
         self.renderers, self.driver = renderers, driver
-        self.chunk = chunk_of(renderers[driver])
-        other = next((name for name, renderer in renderers.items() if chunk_of(renderer) != self.chunk), None)
+        self.block = renderers[driver].block
+        other = next((name for name, renderer in renderers.items() if renderer.block != self.block), None)
         if other is not None:
-            found = f"{other!r} renders in blocks of {chunk_of(renderers[other])}, {driver!r} in blocks of {self.chunk}"
+            found = f"{other!r} renders {renderers[other].block or 'frames one by one'}, {driver!r} {self.block or 'frames one by one'}"
             raise InputError(DOING, f"--renderers {','.join(renderers)}", found, "choose the mode 'speculative' for both")
-        self.lookahead = max(lookahead_of(renderer) for renderer in renderers.values())
+        self.lookahead = max(renderer.lookahead for renderer in renderers.values())
         self.latest: dict[str, dict[str, Frame]] = {name: {} for name in renderers}
-        self.spent_ms: Mapping[str, float] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         return self.render_batch([request])[0]
@@ -92,12 +91,12 @@ class _Eyes:
             frames = checked_frames(renderer, requests)
             self.latest[name] |= {frame.camera: frame for frame in frames}
             if name == self.driver:
-                driven, self.spent_ms = frames, dict(spent_by(renderer))
+                driven, self.stage_ms = frames, dict(renderer.stage_ms)
         return driven
 
 
 @dataclass
-class _Asked:
+class _Asked(Policy):
     """Asks one policy per renderer and gives the loop the driving one's plan."""
 
     policies: Mapping[str, Policy]
@@ -106,7 +105,6 @@ class _Asked:
 
     def __post_init__(self) -> None:
         self.sensors: Sequence[SensorSpec] = self.policies[self.eyes.driver].sensors
-        self.controller = getattr(self.policies[self.eyes.driver], "controller", "bicycle")
 
     def reset(self, seed: int, route: Route) -> None:
         for policy in self.policies.values():
@@ -139,15 +137,17 @@ def probe_rollout(past: PastRollout, renderers: Sequence[str]) -> Probe:
         found = "its latency is measured: when a plan took effect depended on the machine"
         raise InputError(DOING, past.name, found, "run it with --set latency.kind=fixed")
     own, threads = past.cell, thread_budget(1, 1).per_worker
-    names = list(dict.fromkeys([own.renderer, *renderers]))
-    parts = {name: own_parts(replace(own, renderer=name), past.options, past.scenario, threads) for name in names}
-    eyes = _Eyes({name: p.renderer for name, p in parts.items()}, own.renderer)
+    specs = {own.renderer.name: own.renderer} | {
+        name: resolve_renderer(name, past.options.fixer) for name in renderers if name != own.renderer.name
+    }
+    parts = {name: own_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
+    eyes = _Eyes({name: p.renderer for name, p in parts.items()}, own.renderer.name)
     asked = _Asked({name: p.policy for name, p in parts.items()}, eyes)
     if not asked.sensors:
-        raise InputError(DOING, past.name, f"the policy {own.policy!r} takes no camera", "probe a rollout of a policy that sees")
+        raise InputError(DOING, past.name, f"the policy {own.policy.name!r} takes no camera", "probe a rollout of a policy that sees")
     with tempfile.TemporaryDirectory(prefix="simrun-probe-") as folder:
         with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
-            run_rollout(past.scenario, eyes, asked, own.seed, recorder)
+            run_rollout(past.scenario, eyes, asked, own.seed, recorder, parts[own.renderer.name].controller)
         one, other = (trace_log(f / LOG_NAME, read_facts(f / FRAMES_NAME)) for f in (past.folder, Path(folder)))
     difference = first_difference(one, other, past.scenario.start_us, past.scenario.rates.control_us)
     if difference is not None:

@@ -33,7 +33,7 @@ def write_probe(probe: Probe, past: PastRollout, renderers: tuple[str, ...], out
         out: Folder; by default one below ``probes/`` in the rollout's run folder, where the report finds it.
     """
     cell = past.cell
-    folder = out or past.root / probe_folder(cell.renderer, cell.policy, cell.scene, cell.seed, renderers)
+    folder = out or past.root / probe_folder(cell.renderer.name, cell.policy.name, cell.scene, cell.seed, renderers)
     folder.mkdir(parents=True, exist_ok=True)
     start_us = past.scenario.start_us
     pairs, rows = [], []
@@ -89,5 +89,7 @@ def _plot(path: Path, probe: Probe, past: PastRollout) -> None:
         axes.spines[["top", "right"]].set_visible(False)
     above.legend(fontsize=8, loc="upper left")
     reference = probe.pairs[0].reference
-    above.set_title(f"{past.cell.policy} along {past.cell.scene}, seed {past.cell.seed}: against {reference} (grey: warm-up)", fontsize=10)
+    above.set_title(
+        f"{past.cell.policy.name} along {past.cell.scene}, seed {past.cell.seed}: against {reference} (grey: warm-up)", fontsize=10
+    )
     figure.savefig(path, dpi=110)

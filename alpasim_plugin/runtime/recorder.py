@@ -15,7 +15,6 @@ import numpy as np
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
-from alpasim_plugin.runtime.offers import spent_by
 from alpasim_plugin.runtime.pictures import Pictures
 from alpasim_plugin.runtime.stages import StageTimes
 from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, Renderer, RenderRequest, RolloutLog, Scenario, Trajectory
@@ -74,7 +73,7 @@ class Recorder:
     def rendering(self, renderer: Renderer, frames: int) -> AbstractContextManager[None]:
         """Time the rendering of so many frames; what the renderer reports as stages of their own is filed under their names."""
         self._first_call = self._first_call or frames
-        return self._times.measure("render", frames, lambda: spent_by(renderer))
+        return self._times.measure("render", frames, lambda: renderer.stage_ms)
 
     # --- in the loop's order ----------------------------------------------------------------------------------------
 

@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers import BlockFixer
 from alpasim_plugin.fixers.refine import StreamTally, refine_frames
 from alpasim_plugin.log.video_reader import TimedFrame, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
-from alpasim_plugin.types import F32, U8, Frame
+from alpasim_plugin.types import F32, U8, Fixer, Frame
 
 DOING = "refining a video"
 CAMERA = "video"
@@ -97,7 +96,7 @@ class RefineSummary:
 
 
 def refine_video(
-    files: RefineFiles, make_fixer: Callable[[], BlockFixer], on_frames: Callable[[int, int | None], None] | None = None
+    files: RefineFiles, make_fixer: Callable[[], Fixer], on_frames: Callable[[int, int | None], None] | None = None
 ) -> RefineSummary:
     """Refine a video file.
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import time
 
 from alpasim_plugin.clock import Clock
-from alpasim_plugin.control import Controller, make_controller
+from alpasim_plugin.control import make_controller
+from alpasim_plugin.parts import complete
 from alpasim_plugin.runtime.cadence import make_cadence
 from alpasim_plugin.runtime.cameras import CameraRig
 from alpasim_plugin.runtime.forecast import Foresight
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan
 from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState
-from alpasim_plugin.runtime.offers import chunk_of, lookahead_of
 from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.types import Policy, Renderer, Scenario
+from alpasim_plugin.types import Controller, Policy, Renderer, Scenario
 from alpasim_plugin.world.actors import make_actors
 
 
@@ -44,13 +44,14 @@ def run_rollout(
     """
     clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     recorder = recorder or Recorder(scenario, seed)
-    controller = controller or make_controller(getattr(policy, "controller", "bicycle"), scenario.vehicle)
+    renderer, policy = complete(renderer, Renderer), complete(policy, Policy)
+    controller = controller or make_controller(policy.controller, scenario.vehicle)
     actors = make_actors(scenario)
     plans = PlanQueue(scenario.latency)
     state = LoopState.at_start(scenario, clock.n_steps)
-    cadence = make_cadence(clock, scenario, policy.sensors, chunk_of(renderer))
+    cadence = make_cadence(clock, scenario, policy.sensors, renderer.block)
     foresight = Foresight(scenario, controller, plans, actors, state)
-    rig = CameraRig(scenario, policy.sensors, clock, cadence, foresight, lookahead_of(renderer))
+    rig = CameraRig(scenario, policy.sensors, clock, cadence, foresight, renderer.lookahead)
     policy.reset(seed, scenario.route)
     recorder.start(clock, rig.specs)
 

@@ -20,6 +20,7 @@ from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.store import read_json, write_json
 from alpasim_plugin.runtime.tables import write_tables
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
+from evaluators.metrics import declared
 from evaluators.report import write_junit, write_report, write_summary_md
 
 SCHEMA_VERSION = 1
@@ -61,7 +62,7 @@ def default_folder(plan: RunPlan) -> Path:
     """Return the folder a command writes to when none is named: the same command, the same folder."""
     first = next(iter(plan.scenarios))
     more = f"-and-{len(plan.scenarios) - 1}-more" if len(plan.scenarios) > 1 else ""
-    return Path("runs", f"{slug(first)}{more}-{plan.key}")
+    return Path("runs", f"{slug(first)}{more}-{plan.command_key}")
 
 
 def execute_run(
@@ -88,7 +89,7 @@ def execute_run(
         manifest["reused"] = reused
         progress.rollout_done(manifest, reused)
 
-    manifests = execute(plan, root, threads, on_done)
+    manifests = execute(plan, root, threads, on_done, resume)
     wall_s = time.perf_counter() - began
     tables = root / "summary.json"
     held = read_json(tables).get("determinism") if tables.exists() else None
@@ -105,19 +106,19 @@ def execute_run(
 
 
 def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, resume: bool) -> None:
-    """Write run.json, or check that the run in the folder is this one."""
+    """Write run.json, or check that the run in the folder is this one; parts that have changed since are written down anew."""
     path = root / "run.json"
     if path.exists():
-        key = read_json(path).get("key")
-        if key == plan.key:
-            return
-        if not resume:
+        held = read_json(path)
+        if held.get("key") != plan.command_key and not resume:
             raise InputError(
                 "starting a run",
                 f"folder {root}",
-                f"it holds another run (key {key}; this command has {plan.key})",
+                f"it holds another run (key {held.get('key')}; this command has {plan.command_key})",
                 "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
             )
+        if held.get("content") == plan.content:
+            return
     write_run_info(root, plan, command, threads)
 
 
@@ -126,23 +127,30 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
     for scene_id, scenario in plan.scenarios.items():
         write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scenario))
     refs = {cell.scene: cell.ref for cell in plan.cells}
+    parts = plan.parts
     write_json(
         root / "run.json",
         {
             "schema_version": SCHEMA_VERSION,
-            "key": plan.key,
+            "key": plan.command_key,
+            "content": plan.content,
             "command": list(command),
             "version": versions()["alpasim-onefixer"],
             "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
             "config": asdict(plan.options) | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
             "preset": plan.options.preset,
-            "renderers": list(plan.renderers),
-            "policies": list(plan.policies),
+            "renderers": [spec.name for spec in plan.renderers],
+            "policies": [spec.name for spec in plan.policies],
             "seeds": list(plan.seeds),
             "scenes": {
                 name: {
                     "source": s.source,
-                    "ref": {"path": str(Path(refs[name].path).absolute()), "seed": refs[name].seed, "overrides": refs[name].overrides},
+                    "ref": {
+                        "path": str(Path(refs[name].path).absolute()),
+                        "seed": refs[name].seed,
+                        "overrides": refs[name].overrides,
+                        "source": refs[name].source,
+                    },
                     "content_hash": s.content_hash,
                     "seed": s.seed,
                     "duration_s": (s.end_us - s.start_us) * 1e-6,
@@ -154,8 +162,10 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
                 }
                 for name, s in plan.scenarios.items()
             },
-            "fixers": {name: card.as_dict() for name, card in plan.cards.items()},
-            "weights": {file: digest for card in plan.cards.values() for file, digest in card.weights.items()},
+            "fixers": {spec.name: spec.fixer.as_dict() for spec in plan.renderers if spec.fixer is not None},
+            "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
+            "metrics": declared(),
+            "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),
             "versions": versions(),
             "left_out": sorted({note for s in plan.scenarios.values() for note in s.notes}),

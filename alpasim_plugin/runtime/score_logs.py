@@ -12,6 +12,7 @@ from typing import Any
 from alpasim_plugin.config import load_yaml
 from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.scoring import contacts_of, tabulated
@@ -56,7 +57,12 @@ def find_logs(items: Sequence[str]) -> list[Path]:
 
 
 def score_logs(
-    logs: Sequence[Path], scenes: KnownScenes, preset: Preset, root: Path, on_done: Callable[[dict[str, Any]], None]
+    logs: Sequence[Path],
+    scenes: KnownScenes,
+    preset: Preset,
+    evaluators: Sequence[PartSpec],
+    root: Path,
+    on_done: Callable[[dict[str, Any]], None],
 ) -> list[LogScore]:
     """Score every log against its scene and write its steps and manifest.
 
@@ -69,7 +75,7 @@ def score_logs(
     taken: set[str] = set()
     for log in logs:
         began = time.perf_counter()
-        one = _score(log, scenes, preset, root, taken)
+        one = _score(log, scenes, preset, evaluators, root, taken)
         one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
         write_json(root / one.manifest["path"] / "manifest.json", one.manifest)
         out.append(one)
@@ -77,7 +83,7 @@ def score_logs(
     return out
 
 
-def _score(log: Path, scenes: KnownScenes, preset: Preset, root: Path, taken: set[str]) -> LogScore:
+def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[PartSpec], root: Path, taken: set[str]) -> LogScore:
     name = log.resolve().parent.name
     manifest: dict[str, Any] = {
         "renderer": UNKNOWN, "policy": UNKNOWN, "scene": UNKNOWN, "seed": 0, "rollout": name, "log": str(log), "preset": preset.name,
@@ -101,7 +107,7 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, root: Path, taken: se
     known = scenes.of(rollout.scene_id)  # a wrong --scene is the command's fault, not the log's
     try:
         check_whole(log, rollout)
-        series = tuple(score(rollout, known.scene, preset))
+        series = tuple(score(rollout, known.scene, preset, evaluators))
         one = tabulated(rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset))
     except SimrunError as error:
         return _failed(manifest, error, root, taken)

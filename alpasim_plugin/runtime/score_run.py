@@ -14,9 +14,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.errors import EvaluatorError, InputError
+from alpasim_plugin.parts import PartSpec, digest
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes
-from alpasim_plugin.runtime.plan import digest, slug
+from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.run import SCHEMA_VERSION
 from alpasim_plugin.runtime.scene_dump import scene_as_json
@@ -34,7 +35,7 @@ from evaluators.alpasim import (
     results_summary,
     scene_score,
 )
-from evaluators.metrics import info
+from evaluators.metrics import declared, info
 from evaluators.presets import Preset
 from evaluators.report import write_junit, write_report, write_summary_md
 
@@ -55,6 +56,7 @@ def execute_score(
     scenes: KnownScenes,
     preset: Preset,
     settings: EvalSettings | None,
+    evaluators: Sequence[PartSpec],
     root: Path | None,
     command: Sequence[str],
     on_done: Callable[[dict[str, Any]], None],
@@ -66,6 +68,7 @@ def execute_score(
         scenes: Where their scenes are.
         preset: How to score.
         settings: AlpaSim's settings; None where the preset is not AlpaSim's.
+        evaluators: From `evaluators.resolve_evaluators`.
         root: Run folder; None makes one below ``runs/`` named after content and preset.
         command: The command line, for run.json.
         on_done: Called with each log's manifest.
@@ -79,7 +82,7 @@ def execute_score(
     held = read_json(root / "run.json").get("key") if (root / "run.json").exists() else None
     if held not in (None, key):
         raise InputError("scoring logs", f"folder {root}", f"it holds other results (key {held})", "choose another --out")
-    scores = score_logs(logs, scenes, preset, root, on_done)
+    scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
     aggregation: dict[str, Any] | None = None
     error: EvaluatorError | None = None
     if settings is not None:
@@ -177,6 +180,7 @@ def _write_info(
             "scenes": {
                 name: {"source": one.source, "content_hash": one.content_hash, "notes": list(one.notes)} for name, one in used.items()
             },
+            "metrics": declared(),
             "weights": {},
             "hardware": hardware(),
             "versions": versions(),

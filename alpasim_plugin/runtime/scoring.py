@@ -11,6 +11,7 @@ import numpy as np
 
 from alpasim_plugin.geometry import arc_lengths, inverse, offset_trajectory, project, yaw_from_quat
 from alpasim_plugin.log import read_asl, read_facts
+from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
@@ -30,14 +31,14 @@ class Scored:
     contacts: list[dict[str, Any]]  # where contact is searched between steps, each beginning: actor_id, t_s, side, x_m, y_m (rig frame)
 
 
-def score_log(log: Path, frames: Path, scenario: Scenario, preset: str) -> Scored:
+def score_log(log: Path, frames: Path, scenario: Scenario, preset: str, evaluators: Sequence[PartSpec] | None = None) -> Scored:
     """Read a log back and score it, so that what is tabulated is what any reader of the log would find.
 
     Raises:
         EvaluatorError: An evaluator could not give a value where one is due.
     """
     rollout = read_asl(log)
-    series = score(rollout, scenario.scene, preset)
+    series = score(rollout, scenario.scene, preset, evaluators)
     return tabulated(rollout, series, reduce_rollout(series, preset), read_facts(frames), contacts_of(rollout, preset))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.renderers import RENDERERS
+from alpasim_plugin.parts import names
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import Progress, execute_run
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures, worst
@@ -58,7 +58,7 @@ class SelfTest:
 
 def broken_renderers() -> list[str]:
     """Return the registered renderers with a deliberate fault."""
-    return [name for name in RENDERERS if name.startswith("broken-")]
+    return [name for name in names("renderer") if name.startswith("broken-")]
 
 
 def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequence[str], progress: Callable[[], Progress]) -> SelfTest:

@@ -6,16 +6,26 @@ request, a policy has answered every question. What it answered before its turn 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.offers import batch_of, chunk_of, facts_of, lookahead_of, spent_by
-from alpasim_plugin.types import EgoState, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
+from alpasim_plugin.types import (
+    Controller,
+    EgoState,
+    Frame,
+    Observation,
+    Plan,
+    Policy,
+    Renderer,
+    RenderRequest,
+    Route,
+    SensorSpec,
+    Trajectory,
+)
 
 
-class SwitchedRenderer:
+class SwitchedRenderer(Renderer):
     """Render with ``first`` before ``at_us`` and with ``then`` from it on.
 
     Raises:
@@ -24,16 +34,15 @@ class SwitchedRenderer:
 
     def __init__(self, first: Renderer, then: Renderer, at_us: int) -> None:
         self.first, self.then, self.at_us = first, then, at_us
-        self.chunk, other = chunk_of(first), chunk_of(then)
-        if self.chunk != other:
+        self.block = first.block
+        if first.block != then.block:
             raise InputError(
                 "changing over to another renderer",
-                f"blocks of {self.chunk or 'one frame'} and of {other or 'one frame'}",
+                f"{first.block or 'frames one by one'} and {then.block or 'frames one by one'}",
                 "the policy is asked at other times under each of them",
                 "choose the mode 'speculative' for both",
             )
-        self.lookahead = max(lookahead_of(first), lookahead_of(then))
-        self.spent_ms: Mapping[str, float] = {}
+        self.lookahead = max(first.lookahead, then.lookahead)
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
@@ -43,18 +52,18 @@ class SwitchedRenderer:
         """Render the frames of an instant or of a block; a block belongs to the part in whose time it ends."""
         early = max(request.t_us for request in requests) < self.at_us
         used = self.first if early else self.then
-        frames = batch_of(used)(requests)
-        self.spent_ms = dict(spent_by(used))
+        frames = used.render_batch(requests)
+        self.stage_ms = dict(used.stage_ms)
         if early and self.then is not self.first:
-            batch_of(self.then)(requests)
+            self.then.render_batch(requests)
         return frames
 
     def facts(self) -> dict[str, Any]:
         """Return what the fixer of the part that took over, or else of the first, has to say."""
-        return facts_of(self.then) or facts_of(self.first)
+        return dict(self.then.facts() or self.first.facts())
 
 
-class SwitchedPolicy:
+class SwitchedPolicy(Policy):
     """Answer with ``first`` before ``at_us`` and with ``then`` from it on.
 
     Args:
@@ -84,7 +93,7 @@ class SwitchedPolicy:
         return plan
 
 
-class SwitchedController:
+class SwitchedController(Controller):
     """Drive with ``first`` before ``at_us`` and with ``then`` from it on. Controllers are pure: there is no history to keep."""
 
     def __init__(self, first: Controller, then: Controller, at_us: int) -> None:

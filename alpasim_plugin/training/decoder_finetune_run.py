@@ -15,7 +15,8 @@ from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of, save_bundle
 from alpasim_plugin.fixers.networks import streaming_dit
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
-from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, read_metadata
+from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
+from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.training.decoder_finetune import PainterRecipe, PainterTask, Rollouts
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips

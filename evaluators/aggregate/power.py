@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from scipy import stats
+import scipy
 
 from evaluators.aggregate.intervals import TAIL
 
@@ -80,5 +80,5 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_fla
 
 
 def _decides(n: int, distance: float, spread: float, power: float) -> bool:
-    quantiles = float(stats.t.ppf(1 - TAIL, n - 1) + stats.t.ppf(power, n - 1))
+    quantiles = float(scipy.stats.t.ppf(1 - TAIL, n - 1) + scipy.stats.t.ppf(power, n - 1))
     return math.sqrt(n) * abs(distance) >= quantiles * spread

@@ -21,6 +21,7 @@ import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 
 from alpasim_plugin.errors import InputError
+from evaluators.metrics import declare_from
 
 KEY_COLUMNS = ("renderer", "policy", "scene", "seed")
 ROW_COLUMNS = (*KEY_COLUMNS, "status", "failure_class", "failure", "path", "wall_s", "frames", "steps")
@@ -259,6 +260,7 @@ def read_run(run_dir: Path | str) -> Run:
     """
     folder = Path(run_dir)
     info = read_json(folder / "run.json")
+    declare_from(info)
     summary = read_json(folder / "summary.json")
     rollouts, names = _read_rollouts(folder / "rollouts.parquet")
     return Run(folder, info, summary, rollouts, names)

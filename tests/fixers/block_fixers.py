@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.fixers.base import BlockRule
-from alpasim_plugin.types import U8, Frame
+from alpasim_plugin.types import U8, BlockRule, Frame
 
 
 class Blend:

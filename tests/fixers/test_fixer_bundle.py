@@ -15,7 +15,7 @@ from alpasim_plugin.fixers.bundle import read_bundle, save_bundle
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.checkpoints import read_metadata
+from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.init import initial_weights
 from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.errors import FixerError, InputError
-from alpasim_plugin.fixers import FIXERS, BlockRule, fixer_settings, make_fixer
+from alpasim_plugin.fixers import FIXERS, fixer_settings, make_fixer
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings, WeightsSettings, load_settings
 from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from alpasim_plugin.types import BlockRule
 from tests.fixers.fixer_cases import small_settings
 
 

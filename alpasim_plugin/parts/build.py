@@ -1,0 +1,107 @@
+"""From a resolved part to the part itself."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from types import MethodType
+from typing import Any, TypeVar
+
+from alpasim_plugin.errors import EvaluatorError, FixerError, InputError, PolicyError, RendererError, SimrunError
+from alpasim_plugin.parts.kinds import KINDS
+from alpasim_plugin.parts.loading import load
+from alpasim_plugin.parts.spec import PartSpec
+
+T = TypeVar("T")
+ERRORS: dict[str, type[SimrunError]] = {
+    "renderer": RendererError,
+    "fixer": FixerError,
+    "policy": PolicyError,
+    "evaluator": EvaluatorError,
+}  # whose failure it is; a controller or source that cannot be made is bad input
+
+
+def build(spec: PartSpec, **known: Any) -> Any:
+    """Make a part.
+
+    Args:
+        spec: The resolved part.
+        known: What the factory may ask for by naming a parameter so; `alpasim_plugin.parts.kinds` lists the names by kind.
+
+    Raises:
+        InputError: The import fails, the factory asks for something else, or what it makes lacks a required member.
+        SimrunError: The factory raised; the error class is that of the part's kind.
+    """
+    kind = KINDS[spec.kind]
+    known = {"settings": spec.settings, "address": spec.address} | known
+    factory = load(spec.target, spec.kind)
+    wanted = _arguments(factory, spec, {key: value for key, value in known.items() if key in kind.arguments})
+    try:
+        part = factory(**wanted)
+    except SimrunError:
+        raise
+    except Exception as error:  # a part of any origin: the cause is chained
+        raise ERRORS.get(spec.kind, InputError)(
+            f"making a {spec.kind}", f"{spec.kind} {spec.name!r}", f"{type(error).__name__}: {error}", "run with --debug for the traceback"
+        ) from error
+    return complete(part, kind.interface, f"{spec.kind} {spec.name!r}")
+
+
+def complete(part: T, interface: Any, what: str = "") -> T:
+    """Return a part with the defaults of the optional members that it does not define.
+
+    Args:
+        part: Any object with the interface's required members; it need not inherit from the interface.
+        interface: Of `alpasim_plugin.interfaces`.
+        what: The part for messages.
+
+    Raises:
+        InputError: A required member is missing.
+    """
+    required, optional = _members(interface)
+    missing = [name for name in required if not hasattr(part, name)]
+    if missing:
+        kind = interface.__name__.lower()
+        raise InputError(
+            f"making a {kind}",
+            what or type(part).__name__,
+            f"a {type(part).__name__} without {', '.join(missing)}",
+            f"give it {', '.join(f'`{name}`' for name in required)}; docs/extending.md shows a {kind}",
+        )
+    for name, default in optional.items():
+        if not hasattr(part, name):
+            setattr(part, name, MethodType(default, part) if inspect.isfunction(default) else default)
+    return part
+
+
+def _members(interface: Any) -> tuple[list[str], dict[str, Any]]:
+    """Return the names of the required members, and the optional ones with their defaults."""
+    own = vars(interface)
+    required = [name for name in interface.__annotations__ if name not in own]
+    required += [name for name, member in own.items() if getattr(member, "__isabstractmethod__", False)]
+    optional = {name: own[name] for name in interface.__annotations__ if name in own}
+    public = {name: member for name, member in own.items() if inspect.isfunction(member) and not name.startswith("_")}
+    return required, optional | {name: member for name, member in public.items() if name not in required}
+
+
+def _arguments(factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any]) -> dict[str, Any]:
+    """Choose what a factory asks for by the names of its parameters.
+
+    Raises:
+        InputError: It has a parameter without default that is none of them.
+    """
+    try:
+        parameters = inspect.signature(factory).parameters.values()
+    except ValueError:  # some built-in callables have no signature
+        return {}
+    named = [p for p in parameters if p.kind in (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)]
+    positional = [p.name for p in parameters if p.kind is inspect.Parameter.POSITIONAL_ONLY and p.default is inspect.Parameter.empty]
+    unknown = positional + [p.name for p in named if p.name not in known and p.default is inspect.Parameter.empty]
+    if unknown:
+        raise InputError(
+            f"making a {spec.kind}",
+            f"{spec.kind} {spec.name!r}",
+            f"its factory asks for {', '.join(unknown)}",
+            f"give the parameter a default; a {spec.kind} may ask for {', '.join(KINDS[spec.kind].arguments) or 'nothing'}",
+        )
+    return {p.name: known[p.name] for p in named if p.name in known}

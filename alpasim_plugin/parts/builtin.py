@@ -1,0 +1,63 @@
+"""The parts that come with the package: name -> (factory, one line of help). Nothing is imported before a part is used."""
+
+from __future__ import annotations
+
+_ONEFIXER = "alpasim_plugin.fixers.factory:onefixer"
+_BROKEN = "alpasim_plugin.renderers.broken:"
+
+BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
+    "renderer": {
+        "clean": ("alpasim_plugin.renderers.gaussian:CleanRenderer", "the Gaussian scene as built"),
+        "3dgs": (
+            "alpasim_plugin.renderers.reconstruction:reconstruction_renderer",
+            "a reconstruction of the logged drive: error grows with the distance from its path",
+        ),
+        "broken-black": (f"{_BROKEN}black_renderer", "deliberate fault: black frames"),
+        "broken-mirrored": (f"{_BROKEN}mirrored_renderer", "deliberate fault: left and right swapped"),
+        "broken-blurred": (f"{_BROKEN}blurred_renderer", "deliberate fault: strong blur"),
+        "broken-shifted": (f"{_BROKEN}shifted_renderer", "deliberate fault: seen from 0.5 m to the right"),
+        "broken-frozen": (f"{_BROKEN}frozen_renderer", "deliberate fault: the first frame for ever"),
+        "broken-late": (f"{_BROKEN}late_renderer", "deliberate fault: images 1 s old"),
+    },
+    "fixer": {
+        "onefixer": (_ONEFIXER, "one-step causal fixer, the size for a CPU (onefixer-tiny)"),
+        "onefixer-tiny": (_ONEFIXER, "one-step causal fixer for a CPU, 256x144"),
+        "onefixer-s": (_ONEFIXER, "one-step causal fixer for a small GPU"),
+        "onefixer-2b": (_ONEFIXER, "one-step causal fixer of the size of OmniDreams single view; needs its weights"),
+        "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
+    },
+    "policy": {
+        "log-replay": ("policies.log_replay:LogReplay", "the recorded ego poses, exactly; takes no camera"),
+        "constant-velocity": ("policies.constant_velocity:ConstantVelocity", "straight on at the present speed; takes no camera"),
+        "pure-pursuit": ("policies.pure_pursuit:PurePursuit", "along the route at the initial speed, slower in curves; takes no camera"),
+        "lane-camera": (
+            "policies.lane_camera:LaneCamera",
+            "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior",
+        ),
+        "learned": (
+            "policies.learned:Learned",
+            "a network trained on clean frames: one front camera, its speed, a command such as left-ahead",
+        ),
+        "learned-mean": ("policies.learned:LearnedMean", "the same network, driven by its mean prediction: every seed drives alike"),
+    },
+    "controller": {
+        "bicycle": (
+            "alpasim_plugin.control.tracker:PlanTracker",
+            "kinematic bicycle that follows the plan with preview, within the vehicle's limits",
+        ),
+        "perfect": ("alpasim_plugin.control.perfect:PerfectController", "the ego is exactly where its plan says"),
+    },
+    "evaluator": {
+        "collision": ("evaluators.collision:FACTORY", "contact with other actors by class, and the distance to them"),
+        "offroad": ("evaluators.offroad:FACTORY", "off-road, wrong lane and the distance to the lanes' border"),
+        "route": ("evaluators.route:FACTORY", "distance from the recorded drive, progress and distance driven"),
+        "plan": ("evaluators.plan:FACTORY", "plan deviation, open-loop collision and minADE of the plans"),
+        "image_health": ("evaluators.image_health:FACTORY", "black and frozen camera images"),
+    },
+    "source": {
+        "argoverse": ("scenarios.sources:Argoverse", "Argoverse 2 log folder"),
+        "commonroad": ("scenarios.sources:CommonRoad", "CommonRoad XML"),
+        "cosmos": ("scenarios.sources:Cosmos", "Cosmos-Drive-Dreams clip folder"),
+        "usdz": ("scenarios.sources:Usdz", "AlpaSim scene"),
+    },
+}

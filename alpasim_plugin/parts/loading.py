@@ -1,0 +1,86 @@
+"""Import what a target names: ``package.module:attribute``, or ``path/to/file.py:attribute``."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from alpasim_plugin import OWN_PACKAGES
+from alpasim_plugin.errors import InputError
+
+
+def is_target(name: str) -> bool:
+    """Tell whether a name is a target and not a registered name or an address (``scheme://``)."""
+    return ":" in name and "://" not in name
+
+
+def absolute_target(target: str) -> str:
+    """Return a target that means the same in every process: a file's path is made absolute, a dotted name stays.
+
+    A folder beside the user's work may bear the name of one of our packages (``policies/mine.py``). Ours is the importable one, so a
+    module that ours does not have, or that differs from ours, is taken from the file.
+    """
+    module, _, attribute = target.rpartition(":")
+    if module.endswith(".py"):
+        return f"{Path(module).absolute()}:{attribute}"
+    if module.split(".")[0] in OWN_PACKAGES:
+        file = Path(os.getcwd(), *module.split(".")).with_suffix(".py")
+        if file.is_file() and file.resolve() != _own_file(module):
+            return f"{file}:{attribute}"
+    return target
+
+
+def load(target: str, kind: str) -> Any:
+    """Import a target's module and return its attribute.
+
+    Raises:
+        InputError: The import fails, or the module has no such attribute.
+    """
+    name, _, attribute = target.rpartition(":")
+    try:
+        module = _from_file(Path(name)) if name.endswith(".py") else importlib.import_module(name)
+        return getattr(module, attribute)
+    except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
+        raise InputError(
+            f"importing a {kind}",
+            f"{kind} {target!r}",
+            f"{type(error).__name__}: {error}",
+            "write package.module:Class with the package on Python's path, or file.py:Class",
+        ) from error
+
+
+def file_of(target: str) -> Path | None:
+    """Return the source file of a loaded target's module; None where it has none."""
+    name, _, _ = target.rpartition(":")
+    file = name if name.endswith(".py") else getattr(sys.modules[name], "__file__", None)
+    return None if file is None else Path(file)
+
+
+def _from_file(file: Path) -> ModuleType:
+    """Import a file under a name of its own; files beside it can be imported too, after everything that is installed."""
+    name = f"simrun_file_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None or not file.is_file():
+        raise FileNotFoundError(f"no such file: {file}")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # before it runs, as the import system does: dataclasses and pickles look it up
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _own_file(module: str) -> Path:
+    return Path(__file__).resolve().parents[2].joinpath(*module.split(".")).with_suffix(".py")

@@ -1,0 +1,122 @@
+"""The digest of a part's code: its module, and every module that it reaches by imports among the sources that may change under it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+from alpasim_plugin import OWN_PACKAGES
+
+OWN_ROOT = str(Path(__file__).resolve().parents[2])
+INSTALLED = {"site-packages", "dist-packages"}  # folders that hold packages of many distributions
+
+# Import statements wherever they stand: at the top, inside functions, under conditions. A line of a docstring that looks like one only
+# adds a file. Imports for type checkers alone do not run.
+_FROM = re.compile(rb"^[ \t]*from[ \t]+(\.*[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]+)", re.MULTILINE)
+_IMPORT = re.compile(rb"^[ \t]*import[ \t]+([^\n#]+)", re.MULTILINE)
+_TYPES_ONLY = re.compile(rb"^if (?:typing\.)?TYPE_CHECKING:\n(?:[ \t]+[^\n]*\n|\n)+", re.MULTILINE)
+_COMMENT = re.compile(rb"#[^\n]*")
+
+
+def code_digest(file: str | Path) -> str:
+    """Return a SHA-256 over a module and all modules that it reaches by imports.
+
+    Followed are imports of modules in the part's own top-level package, in simrun's packages, and, for code that is not installed, of files
+    beside it. Installed third-party libraries and the standard library are not: ``run.json`` lists the versions of those that matter.
+
+    Args:
+        file: Source file of the part's module.
+    """
+    digests = sorted(_read(path)[0] for path in reached(file))
+    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
+
+
+def own_code_digest(module: str) -> str:
+    """Return the `code_digest` of one of simrun's own modules, by its dotted name. Nothing is imported."""
+    file = _own_file(tuple(module.split(".")))
+    assert file is not None, module
+    return code_digest(file)
+
+
+def reached(file: str | Path) -> set[str]:
+    """Return the paths of a module and of all that `code_digest` follows from it."""
+    start = os.path.realpath(file)
+    root = top_folder(start)
+    seen: set[str] = set()
+    todo = [start]
+    while todo:
+        path = todo.pop()
+        if path not in seen:
+            seen.add(path)
+            todo += _imported(path, root)
+    return seen
+
+
+def top_folder(file: str) -> str:
+    """Return the folder from which a file's module is imported: that of its outermost package."""
+    folder = os.path.dirname(file)
+    while os.path.isfile(os.path.join(folder, "__init__.py")):
+        folder = os.path.dirname(folder)
+    return folder
+
+
+def _read(path: str) -> tuple[str, tuple[str, ...]]:
+    """Return a file's SHA-256 and the dotted names that it imports."""
+    stat = os.stat(path)
+    return _parsed(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _parsed(path: str, mtime_ns: int, size: int) -> tuple[str, tuple[str, ...]]:
+    with open(path, "rb") as file:
+        text = file.read()
+    return hashlib.sha256(text).hexdigest(), tuple(dict.fromkeys(_names(_TYPES_ONLY.sub(b"", text))))
+
+
+def _names(text: bytes) -> Iterator[str]:
+    """Give every dotted name that a module may import; ``from a import b`` gives ``a`` and ``a.b``."""
+    for match in _FROM.finditer(text):
+        module = match[1].decode()
+        yield module
+        for item in _COMMENT.sub(b"", match[2]).decode(errors="replace").strip("()").split(","):
+            name = item.split(" as ")[0].strip()
+            if name.isidentifier():
+                yield f"{module}{'' if module.endswith('.') else '.'}{name}"
+    for match in _IMPORT.finditer(text):
+        for item in match[1].decode(errors="replace").split(","):
+            yield item.split(" as ")[0].strip()
+
+
+def _imported(path: str, root: str) -> Iterator[str]:
+    base = next((base for base in (root, OWN_ROOT) if path.startswith(base + os.sep)), root)
+    here = os.path.relpath(os.path.dirname(path), base).split(os.sep)
+    top = here[0] if here != ["."] else os.path.basename(path).removesuffix(".py")
+    is_shared = not INSTALLED.isdisjoint(root.split(os.sep))
+    for dotted in _read(path)[1]:
+        dots = len(dotted) - len(dotted.lstrip("."))
+        rest = [part for part in dotted[dots:].split(".") if part]
+        parts = [*(part for part in here[: len(here) - dots + 1] if part != "."), *rest] if dots else rest
+        own = bool(parts) and parts[0] in OWN_PACKAGES
+        if not parts or not (own or parts[0] == top or not is_shared):
+            continue
+        for depth in range(1, len(parts) + 1):
+            found = _own_file(tuple(parts[:depth])) if own else _module_file(root, parts[:depth])
+            if found is not None:
+                yield found
+
+
+@lru_cache(maxsize=8192)
+def _own_file(parts: tuple[str, ...]) -> str | None:
+    return _module_file(OWN_ROOT, parts)  # our own files do not come and go while a process runs
+
+
+def _module_file(root: str, parts: Sequence[str]) -> str | None:
+    path = os.path.join(root, *parts)
+    package = os.path.join(path, "__init__.py")
+    if os.path.isfile(package):
+        return package
+    return path + ".py" if os.path.isfile(path + ".py") else None
