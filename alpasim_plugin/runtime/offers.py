@@ -3,7 +3,7 @@
 - ``lookahead: int``: requests carry a forecast of so many of the camera's next frames in ``ahead``. Others pay nothing for it.
 - ``chunk: tuple[int, int] | None``: frames come in blocks of so many, first and later ones; the policy is asked at each block's end.
 - ``render_batch(requests) -> frames``: all requests of an instant (of all cameras; of a whole block with ``chunk``) in one call.
-- ``spent_ms: Mapping[str, float]``: parts of the last call's time that are stages of their own, such as ``{"fix": 12.0}``.
+- ``stage_ms: Mapping[str, float]``: parts of the last call's time that are stages of their own, such as ``{"fix": 12.0}``.
 - ``facts() -> dict``: what a fixer's session is and did, for the rollout's manifest: ``label``, ``trained``, ``mode``, counts.
 """
 
@@ -34,7 +34,7 @@ def batch_of(renderer: Renderer) -> Callable[[Sequence[RenderRequest]], Sequence
 
 def spent_by(renderer: Renderer) -> Mapping[str, float]:
     """Return the stages within the renderer's last call, milliseconds."""
-    spent: Mapping[str, float] = getattr(renderer, "spent_ms", {})
+    spent: Mapping[str, float] = getattr(renderer, "stage_ms", {})
     return spent
 
 

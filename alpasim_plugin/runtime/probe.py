@@ -82,7 +82,7 @@ class _Eyes:
             raise InputError(DOING, f"--renderers {','.join(renderers)}", found, "choose the mode 'speculative' for both")
         self.lookahead = max(lookahead_of(renderer) for renderer in renderers.values())
         self.latest: dict[str, dict[str, Frame]] = {name: {} for name in renderers}
-        self.spent_ms: Mapping[str, float] = {}
+        self.stage_ms: Mapping[str, float] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         return self.render_batch([request])[0]
@@ -92,7 +92,7 @@ class _Eyes:
             frames = checked_frames(renderer, requests)
             self.latest[name] |= {frame.camera: frame for frame in frames}
             if name == self.driver:
-                driven, self.spent_ms = frames, dict(spent_by(renderer))
+                driven, self.stage_ms = frames, dict(spent_by(renderer))
         return driven
 
 

@@ -33,7 +33,7 @@ class SwitchedRenderer:
                 "choose the mode 'speculative' for both",
             )
         self.lookahead = max(lookahead_of(first), lookahead_of(then))
-        self.spent_ms: Mapping[str, float] = {}
+        self.stage_ms: Mapping[str, float] = {}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
@@ -44,7 +44,7 @@ class SwitchedRenderer:
         early = max(request.t_us for request in requests) < self.at_us
         used = self.first if early else self.then
         frames = batch_of(used)(requests)
-        self.spent_ms = dict(spent_by(used))
+        self.stage_ms = dict(spent_by(used))
         if early and self.then is not self.first:
             batch_of(self.then)(requests)
         return frames
