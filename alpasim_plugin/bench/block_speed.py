@@ -14,7 +14,7 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.nets.attention_kernels import Kernel, attention_kernel
 from alpasim_plugin.nets.graphs import GraphedFunction
-from alpasim_plugin.nets.precision import stream_dtype
+from alpasim_plugin.nets.precision import DTYPES
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def measure_blocks(
         InputError: An attention kernel that is not there.
     """
     check_device(settings, work, device)
-    with attention_kernel(attention, device, stream_dtype(settings.precision, device), settings.dit.head_width):
+    with attention_kernel(attention, device, DTYPES[settings.precision], settings.dit.head_width):
         return _measured(settings, work, height, width, device, blocks, text_tokens)
 
 

@@ -70,8 +70,6 @@ def cases(latents: int) -> tuple[Case, ...]:
         Case("precision", "bfloat16 transformer", ("precision=bf16",)),
         Case("precision", "bfloat16", tuple(f"{key}=bf16" for key in both)),
         Case("precision", "float16", tuple(f"{key}=fp16" for key in both)),
-        Case("precision", "int8 transformer", ("precision=int8",)),
-        Case("precision", "int8, codec bfloat16", ("precision=int8", "codec_precision=bf16")),
         Case("precision", "float32, identity", (), "identity"),
         Case("precision", "bfloat16, identity", tuple(f"{key}=bf16" for key in both), "identity"),
         Case("window", "4 latents", ("window=4",)),

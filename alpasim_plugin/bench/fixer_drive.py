@@ -137,8 +137,8 @@ class _Watched(Renderer):
         self.ms: list[float] = []
 
     @property
-    def spent_ms(self) -> Mapping[str, float]:
-        return self._renderer.spent_ms
+    def stage_ms(self) -> Mapping[str, float]:
+        return self._renderer.stage_ms
 
     def render(self, request: RenderRequest) -> Frame:
         return self.render_batch([request])[0]
@@ -146,6 +146,6 @@ class _Watched(Renderer):
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         frames = self._renderer.render_batch(requests)
         self.frames += frames
-        spent = sum(ms for stage, ms in self._renderer.spent_ms.items() if stage != "map")
+        spent = sum(ms for stage, ms in self._renderer.stage_ms.items() if stage != "map")
         self.ms += [spent / len(frames)] * len(frames)
         return frames

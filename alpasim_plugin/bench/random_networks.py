@@ -36,11 +36,11 @@ def random_networks(settings: OneFixerSettings, device: torch.device | str, text
     sizes = DiTSizes(**settings.dit.model_dump())
     shapes = {key: torch.empty(shape, device="meta") for key, shape in sizes.shapes().items()}
     plain = CosmosCausalDiT.from_state_dict(shapes, settings.rope_ratios).requires_grad_(False)
-    text = text_at_precision(plain.encode_text(torch.empty(1, text_tokens, sizes.text_width, device="meta")), precision, device)
+    text = text_at_precision(plain.encode_text(torch.empty(1, text_tokens, sizes.text_width, device="meta")), precision)
     fold = settings.fold and len(settings.steps) == 1
-    dit = at_precision(plain.folded(from_names(settings.steps)[0].t) if fold else plain, precision, device)
+    dit = at_precision(plain.folded(from_names(settings.steps)[0].t) if fold else plain, precision)
     apart = fold and settings.history == "finalise"
-    finalise = at_precision(plain.folded(CONTEXT_STEP), precision, device) if apart else dit
+    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if apart else dit
     if device.type != "meta":
         generator = torch.Generator(device).manual_seed(seed)
         for net in {id(net): net for net in (dit, finalise)}.values():

@@ -35,18 +35,18 @@ class Workshop:
         scene_map: The scene's map, or None where the fixer uses none.
         actors: The scenario's, for the sizes of their boxes.
         threads: Threads of the map rasteriser.
-        spent_ms: Time since `start_clock` by stage; the base renderer's is left out.
+        stage_ms: Time since `start_clock` by stage; the base renderer's is left out.
     """
 
     render: Callable[[RenderRequest], Frame]
     scene_map: PreparedMap | None
     actors: Sequence[Actor]
     threads: int | None = None
-    spent_ms: dict[str, float] = field(default_factory=dict)
+    stage_ms: dict[str, float] = field(default_factory=dict)
 
     def start_clock(self) -> None:
         """Begin a call: every stage met so far stands at zero."""
-        self.spent_ms = dict.fromkeys(self.spent_ms, 0.0)
+        self.stage_ms = dict.fromkeys(self.stage_ms, 0.0)
 
     def shoot(self, request: RenderRequest) -> Shot:
         """Render one frame and draw its map."""
@@ -62,7 +62,7 @@ class Workshop:
         """Have a block fixed and check what comes back.
 
         Args:
-            fixer: Whose call it is; for messages, and for the stages it timed itself (``spent_ms``).
+            fixer: Whose call it is; for messages, and for the stages it timed itself (``stage_ms``).
             call: Its ``preview`` or ``step``.
             shots: The block.
 
@@ -71,7 +71,7 @@ class Workshop:
         """
         frames, maps = [shot.frame for shot in shots], [shot.map for shot in shots if shot.map is not None]
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
-        before = dict(getattr(fixer, "spent_ms", {}))
+        before = dict(getattr(fixer, "stage_ms", {}))
         with self._timed("fix"):
             try:
                 fixed = list(call(frames, maps))
@@ -79,7 +79,7 @@ class Workshop:
                 raise
             except Exception as error:
                 raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
-        self._own_stages(before, getattr(fixer, "spent_ms", {}))
+        self._own_stages(before, getattr(fixer, "stage_ms", {}))
         problem = _problem(frames, fixed)
         if problem:
             raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")
@@ -89,15 +89,15 @@ class Workshop:
     def _timed(self, stage: str) -> Iterator[None]:
         began = time.perf_counter()
         yield
-        self.spent_ms[stage] = self.spent_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
+        self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
 
     def _own_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
         """File what a fixer timed itself (sums that only grow) as ``fix: STAGE``, and the rest of its call as ``fix``."""
         for stage, total_ms in after.items():
             part_ms = total_ms - before.get(stage, 0.0)
             name = f"fix: {stage}"
-            self.spent_ms[name] = self.spent_ms.get(name, 0.0) + part_ms
-            self.spent_ms["fix"] -= part_ms
+            self.stage_ms[name] = self.stage_ms.get(name, 0.0) + part_ms
+            self.stage_ms["fix"] -= part_ms
 
 
 def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:

@@ -134,7 +134,7 @@ class OneFixerSettings(FixerSettings):
     holes: Literal["noise", "render"] = Field(
         default="noise", description="What a block starts from where the render is transparent: noise (Eq. 1), or the render all the same."
     )
-    precision: Literal["fp32", "bf16", "fp16", "int8"] = Field(default="fp32", description="Of the transformer; int8 is its linears.")
+    precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
     codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
     graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
     fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")

@@ -64,9 +64,9 @@ class SpeculativeRenderer(Renderer):
         self.tally = Tally()
 
     @property
-    def spent_ms(self) -> Mapping[str, float]:
+    def stage_ms(self) -> Mapping[str, float]:
         """Give the times of the last call by stage, the base renderer's left out."""
-        return self.workshop.spent_ms
+        return self.workshop.stage_ms
 
     def facts(self) -> dict[str, Any]:
         """Return what the fixer is and what happened so far."""

@@ -48,7 +48,7 @@ def test_every_setting_of_the_groups_is_measured_at_every_stage(rows: dict[str, 
 @pytest.mark.slow
 def test_streaming_in_float32_is_the_whole_clip_up_to_rounding(rows: dict[str, Row]) -> None:
     for name, row in rows.items():
-        if "float16" not in name and "int8" not in name:
+        if "float16" not in name:
             assert mean_error(row.rounding) < 1e-3, name
             assert row.rounding is not None
             assert row.rounding[1] <= 1, name  # a value that lies between two grey levels
@@ -56,9 +56,8 @@ def test_streaming_in_float32_is_the_whole_clip_up_to_rounding(rows: dict[str, R
 
 @pytest.mark.slow
 def test_less_precision_is_more_error_and_still_small(rows: dict[str, Row]) -> None:
-    error = {name: mean_error(rows[f"precision: {name}"].rounding) for name in ("float32", "float16", "bfloat16", "int8 transformer")}
+    error = {name: mean_error(rows[f"precision: {name}"].rounding) for name in ("float32", "float16", "bfloat16")}
     assert error["float32"] < error["float16"] < error["bfloat16"] < 2
-    assert 0.005 < error["int8 transformer"] < 2
 
 
 @pytest.mark.slow

@@ -70,6 +70,7 @@ def test_step_count_after_the_name() -> None:
         ("decoder.kind=taehv", ("vae.kind wan",)),
         ("weights.sha256.ditt=00", ("unknown key 'ditt'", "did you mean 'dit'")),
         ("precision=fp8", ("precision is 'fp8'",)),
+        ("precision=int8", ("precision is 'int8'", "fp32")),
         ("tolerance_m=-1", ("tolerance_m = -1",)),
     ],
 )

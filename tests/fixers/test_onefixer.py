@@ -54,13 +54,13 @@ def test_a_session_keeps_both_contracts(busy) -> None:
 
 def test_stages_add_up_to_less_than_the_calls_and_a_committed_draft_costs_only_its_write(busy) -> None:
     session = fixer(busy)
-    assert session.spent_ms == {"encode": 0.0, "dit": 0.0, "decode": 0.0, "cache write": 0.0}
+    assert session.stage_ms == {"encode": 0.0, "dit": 0.0, "decode": 0.0, "cache write": 0.0}
     began = time.perf_counter()
     session.preview(FRAMES[:5], MAPS[:5])
-    drafted = session.spent_ms
+    drafted = session.stage_ms
     assert all(drafted[stage] > 0 for stage in ("encode", "dit", "decode"))
     session.step(FRAMES[:5], MAPS[:5])
-    kept = session.spent_ms
+    kept = session.stage_ms
     assert sum(kept.values()) <= 1e3 * (time.perf_counter() - began)
     assert kept["cache write"] > drafted["cache write"] == 0
     assert kept == drafted | {"cache write": kept["cache write"]}

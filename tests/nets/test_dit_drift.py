@@ -12,7 +12,7 @@ from tests.nets.dit_reference import random_weights, velocity
 
 TINY = DiTSizes(32, 2, 16, 48, 4, 6, 8, 4, 3)
 SHIPPED = DiTSizes(192, 6, 48, 384, 16, 64, 64)
-LIMITS = {"bf16": 0.03, "fp16": 0.004, "int8": 0.06}
+LIMITS = {"bf16": 0.03, "fp16": 0.004}
 
 
 def errors(sizes: DiTSizes, precision: Precision, blocks: int, height: int, width: int, start: int = 0) -> torch.Tensor:
@@ -48,13 +48,13 @@ def check_no_growth(error: torch.Tensor, precision: Precision) -> None:
     assert float(late / early) < 1.15, (float(early), float(late))
 
 
-@pytest.mark.parametrize("precision", ["bf16", *(pytest.param(p, marks=pytest.mark.slow) for p in ("fp16", "int8"))])
+@pytest.mark.parametrize("precision", ["bf16", pytest.param("fp16", marks=pytest.mark.slow)])
 def test_error_does_not_grow_over_900_latents(precision):
     check_no_growth(errors(TINY, precision, 450, 2, 4), precision)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("precision", ["bf16", "fp16", "int8"])
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_error_does_not_grow_over_900_latents_at_the_shipped_size(precision):
     error = errors(SHIPPED, precision, 450, 8, 12)
     print(precision, [f"{part.mean():.2e}" for part in error.split(45)])
