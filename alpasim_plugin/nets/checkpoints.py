@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
@@ -79,14 +78,6 @@ def read_metadata(path: str | Path) -> dict[str, str]:
             return dict(file.metadata() or {})
     except (SafetensorError, ValueError) as error:
         raise InputError(doing, str(path), f"not safetensors: {error}", do) from error
-
-
-def save_weights(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write a safetensors file, whole or not at all."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    save_file({key: value.detach().contiguous() for key, value in tensors.items()}, part, dict(metadata or {}))
-    os.replace(part, path)
 
 
 def file_sha256(path: str | Path) -> str:
