@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64
 from policies.learned_command import COMMANDS
@@ -104,7 +105,7 @@ def lay_out(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 def save_net(net: LearnedNet, path: Path, metadata: dict[str, str]) -> None:
     """Write the weights in float16."""
-    save_file({name: value.detach().half().contiguous() for name, value in net.state_dict().items()}, str(path), metadata)
+    write_safetensors(path, {name: value.half() for name, value in net.state_dict().items()}, metadata)
 
 
 def load_net(path: Path) -> LearnedNet:

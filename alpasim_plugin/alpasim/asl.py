@@ -18,6 +18,7 @@ from typing import BinaryIO
 from google.protobuf.message import DecodeError
 
 from alpasim_plugin.alpasim.wire import logging_pb2
+from alpasim_plugin.atomic import disk_error
 from alpasim_plugin.errors import InfrastructureError, InputError
 
 _LENGTH = struct.Struct(">I")
@@ -181,9 +182,7 @@ class AslFile:
             self.abandon()
 
     def _failure(self, error: OSError) -> InfrastructureError:
-        return InfrastructureError(
-            "writing a rollout log", str(self.path), f"{error.strerror}", "check that the folder exists and has room"
-        )
+        return disk_error(self.path, error, "writing a rollout log")
 
 
 def _may_begin_entry(head: bytes, announced: int) -> bool:

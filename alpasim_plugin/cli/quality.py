@@ -16,6 +16,7 @@ import torch
 import typer
 from rich.console import Console
 
+from alpasim_plugin.atomic import write_bytes, write_json
 from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, roll, row_key
 from alpasim_plugin.cli.jobs import spread
 from alpasim_plugin.cli.refine import fixer_overrides
@@ -27,7 +28,7 @@ from alpasim_plugin.nets.perceptual import NAME, shipped_weights
 from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistance, available, load_distance, weights_folder
 from alpasim_plugin.parts import build, resolve
 from alpasim_plugin.runtime.provenance import hardware, versions
-from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
+from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
 from evaluators.video.charts import plot_by_frame, plot_speed
 from evaluators.video.sheet import sheet

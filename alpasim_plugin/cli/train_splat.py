@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
@@ -77,7 +77,7 @@ def splat(
     }  # fmt: skip
     metrics = _measure(model, groups, out, threads)
     model.save(out, facts)
-    (out / "metrics.json").write_text(json.dumps({**facts, "gaussians": len(model), **metrics}, indent=1) + "\n", encoding="utf-8")
+    write_json(out / "metrics.json", {**facts, "gaussians": len(model), **metrics})
     if as_json:
         print((out / "metrics.json").read_text(encoding="utf-8"), end="")
     _tell(model, metrics, fitted_s, out)

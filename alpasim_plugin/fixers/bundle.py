@@ -14,9 +14,10 @@ from pathlib import Path
 
 from torch import Tensor
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets.checkpoints import StateDict, load_weights, save_weights
+from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 
@@ -57,7 +58,7 @@ def save_bundle(
         raise InputError("saving a fixer's weights", str(path), found, f"give dit and vae, and nothing but {', '.join(PARTS)}")
     tensors = {f"{part}.{key}": value for part, sd in parts.items() for key, value in sd.items()}
     plain = settings.model_dump(mode="json", exclude={"weights"})
-    save_weights(path, tensors, {"format": FORMAT, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)})
+    write_safetensors(path, tensors, {"format": FORMAT, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)})
 
 
 def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.atomic import atomic_file
+from alpasim_plugin.errors import InputError
 
 Fact = str | int | float | bool | None
 
@@ -22,18 +22,10 @@ def write_facts(path: Path | str, rows: Iterable[Mapping[str, Fact]]) -> None:
         InfrastructureError: The disk refuses.
     """
     path = Path(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        with partial.open("w", encoding="utf-8") as stream:
+        with atomic_file(path, "writing facts of a rollout") as partial, partial.open("w", encoding="utf-8") as stream:
             stream.writelines(json.dumps(dict(row), allow_nan=False) + "\n" for row in rows)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InfrastructureError(
-            "writing facts of a rollout", str(path), f"{error.strerror}", "check that the folder exists and has room"
-        ) from error
     except (TypeError, ValueError) as error:
-        partial.unlink(missing_ok=True)
         raise InputError("writing facts of a rollout", str(path), str(error), "give finite numbers, text or booleans") from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +10,7 @@ from typing import Self
 import av
 import numpy as np
 
+from alpasim_plugin.atomic import temporary_path
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log.video_reader import EXACT, UNSPECIFIED
 from alpasim_plugin.types import U8
@@ -56,7 +56,7 @@ class VideoWriter:
         self._time_base, self._colour, self._pixel_aspect = time_base, colour, pixel_aspect
         self._matrix = WRITABLE.get(colour[0], BT709)
         self._size: tuple[int, ...] | None = None
-        self._partial = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
+        self._partial = temporary_path(self.path)
         try:
             self._container = av.open(str(self._partial), mode="w", format="mp4")
         except (OSError, av.FFmpegError) as error:

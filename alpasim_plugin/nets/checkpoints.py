@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
@@ -63,14 +62,6 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     if dtype is None:
         return tensors
     return {key: convert(key, value, dtype, str(path)) for key, value in tensors.items()}
-
-
-def save_weights(path: str | Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write a safetensors file, whole or not at all."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    save_file({key: value.detach().contiguous() for key, value in tensors.items()}, part, dict(metadata or {}))
-    os.replace(part, path)
 
 
 def file_sha256(path: str | Path) -> str:

@@ -14,8 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.checkpoints import load_weights, save_weights, weight
+from alpasim_plugin.nets.checkpoints import load_weights, weight
 from alpasim_plugin.nets.headers import read_metadata
 
 NAME = "perceptual-syn"
@@ -94,7 +95,7 @@ class PerceptualDistance(nn.Module):
     def save(self, path: str | Path, metadata: dict[str, str] | None = None, dtype: torch.dtype = torch.float16) -> None:
         """Write the weights as safetensors."""
         tensors = {key: value.to(dtype) for key, value in self.state_dict().items()}
-        save_weights(path, tensors, {**(metadata or {}), "format": FORMAT, "name": NAME})
+        write_safetensors(path, tensors, {**(metadata or {}), "format": FORMAT, "name": NAME})
 
 
 def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:

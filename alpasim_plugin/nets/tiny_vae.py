@@ -28,8 +28,9 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.checkpoints import load_weights, save_weights, unwrap
+from alpasim_plugin.nets.checkpoints import load_weights, unwrap
 from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import from_layers, halves_to_frames, split_last, to_layers
@@ -103,7 +104,7 @@ class TinyVAE(nn.Module):
 
     def save(self, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
         """Write a safetensors file, whole or not at all."""
-        save_weights(path, self.state_dict(), metadata)
+        write_safetensors(path, self.state_dict(), metadata)
 
     @property
     def dtype(self) -> torch.dtype:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,9 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.atomic import atomic_folder, disk_error
+from alpasim_plugin.errors import InputError
 
 T = TypeVar("T")
+DOING, DO_THIS = "writing to the cache", "free disk space, or name a writable folder in SIMRUN_CACHE"
 
 
 def cache_root() -> Path:
@@ -67,19 +68,10 @@ def _readable(folder: Path, read: Callable[[Path], T], what: str, warn: bool = T
 
 
 def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     print(f"{what} ...", file=sys.stderr, flush=True)
     began = time.perf_counter()
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with atomic_folder(folder, DOING, DO_THIS) as partial:
         make(partial)
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.replace(folder)
-    except OSError as error:
-        raise _refused(folder, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
 
 
@@ -90,13 +82,7 @@ def _locked(path: Path) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a")
     except OSError as error:
-        raise _refused(path, error) from error
+        raise disk_error(path, error, DOING, DO_THIS) from error
     with file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _refused(path: Path, error: OSError) -> InfrastructureError:
-    return InfrastructureError(
-        "writing to the cache", str(path), error.strerror or str(error), "make room, or name a writable folder in SIMRUN_CACHE"
-    )

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
@@ -28,7 +29,7 @@ def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView
     """Write a reconstruction and its sky views into an existing, empty folder.
 
     Raises:
-        InputError, OSError: The disk refuses.
+        InfrastructureError, OSError: The disk refuses.
     """
     model.save(folder, facts)
     bits = [np.packbits(view.sky > 0.5) for view in sky_views]
@@ -41,7 +42,7 @@ def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView
     )
     files = sorted(p for p in folder.rglob("*") if p.is_file())
     hashes = {p.relative_to(folder).as_posix(): _hash(p) for p in files}
-    (folder / HASHES).write_text(json.dumps(hashes, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / HASHES, hashes)
 
 
 def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 
+from alpasim_plugin.atomic import disk_error, write_json
 from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.parts import build, complete
@@ -20,7 +21,7 @@ from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
-from alpasim_plugin.runtime.store import STEPS_SCHEMA, disk_error, read_json, write_json, write_table
+from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, write_table
 from alpasim_plugin.types import Policy, Renderer, Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef

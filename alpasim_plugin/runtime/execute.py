@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.runtime.cell import MANIFEST, finished, rescore_cell, run_cell
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runtime.store import write_json
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Difference, Trace, first_difference, trace_log
@@ -27,7 +28,7 @@ from alpasim_plugin.runtime.past import PastRollout
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.run import RunResult, write_run_info
-from alpasim_plugin.runtime.store import read_json, write_json
+from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.switch import SwitchedController, SwitchedPolicy, SwitchedRenderer
 from alpasim_plugin.runtime.tables import write_tables
 from alpasim_plugin.types import Scenario

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.atomic import write_bytes
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.log import encode_image, write_mp4
-from alpasim_plugin.runtime.store import write_bytes
 from alpasim_plugin.types import U8, Frame
 
 STRIP_NAME, VIDEO_NAME = "strip.jpg", "front.mp4"

@@ -9,11 +9,12 @@ import pyarrow as pa
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from alpasim_plugin.atomic import write_bytes, write_json
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.runtime.past import PastRollout
 from alpasim_plugin.runtime.probe import HORIZONS_S, Probe, summarise
 from alpasim_plugin.runtime.probe_files import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
-from alpasim_plugin.runtime.store import write_bytes, write_json, write_table
+from alpasim_plugin.runtime.store import write_table
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US
 
 SCHEMA = pa.schema(

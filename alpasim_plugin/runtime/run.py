@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.reconstruction import model_key
 from alpasim_plugin.runtime.certificate import Certify, certify
@@ -17,7 +18,7 @@ from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.plan import RunPlan, slug
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.scene_dump import scene_as_json
-from alpasim_plugin.runtime.store import read_json, write_json
+from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.tables import write_tables
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import declared

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.config import load_yaml
 from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log import read_asl
@@ -16,7 +17,7 @@ from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.scoring import contacts_of, tabulated
-from alpasim_plugin.runtime.store import steps_schema, write_json, write_table
+from alpasim_plugin.runtime.store import steps_schema, write_table
 from alpasim_plugin.types import RolloutLog
 from evaluators import reduce_rollout, score
 from evaluators.alpasim import ScoredRollout

@@ -13,6 +13,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from alpasim_plugin.atomic import write_bytes, write_json
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.parts import PartSpec, digest
 from alpasim_plugin.runtime.execute import Threads
@@ -22,7 +23,7 @@ from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.run import SCHEMA_VERSION
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
-from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
+from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.tables import write_tables
 from evaluators.aggregate.reduce import RolloutValue
 from evaluators.alpasim import (

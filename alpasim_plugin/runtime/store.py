@@ -1,10 +1,8 @@
-"""Files that are either whole or absent: written beside their place and renamed."""
+"""Read and write the files of a run: JSON, and the schemas of its parquet tables."""
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,42 +10,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.errors import InfrastructureError, InputError
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically.
-
-    Raises:
-        InfrastructureError: The disk refused (full, read-only, quota); what stood at ``path`` before is untouched.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(path.parent, error) from error
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise disk_error(path, error) from error
-
-
-def disk_error(path: Path, error: OSError) -> InfrastructureError:
-    """Name a failed write in four parts."""
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    room = "free disk space and run the same command again; finished rollouts are kept"
-    do = room if full else "make the folder writable, or name another one"
-    return InfrastructureError("writing a result", str(path), f"{error.strerror or error}", do)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically; NaN and infinity are refused since no JSON reader has to accept them."""
-    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+from alpasim_plugin.atomic import write_bytes
+from alpasim_plugin.errors import InputError
 
 
 def read_json(path: Path) -> Any:

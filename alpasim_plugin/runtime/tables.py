@@ -10,9 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from alpasim_plugin.atomic import write_bytes, write_json
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
-from alpasim_plugin.runtime.store import read_json, rollouts_schema, steps_schema, write_bytes, write_json, write_table
+from alpasim_plugin.runtime.store import read_json, rollouts_schema, steps_schema, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.atomic import write_array
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.clips import GROUP, SIDE
 from alpasim_plugin.nets.dit import CosmosCausalDiT
@@ -27,7 +28,6 @@ from alpasim_plugin.training.perceptual_term import Distance, frames_of
 from alpasim_plugin.training.shared_rollout import roll_out
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.training.vae import picture_error
-from alpasim_plugin.training.whole import save_array
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Rollouts:
                 )
                 z_r, m, z_map = (z[None] for z in (clip.z_r, clip.m, clip.z_map))
                 z = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=block_latents, window=window, use_map=use_map)
-                save_array(path, z[0].half().numpy())
+                write_array(path, z[0].half().numpy(), "writing training data")
             if report is not None:
                 report(index + 1, len(clips))
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.atomic import atomic_folder, write_json
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import inverse, quat_from_yaw, se3
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.perturbed_rollouts import Moment, Practice, practice_drives
 from alpasim_plugin.training.policy_expert import SIGHT_M, leader_on, taught_path, taught_speeds
-from alpasim_plugin.training.whole import whole_folder
 from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Route, Scenario
 from alpasim_plugin.world.route import route_in_rig
 from policies.lane_camera import front_camera
@@ -93,10 +93,10 @@ def make_lessons(scenario: Scenario, folder: Path, recipe: LessonRecipe, seed: i
     camera = wide_camera(front_camera(scenario))
     arrays = _lessons(scenario, camera, recipe, seed, threads)
     facts = {"K": camera.K.tolist(), "T_rig_camera": camera.T_rig_camera.tolist(), "lessons": len(arrays["frame"])}
-    with whole_folder(folder, "writing lessons") as partial:
+    with atomic_folder(folder, "writing lessons") as partial:
         for name, array in arrays.items():
             np.save(partial / f"{name}.npy", array)
-        (partial / LESSONS_FILE).write_text(json.dumps({**info, **facts}, indent=1) + "\n", encoding="utf-8")
+        write_json(partial / LESSONS_FILE, {**info, **facts})
     return True
 
 

@@ -22,6 +22,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from alpasim_plugin.atomic import write_array
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.sampling import opacity_mask
@@ -30,7 +31,6 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.class_colours import OTHERS, recolour_boxes
 from alpasim_plugin.training.clips import to_tensor
 from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
-from alpasim_plugin.training.whole import save_array
 
 F16 = npt.NDArray[np.float16]
 DOING = "encoding training clips"
@@ -133,7 +133,7 @@ class LatentClips:
     def _latents(self, sequence: PairSequence, vae: TinyVAE) -> F16:
         path = self._folder / f"{sequence.name}-{sequence.content[:12]}.npy"
         if not path.exists():
-            save_array(path, encode_sequence(sequence, vae, self.form))
+            write_array(path, encode_sequence(sequence, vae, self.form), "writing training data")
         return np.asarray(np.load(path, mmap_mode="r"))
 
 

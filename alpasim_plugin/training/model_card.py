@@ -15,6 +15,8 @@ from typing import Any
 
 import torch
 
+from alpasim_plugin.atomic import write_json
+
 
 @dataclass(frozen=True)
 class ModelCard:
@@ -41,7 +43,7 @@ class ModelCard:
             **asdict(self), "weights": weights.name, "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
             "bytes": weights.stat().st_size, "command": command(), "machine": machine(),
         }  # fmt: skip
-        path.write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        write_json(path, card)
         return path
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.atomic import write_text
 from alpasim_plugin.training.pair_store import PairSequence
 from alpasim_plugin.types import F64, U8
 
@@ -168,7 +169,7 @@ def contact_sheet(sequences: Sequence[PairSequence], rows: int = ROWS) -> U8:
 def write_sheet(out: Path, document: Mapping[str, Any], picture: U8) -> None:
     """Write ``sheet.md`` and ``sheet.jpg`` into a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / "sheet.md").write_text(markdown(document), encoding="utf-8")
+    write_text(out / "sheet.md", markdown(document))
     cv2.imwrite(str(out / "sheet.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from alpasim_plugin.atomic import atomic_folder
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.training.whole import whole_folder
 from alpasim_plugin.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"
@@ -168,7 +168,7 @@ def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapp
         InputError: No frame, or frames of changing size.
         InfrastructureError: The disk refuses.
     """
-    with whole_folder(folder, "writing training pairs") as partial:
+    with atomic_folder(folder, "writing training pairs") as partial:
         count = _write_arrays(partial, frames, length)
         document = {**info, "frames": count, CONTENT: _content(partial)}
         (partial / SEQUENCE_FILE).write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import yaml
 
+from alpasim_plugin.atomic import write_text
 from alpasim_plugin.errors import InputError, SimrunError
 from alpasim_plugin.training.scene_families import TEST_FAMILIES, TRAIN_FAMILIES, draw_spec
 from scenarios.load import load_scenario
@@ -42,18 +43,17 @@ def _write_drivable(path: Path, family: str, scene_id: str, first_seed: int, dur
     last: SimrunError | None = None
     for draw in range(DRAWS):
         spec = draw_spec(family, scene_id, first_seed + draw, duration_s)
-        partial = path.with_name(f".{path.stem}.{os.getpid()}.part.yaml")
-        partial.write_text(yaml.safe_dump(spec, sort_keys=False), encoding="utf-8")
-        try:
-            load_scenario(partial)
-        except InputError as error:
-            last = error
-            continue
-        else:
-            partial.replace(path)
-            return
-        finally:
-            partial.unlink(missing_ok=True)
+        text = yaml.safe_dump(spec, sort_keys=False)
+        with tempfile.TemporaryDirectory() as scratch:
+            candidate = Path(scratch) / path.name
+            candidate.write_text(text, encoding="utf-8")
+            try:
+                load_scenario(candidate)
+            except InputError as error:
+                last = error
+                continue
+        write_text(path, text)
+        return
     raise InputError(
         "drawing a training scene", f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}",
         f"no draw can be driven; the last: {last}",

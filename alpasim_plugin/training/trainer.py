@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -16,9 +15,10 @@ from typing import Any, Generic, TypeVar
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from alpasim_plugin.atomic import atomic_file, write_safetensors, write_text
 from alpasim_plugin.errors import InfrastructureError, InputError
 
 Batch = TypeVar("Batch")
@@ -119,15 +119,12 @@ class Trainer(Generic[Batch]):
         return {**self.module.state_dict(), **self.average}
 
     def save(self) -> None:
-        """Write the checkpoint, whole or not at all."""
+        """Write the checkpoint."""
         tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
         for name, p in self.parameters.items():
             tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state[p].items()}
-        partial = self.folder / f"{STATE_FILE}.{os.getpid()}.part"
-        contiguous = {name: t.cpu().contiguous() for name, t in tensors.items()}
-        save_file(contiguous, str(partial), {"step": str(self.step), "facts": self._facts})
-        partial.replace(self.folder / STATE_FILE)
+        write_safetensors(self.folder / STATE_FILE, tensors, {"step": str(self.step), "facts": self._facts})
 
     def _update(self) -> dict[str, float]:
         began = time.perf_counter()
@@ -165,7 +162,8 @@ class Trainer(Generic[Batch]):
 
     def _stop(self, batch: Batch, found: str) -> None:
         path = self.folder / BAD_FILE
-        torch.save(batch, path)
+        with atomic_file(path) as partial:
+            torch.save(batch, partial)
         self.save()
         do = f"look at the batch in {path}; lower the learning rate or repair the data, then start again: training goes on from there"
         raise InfrastructureError("training", str(self.folder), found, do)
@@ -198,4 +196,4 @@ class Trainer(Generic[Batch]):
         path = self.folder / LOG_FILE
         if path.exists():
             rows = [line for line in path.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= self.step]
-            path.write_text("".join(row + "\n" for row in rows), encoding="utf-8")
+            write_text(path, "".join(row + "\n" for row in rows))

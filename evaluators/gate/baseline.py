@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
 from evaluators.aggregate.rows import Row
 from evaluators.gate.rows import rows_of_run
-from evaluators.report.files import write_whole
 from evaluators.report.run_folder import Run
 
 SCHEMA_VERSION = 1
@@ -49,7 +49,7 @@ def write_baseline(run: Run, path: Path) -> None:
     if failed or not run.rollouts:
         found = f"{len(failed)} of {len(run.rollouts)} rollouts failed" if failed else "it holds no rollouts"
         raise InputError("storing a baseline", str(run.folder), found, "store a run in which every rollout ran to its end")
-    write_whole(path, json.dumps(asdict(baseline_of(run)), indent=1, allow_nan=False) + "\n")
+    write_json(path, asdict(baseline_of(run)), "writing a report")
 
 
 def read_baseline(path: Path) -> Baseline:

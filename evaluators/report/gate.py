@@ -6,8 +6,8 @@ import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+from alpasim_plugin.atomic import write_text
 from evaluators.gate.judge import Check, GateVerdict
-from evaluators.report.files import write_whole
 from evaluators.report.junit import clean, junit
 from evaluators.report.run_folder import Run
 from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, escape, table
@@ -46,10 +46,10 @@ def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) ->
     text = gate_md(verdict, gate, str(run.folder))
     folder.mkdir(parents=True, exist_ok=True)
     page, tests = folder / "gate.md", folder / "gate.junit.xml"
-    write_whole(page, cut(text))
+    write_text(page, cut(text), "writing a report")
     root = gate_junit(verdict, gate, run)
     ET.indent(root)
-    write_whole(tests, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n")
+    write_text(tests, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n", "writing a report")
     append_job_summary(text)
     return [page, tests]
 
@@ -64,7 +64,7 @@ def append_job_summary(text: str) -> Path | None:
     before = before.rstrip("\n") + "\n\n" if before else ""
     room = MAX_BYTES - len(before.encode())
     if room > len(CUT_NOTE):
-        write_whole(path, before + cut(text, room))
+        write_text(path, before + cut(text, room), "writing a report")
     return path
 
 

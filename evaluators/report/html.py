@@ -12,6 +12,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from alpasim_plugin.atomic import write_text
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.certificate import certificate
@@ -19,7 +20,6 @@ from evaluators.report.charts import drift_charts
 from evaluators.report.events import events_of, read_series
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
 from evaluators.report.figures import forest, speed_against_error, strata_chart
-from evaluators.report.files import write_whole
 from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.flips import baseline_of, flip_rows
 from evaluators.report.frames import comparisons
@@ -54,7 +54,7 @@ def write_report(run_dir: Path | str) -> Path:
     """
     run = read_run(run_dir)
     path = run.folder / "report.html"
-    write_whole(path, render_report(run))
+    write_text(path, render_report(run), "writing a report")
     return path
 
 

@@ -9,7 +9,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from evaluators.report.files import write_whole
+from alpasim_plugin.atomic import write_text
 from evaluators.report.run_folder import Rollout, Run, read_run
 
 NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # characters that XML 1.0 cannot hold
@@ -25,7 +25,7 @@ def write_junit(run_dir: Path | str) -> Path:
     root = junit(run)
     ET.indent(root)
     path = run.folder / "junit.xml"
-    write_whole(path, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n")
+    write_text(path, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n", "writing a report")
     return path
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from alpasim_plugin.atomic import write_text
 from evaluators.report import tables
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
-from evaluators.report.files import write_whole
 from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell, plural
@@ -30,7 +30,7 @@ def write_summary_md(run_dir: Path | str) -> Path:
     """
     run = read_run(run_dir)
     path = run.folder / "summary.md"
-    write_whole(path, cut(summary_md(run)))
+    write_text(path, cut(summary_md(run)), "writing a report")
     return path
 
 

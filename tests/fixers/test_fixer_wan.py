@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.reference import whole_clip
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets.checkpoints import save_weights
 from tests.fixers.fixer_cases import Recorded, fixer, maps_of, moving_picture, pixels, run_blocks
 
 FRAMES = moving_picture(13)
@@ -26,7 +26,7 @@ def paths(shared_data: Path, tmp_path: Path) -> list[str]:
     folder = shared_data / "golden-nets"
     prompt = tmp_path / "prompt.safetensors"
     width = load_width(folder / "dit.weights.safetensors")
-    save_weights(prompt, {"text": torch.linspace(-1, 1, 3 * width).view(3, width)})
+    write_safetensors(prompt, {"text": torch.linspace(-1, 1, 3 * width).view(3, width)})
     files = {"dit": folder / "dit.weights.safetensors", "vae": folder / "wan_vae.weights.safetensors", "prompt": prompt}
     return [f"weights.{part}={path}" for part, path in files.items()]
 

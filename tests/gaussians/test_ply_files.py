@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
 from alpasim_plugin.gaussians.files.formats import read_gaussians
 from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays
@@ -283,7 +283,7 @@ def test_broken_gaussians_are_dropped_and_counted(tmp_path: Path) -> None:
 
 
 def test_unfinished_file_never_bears_the_name(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="writing a PLY file"):
+    with pytest.raises(InfrastructureError, match="writing a PLY file"):
         write_ply(tmp_path / "absent" / "a.ply", make_cloud())
     write_ply(tmp_path / "a.ply", make_cloud())
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]

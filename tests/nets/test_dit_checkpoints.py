@@ -9,9 +9,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
-from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, save_weights
+from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
 from tests.nets.dit_cases import SMALL, clip, furthest
 from tests.nets.dit_reference import random_weights, velocity
 
@@ -151,7 +152,7 @@ def test_integer_weights_are_named():
 def test_safetensors_round_trip_with_digest_and_precision(tmp_path):
     sd = random_weights(SMALL)
     path = tmp_path / "net.safetensors"
-    save_weights(path, sd, {"made": "test"})
+    write_safetensors(path, sd, {"made": "test"})
     assert [p.name for p in tmp_path.iterdir()] == ["net.safetensors"]
     back = load_weights(path, sha256=file_sha256(path).upper())
     assert all(torch.equal(back[key], sd[key]) for key in sd)
@@ -179,7 +180,7 @@ def test_integer_tensors_keep_their_type_when_others_are_converted(tmp_path):
 @pytest.mark.parametrize("keep", [0, 5, 100, -100])
 def test_truncated_safetensors_is_refused(tmp_path, keep):
     path = tmp_path / "net.safetensors"
-    save_weights(path, random_weights(SMALL))
+    write_safetensors(path, random_weights(SMALL))
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(InputError, match=r"not a whole safetensors file of \d+ bytes[\s\S]*truncated or of another format"):
         load_weights(path)

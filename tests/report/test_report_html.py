@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from html.parser import HTMLParser
@@ -193,10 +194,10 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path:
     folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
     before = write_report(folder).read_bytes()
 
-    def refuse(self: Path, *args: object, **more: object) -> int:
+    def refuse(fd: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(os, "fsync", refuse)
     with pytest.raises(InfrastructureError) as caught:
         write_report(folder)
     assert caught.value.doing == "writing a report"

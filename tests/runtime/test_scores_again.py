@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.runtime import cell, plan
 from alpasim_plugin.runtime.cell import MANIFEST
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.runtime.store import read_json, write_json
+from alpasim_plugin.runtime.store import read_json
 from evaluators import EVALUATORS_VERSION
 from scenarios.suite import expand
 from tests.runtime.test_runs import Heard

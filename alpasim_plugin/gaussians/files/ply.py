@@ -7,7 +7,6 @@ Properties are found by name. Opacity is stored as logit, scale as natural logar
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -15,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from alpasim_plugin.atomic import atomic_file
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.arrays import GaussianArrays, build_cloud, logit, sigmoid
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -74,22 +74,16 @@ def write_ply(path: Path | str, cloud: GaussianCloud, precision: Precision = "fl
         precision: Type of every property.
 
     Raises:
-        InputError: The folder is missing or not writable.
+        InfrastructureError: The folder is missing or not writable, or the disk is full.
     """
     path = Path(path)
     rows = ply_rows(cloud, precision)
     word = {"float32": "float", "float64": "double"}[precision]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [f"property {word} {name}" for name in rows.dtype.names or ()]
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with partial.open("wb") as stream:
-            stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
-            stream.write(rows.tobytes())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError("writing a PLY file", str(path), f"{error.strerror}", "check that the folder exists and has room") from error
+    with atomic_file(path, "writing a PLY file") as partial, partial.open("wb") as stream:
+        stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+        stream.write(rows.tobytes())
 
 
 def ply_rows(cloud: GaussianCloud, precision: Precision = "float32") -> NDArray[np.void]:

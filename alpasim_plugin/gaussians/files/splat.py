@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.atomic import atomic_file
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.arrays import SH_C0, GaussianArrays
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -53,9 +53,8 @@ def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
     Rotations keep 7 bits and sign, colours and opacity 8 bits; positions and scales are exact in float32.
 
     Raises:
-        InputError: The folder is missing or not writable.
+        InfrastructureError: The folder is missing or not writable, or the disk is full.
     """
-    path = Path(path)
     rows = np.zeros(len(cloud.means), dtype=_ROW)
     rows["position"] = cloud.means
     rows["scale"] = cloud.scales
@@ -63,10 +62,5 @@ def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
     rgba = np.concatenate([rgb, np.asarray(cloud.opacities, dtype=np.float64)[:, None]], axis=1)
     rows["rgba"] = np.rint(np.clip(rgba, 0.0, 1.0) * 255.0)
     rows["rotation"] = np.clip(np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128.0 + 128.0), 0, 255)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with atomic_file(path, "writing a .splat file") as partial:
         partial.write_bytes(rows.tobytes())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError("writing a .splat file", str(path), f"{error.strerror}", "check that the folder exists and has room") from error

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
+from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.fit.adam import RowAdam
 from alpasim_plugin.gaussians.fit.density import ScreenGradients
@@ -22,10 +22,7 @@ def save_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: Screen
     tensors = {"node": model.node, "gradients.total": gradients.total, "gradients.count": gradients.count}
     for name in NAMES:
         tensors |= {f"value.{name}": model.params[name].detach(), f"first.{name}": adam.first[name], f"second.{name}": adam.second[name]}
-    partial = folder / f"{STATE_FILE}.{os.getpid()}.part"
-    meta = {"step": str(step), "adam_step": str(adam.step), "facts": facts}
-    save_file({name: t.cpu().contiguous() for name, t in tensors.items()}, str(partial), meta)
-    partial.replace(folder / STATE_FILE)
+    write_safetensors(folder / STATE_FILE, tensors, {"step": str(step), "adam_step": str(adam.step), "facts": facts})
 
 
 def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, facts: str) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
@@ -56,10 +57,7 @@ class Reconstruction:
         for name, file in files.items():
             write_ply(folder / file, self.actors[name])
         cv2.imwrite(str(folder / SKY_FILE), np.rint(self.sky.panorama[..., ::-1] * 255).clip(0, 255).astype(np.uint8))
-        document = {"actors": files, "gaussians": len(self), **facts}
-        partial = folder / f".{INDEX_FILE}.part"
-        partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        partial.replace(folder / INDEX_FILE)
+        write_json(folder / INDEX_FILE, {"actors": files, "gaussians": len(self), **facts})
 
     @classmethod
     def load(cls, folder: Path) -> Reconstruction:

@@ -24,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -86,7 +87,7 @@ def write_views(folder: Path, views: Sequence[PosedView]) -> None:
                 frame[f"{key}_path"] = f"{key}/{i:04d}.png"
                 _write_image(folder / frame[f"{key}_path"], image.astype(np.uint8) * 255)
         frames.append(frame)
-    (folder / FILE).write_text(json.dumps({"axes": "opencv", "frames": frames}, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / FILE, {"axes": "opencv", "frames": frames})
 
 
 def read_points(path: Path) -> GaussianCloud:
