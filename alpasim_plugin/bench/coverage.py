@@ -1,178 +1,193 @@
-"""Monte-Carlo study of the intervals: coverage and power on synthetic rollouts, and the tables of docs/statistics.md.
+"""The tables of docs/statistics.md, from the study of the intervals.
 
 ``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write docs/statistics.md`` puts them between their markers.
-
-The model: a rollout has the event if scene effect + run noise, both normal, falls below the threshold that gives the wanted rate. The
-scene's share of the variance is the within-scene correlation. Two renderers share 90 % of the scene effect, and the run noise with
-correlation 0.8 where they meet the same random numbers.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
-from alpasim_plugin.seeding import stream
+from alpasim_plugin.bench.interval_study import (
+    CORRELATIONS,
+    PAPER_SCENES,
+    PAPER_SEEDS,
+    RATES,
+    SHARED_NOISE,
+    Design,
+    bootstrap_coverage,
+    coverage,
+    coverage_of,
+    in_blocks,
+    paired_coverage,
+    pairs,
+    power_of,
+)
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64
-from evaluators.aggregate.bootstrap import resampled_means
-from evaluators.aggregate.intervals import TAIL, Z95, logit_t_bounds, t_bounds
-from evaluators.aggregate.paired import flag_bounds
+from evaluators.aggregate.intervals import t_bounds
+from evaluators.aggregate.power import more_scenes, scenes_needed
 
-CORRELATIONS = (0.0, 0.3, 0.6, 0.8)  # within a scene, latent
-PAPER_SCENES, PAPER_SEEDS = 60, 5
-RATES = (0.106, 0.069)
-SHARED_SCENE, SHARED_NOISE = 0.9, 0.8
+SCENES = (5, 10, 20, 60, 150)
+LEAST, MOST = 0.93, 0.97
 REPEATS = 20_000
 
-Bounds = tuple[F64, F64]
+
+def tables(repeats: int) -> dict[str, str]:
+    """Return every table as Markdown, by the name of its marker."""
+    makers: dict[str, Callable[[int], str]] = {
+        "coverage": _coverage,
+        "coverage-scenes": _coverage_scenes,
+        "coverage-means": _coverage_means,
+        "coverage-paired": _coverage_paired,
+        "power": _power,
+        "planning": _planning,
+        "planning-check": _planning_check,
+    }
+    return {name: make(repeats) for name, make in makers.items()}
 
 
-@dataclass(frozen=True)
-class Design:
-    """One cell of the grid."""
+def write_into(page: Path, made: dict[str, str]) -> None:
+    """Replace what stands between ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
 
-    n_scenes: int = PAPER_SCENES
-    n_seeds: int = PAPER_SEEDS
-    rate: float = RATES[0]
-    correlation: float = 0.0
-
-
-def flags(design: Design, repeats: int, generator: np.random.Generator) -> F64:
-    """Return outcomes ``(repeats, scenes, seeds)``, 0 or 1, under the probit model."""
-    shape = (repeats, design.n_scenes, design.n_seeds)
-    latent = _latent(generator.standard_normal((*shape[:2], 1)), generator.standard_normal(shape), design.correlation)
-    return np.asarray(latent < stats.norm.ppf(design.rate), dtype=np.float64)
+    Raises:
+        InputError: A marker is missing.
+    """
+    text = page.read_text(encoding="utf-8")
+    for name, table in made.items():
+        begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
+        if begin not in text or end not in text:
+            raise InputError("writing tables into a page", str(page), f"no markers for {name!r}", f"add {begin.strip()} and {end}")
+        text = text[: text.index(begin) + len(begin)] + table + text[text.index(end) :]
+    page.write_text(text, encoding="utf-8")
 
 
-def pairs(design: Design, other_rate: float, shared_noise: float, repeats: int, generator: np.random.Generator) -> tuple[F64, F64]:
-    """Return outcomes ``(repeats, scenes, seeds)`` of two renderers with rates ``design.rate`` and ``other_rate``."""
-    shape = (repeats, design.n_scenes, design.n_seeds)
-    scenes = _correlated(generator, (*shape[:2], 1), SHARED_SCENE)
-    noises = _correlated(generator, shape, shared_noise)
-    latents = [_latent(scene, noise, design.correlation) for scene, noise in zip(scenes, noises, strict=True)]
-    first, second = (x < stats.norm.ppf(rate) for x, rate in zip(latents, (design.rate, other_rate), strict=True))
-    return first.astype(np.float64), second.astype(np.float64)
+def _coverage(repeats: int) -> str:
+    rows = []
+    for rate in RATES:
+        for correlation in CORRELATIONS:
+            design = Design(rate=rate, correlation=correlation)
+            found = coverage_of(design, repeats)
+            drawn = bootstrap_coverage(design, max(200, repeats // 10))
+            rows.append([f"{100 * rate:g} %", f"{correlation:g}", *map(_percent, found[:3]), _percent(drawn), _judged(found[3])])
+    return _markdown(["rate", "correlation", "paper", "Wilson", "t on scenes", "bootstrap", "`ci95_clustered`"], rows)
 
 
-def naive(values: F64) -> Bounds:
-    """Return the paper's bounds ``(repeats,)`` from ``(repeats, scenes, seeds)``."""
-    flat = values.reshape(len(values), -1)
-    half = Z95 * flat.std(axis=1, ddof=1) / np.sqrt(flat.shape[1])
-    centre = flat.mean(axis=1)
-    return centre - half, centre + half
+def _coverage_scenes(repeats: int) -> str:
+    rows = []
+    for rate in (0.5, 0.106, 0.069, 0.02):
+        for n_scenes in SCENES:
+            found = [coverage_of(Design(n_scenes, PAPER_SEEDS, rate, c), repeats // 2) for c in CORRELATIONS]
+            rows.append([f"{100 * rate:g} %", str(n_scenes), *(f"{_percent(f[2])} / {_judged(f[3])}" for f in found)])
+    return _markdown(["rate", "scenes", *(f"correlation {c:g}" for c in CORRELATIONS)], rows)
 
 
-def by_scene_t(values: F64) -> Bounds:
-    """Return plain t bounds on the scene means."""
-    return t_bounds(values.mean(axis=2))
+def _coverage_means(repeats: int) -> str:
+    """Coverage of t on scenes for metrics that are no rates, by the shape of the scenes' means."""
+    shapes: dict[str, tuple[Callable[[np.random.Generator, tuple[int, int]], F64], float]] = {
+        "normal": (lambda g, s: g.standard_normal(s), 0.0),
+        "log-normal, sigma 0.5": (lambda g, s: np.exp(0.5 * g.standard_normal(s)), float(np.exp(0.125))),
+        "log-normal, sigma 1": (lambda g, s: np.exp(g.standard_normal(s)), float(np.exp(0.5))),
+        "difference of two log-normal, sigma 1": (
+            lambda g, s: np.exp(g.standard_normal(s)) - np.exp(g.standard_normal(s)),
+            0.0,
+        ),
+    }
+    rows = []
+    for name, (draw, truth) in shapes.items():
+        row = [name]
+        for n_scenes in SCENES:
+
+            def measure(n: int, generator: np.random.Generator, n_scenes: int = n_scenes) -> list[float]:
+                return [coverage(t_bounds(draw(generator, (n, n_scenes))), truth)]  # noqa: B023 - called before the loop moves on
+
+            row.append(_judged(in_blocks(measure, repeats, f"{name} {n_scenes}")[0]))
+        rows.append(row)
+    return _markdown(["scene means", *(f"{n} scenes" for n in SCENES)], rows)
 
 
-def by_scene(values: F64) -> Bounds:
-    """Return the bounds that summary.json gives for a rate."""
-    return logit_t_bounds(values.mean(axis=2))
+def _coverage_paired(repeats: int) -> str:
+    rows = []
+    for rates in ((RATES[0], RATES[1]), (RATES[1], RATES[1]), (0.3, 0.3)):
+        for n_scenes in SCENES[1:]:
+            designs = [Design(n_scenes, PAPER_SEEDS, rates[0], c) for c in CORRELATIONS]
+            found = [_judged(paired_coverage(design, rates[1], repeats // 2)) for design in designs]
+            rows.append([f"{100 * rates[0]:g} and {100 * rates[1]:g} %", str(n_scenes), *found])
+    return _markdown(["rates", "scenes", *(f"correlation {c:g}" for c in CORRELATIONS)], rows)
 
 
-def wilson(values: F64) -> Bounds:
-    """Return Wilson bounds as if rollouts were independent."""
-    n = values.shape[1] * values.shape[2]
-    p = values.mean(axis=(1, 2))
-    centre, half = p + Z95**2 / (2 * n), Z95 * np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n * n))
-    return (centre - half) / (1 + Z95**2 / n), (centre + half) / (1 + Z95**2 / n)
+def _power(repeats: int) -> str:
+    rows = []
+    for correlation in CORRELATIONS:
+        found = power_of(Design(rate=RATES[0], correlation=correlation), RATES[1], repeats)
+        rows.append([f"{correlation:g}", *(f"{100 * p:.0f} %" for p in found)])
+    return _markdown(["correlation", "unpaired", "paired by scene", "paired, shared random numbers"], rows)
 
 
-def bootstrap(values: F64, generator: np.random.Generator, draws: int = 400) -> Bounds:
-    """Return percentile bounds of the cluster bootstrap."""
-    means = values.mean(axis=2)
-    ends = np.array([np.quantile(resampled_means(row, generator, draws), [TAIL, 1 - TAIL]) for row in means])
-    return ends[:, 0], ends[:, 1]
+def _planning(repeats: int) -> str:
+    """Scenes for 80 % power against the two rates, from the spread that the model gives."""
+    rows = []
+    for n_seeds in (1, 3, 5):
+        needed = [scenes_needed(RATES[0] - RATES[1], _spread(n_seeds, correlation, repeats)) for correlation in CORRELATIONS]
+        rows.append([str(n_seeds), *map(_scenes, needed)])
+    return _markdown(["seeds", *(f"correlation {c:g}" for c in CORRELATIONS)], rows)
 
 
-def coverage(bounds: Bounds, truth: float) -> float:
-    """Return the share of intervals that hold the truth."""
-    return float(np.mean((bounds[0] <= truth) & (truth <= bounds[1])))
+def _planning_check(repeats: int) -> str:
+    """How often a run of the planned size decides, and what a small first run says is needed."""
+    rows = []
+    for correlation in CORRELATIONS:
+        needed = scenes_needed(RATES[0] - RATES[1], _spread(PAPER_SEEDS, correlation, repeats))
+        if needed is None:
+            raise AssertionError("a difference of this size can be planned for")
+        decided = power_of(Design(needed, PAPER_SEEDS, RATES[0], correlation), RATES[1], min(repeats, 4000))[2]
+        said = _advice(correlation)
+        quartiles = [("out of reach" if q > 1e5 else f"{q:.0f}") for q in np.quantile(said, [0.25, 0.5, 0.75])]
+        rows.append([f"{correlation:g}", str(needed), f"{100 * decided:.0f} %", str(needed - PAPER_SCENES), " / ".join(quartiles)])
+    head = ["correlation", "planned scenes", "decided", "missing after 60 scenes", "`more_scenes` of undecided runs, quartiles"]
+    return _markdown(head, rows)
 
 
-def power(first: F64, second: F64, is_paired: bool) -> float:
-    """Return how often a 95 % interval on the difference leaves out 0, scenes as unit, paired by scene or not."""
-    here, there = first.mean(axis=2), second.mean(axis=2)
-    if is_paired:
-        low, high = t_bounds(here - there)
-    else:
-        n = here.shape[1]
-        error = np.sqrt((here.var(axis=1, ddof=1) + there.var(axis=1, ddof=1)) / n)
-        half = stats.t.ppf(1 - TAIL, 2 * n - 2) * error
-        centre = here.mean(axis=1) - there.mean(axis=1)
-        low, high = centre - half, centre + half
-    return float(np.mean((low > 0) | (high < 0)))
+def _advice(correlation: float, runs: int = 400) -> F64:
+    """Return what `more_scenes` answers after 60 scenes, over undecided runs; infinite where it answers none."""
+    design = Design(rate=RATES[0], correlation=correlation)
+    worse, base = pairs(design, RATES[1], SHARED_NOISE, runs, np.random.Generator(np.random.Philox(int(10 * correlation))))
+    delta = (worse - base).mean(axis=2)
+    low, high = t_bounds(delta)
+    undecided = delta[(low <= 0) & (high >= 0)]
+    said = [more_scenes(float(d.mean()), float(d.std(ddof=1)), PAPER_SCENES, 0.0, True) for d in undecided]
+    return np.array([np.inf if s is None else float(s) for s in said])
 
 
-def in_blocks(measure: Callable[[int, np.random.Generator], Sequence[float]], repeats: int, key: str, block: int = 2000) -> list[float]:
-    """Average a measurement over blocks of repeats, each from its own stream, so that memory stays small."""
-    sizes = [min(block, repeats - start) for start in range(0, repeats, block)]
-    parts = [measure(size, stream(key, 0, "aggregate/study", i)) for i, size in enumerate(sizes)]
-    return [float(v) for v in np.average(np.array(parts), axis=0, weights=sizes)]
+def _spread(n_seeds: int, correlation: float, repeats: int) -> float:
+    """Return the standard deviation between scenes of the paired difference."""
+    generator = np.random.Generator(np.random.Philox(n_seeds))
+    first, second = pairs(Design(repeats, n_seeds, RATES[0], correlation), RATES[1], SHARED_NOISE, 4, generator)
+    return float((first - second).mean(axis=2).std(ddof=1))
 
 
-def coverage_of(design: Design, repeats: int) -> list[float]:
-    """Return the coverage of `naive`, `wilson`, `by_scene_t` and `by_scene` in one cell of the grid."""
-
-    def measure(n: int, generator: np.random.Generator) -> list[float]:
-        values = flags(design, n, generator)
-        return [coverage(method(values), design.rate) for method in (naive, wilson, by_scene_t, by_scene)]
-
-    return in_blocks(measure, repeats, repr(design))
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}"
 
 
-def bootstrap_coverage(design: Design, repeats: int) -> float:
-    """Return the coverage of the cluster bootstrap in one cell of the grid."""
-
-    def measure(n: int, generator: np.random.Generator) -> list[float]:
-        return [coverage(bootstrap(flags(design, n, generator), generator), design.rate)]
-
-    return in_blocks(measure, repeats, f"bootstrap {design!r}")[0]
+def _judged(share: float) -> str:
+    """Print a coverage, bold where it lies outside 93 to 97 %."""
+    return _percent(share) if LEAST <= share <= MOST else f"**{_percent(share)}**"
 
 
-def paired_coverage(design: Design, other_rate: float, repeats: int) -> float:
-    """Return the coverage of the interval that summary.json gives for a difference of rates."""
-
-    def measure(n: int, generator: np.random.Generator) -> list[float]:
-        first, second = pairs(design, other_rate, SHARED_NOISE, n, generator)
-        gained, lost = (first > second).mean(axis=2), (second > first).mean(axis=2)
-        return [coverage(flag_bounds(gained, lost), design.rate - other_rate)]
-
-    return in_blocks(measure, repeats, f"paired {design!r}")[0]
+def _scenes(n: int | None) -> str:
+    return "out of reach" if n is None else str(n)
 
 
-def power_of(design: Design, other_rate: float, repeats: int) -> list[float]:
-    """Return the power unpaired, paired by scene, and paired by scene with shared random numbers."""
-
-    def measure(n: int, generator: np.random.Generator) -> list[float]:
-        alone = pairs(design, other_rate, 0.0, n, generator)
-        shared = pairs(design, other_rate, SHARED_NOISE, n, generator)
-        return [power(*alone, is_paired=False), power(*alone, is_paired=True), power(*shared, is_paired=True)]
-
-    return in_blocks(measure, repeats, f"power {design!r}")
-
-
-def _latent(scene: F64, noise: F64, correlation: float) -> F64:
-    return np.asarray(np.sqrt(correlation) * scene + np.sqrt(1 - correlation) * noise)
-
-
-def _correlated(generator: np.random.Generator, shape: tuple[int, ...], correlation: float) -> list[F64]:
-    """Return two standard normal arrays with the wanted correlation."""
-    common = generator.standard_normal(shape)
-    return [np.sqrt(correlation) * common + np.sqrt(1 - correlation) * generator.standard_normal(shape) for _ in range(2)]
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "".join("| " + " | ".join(line) + " |\n" for line in (head, ["---"] * len(head), *rows))
 
 
 def main() -> None:
     """Print the tables, or write them into a page."""
-    from alpasim_plugin.bench.coverage_tables import tables, write_into
-
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--repeats", type=int, default=REPEATS, help="Simulated runs per cell of the grid.")
     parser.add_argument("--write", type=Path, help="Page whose tables are replaced.")

@@ -1,7 +1,8 @@
-"""How long the evaluators take and whether they are right: against a search step by step, and against the exact twin.
+"""Time and correctness of the evaluators: against a search step by step, and against an exact reference implementation.
 
 The search step by step is how AlpaSim does it: at every step polygons of everybody, one tree over them and one query; for lane keeping the
-nearby lanes and their union. The twin (`evaluators.reference`) decides contact in rational arithmetic and uses no index at all.
+nearby lanes and their union. The reference implementation (`bench.evaluators_reference`) decides contact in rational arithmetic and uses
+no index at all.
 
 Times are CPU times: nothing here runs on more than one core, and other work on the machine does not blur them.
 """
@@ -17,6 +18,7 @@ import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
+from alpasim_plugin.bench.evaluators_reference import contacts_by_step, ego_corners, road_by_step
 from alpasim_plugin.geometry import arc_lengths, inverse, offset_trajectory, quat_from_yaw
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, Actor, Box, Lane, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
@@ -25,7 +27,6 @@ from evaluators.collision import SIDES
 from evaluators.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.offroad import containment
 from evaluators.presets import PRESETS, Preset
-from evaluators.reference import contacts_by_step, ego_corners, road_by_step
 from evaluators.road import Road
 from evaluators.step_contact import Contacts, find_contacts
 from evaluators.swept_contact import find_swept
@@ -33,7 +34,7 @@ from evaluators.swept_contact import find_swept
 PAPER, STRICT = PRESETS["paper"], PRESETS["strict"]
 STEP_US = 100_000
 LANE_M = 3.5
-TWIN_PAIRS = 8_000
+REFERENCE_PAIRS = 8_000
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,10 @@ class BenchRow:
     ours_ms: float
     per_step_ms: float
     ratio: float  # per step over ours
-    twin_steps: int  # the twin takes most of a millisecond per pair, so it looks at this many of the steps
-    twin_ms: float | None
+    reference_steps: int  # the reference takes most of a millisecond per pair, so it looks at this many of the steps
+    reference_ms: float | None
     differ_per_step: int  # pairs (steps) on which ours and per step disagree, sides included
-    differ_twin: int | None
+    differ_reference: int | None
     gap_error_m: float  # largest difference of the least gap between ours and either other
     again_ms: float | None  # ours for the next rollout of the same scene: its road is kept
     swept_ms: float | None  # contact between steps, on top of contact at steps
@@ -58,7 +59,7 @@ class BenchRow:
 
 
 def bench_evaluators(
-    actors: Sequence[int] = (10, 40, 200), steps: Sequence[int] = (200, 900), repeats: int = 5, twin: bool = True
+    actors: Sequence[int] = (10, 40, 200), steps: Sequence[int] = (200, 900), repeats: int = 5, reference: bool = True
 ) -> list[BenchRow]:
     """Measure every combination of actor and step counts, then lane keeping once per step count.
 
@@ -66,10 +67,10 @@ def bench_evaluators(
         actors: How many other road users.
         steps: How many logged steps of 0.1 s.
         repeats: Runs of ours; the slower ways run once.
-        twin: Also run the exact twin, which takes most of the time.
+        reference: Also run the exact reference, which takes most of the time.
     """
-    rows = [_contact_row(busy_road(a, t), a, t, repeats, twin) for a in actors for t in steps]
-    return rows + [_road_row(busy_road(1, t), t, repeats, twin) for t in steps]
+    rows = [_contact_row(busy_road(a, t), a, t, repeats, reference) for a in actors for t in steps]
+    return rows + [_road_row(busy_road(1, t), t, repeats, reference) for t in steps]
 
 
 def busy_road(n_actors: int, n_steps: int) -> tuple[RolloutLog, Scene]:
@@ -143,7 +144,7 @@ def _side(shape: Any, front: Any, rear: Any) -> str:
     return "front" if shape.intersects(front) else "rear" if shape.intersects(rear) else "lateral"
 
 
-def _contact_row(world: tuple[RolloutLog, Scene], n_actors: int, n_steps: int, repeats: int, twin: bool) -> BenchRow:
+def _contact_row(world: tuple[RolloutLog, Scene], n_actors: int, n_steps: int, repeats: int, reference: bool) -> BenchRow:
     log, scene = world
     origin = origin_of(log.ego, PAPER)
 
@@ -159,8 +160,8 @@ def _contact_row(world: tuple[RolloutLog, Scene], n_actors: int, n_steps: int, r
     for step, actor, side in zip(contacts.step, contacts.actor, contacts.side, strict=True):
         mine[step][ids[actor]] = SIDES[int(side)]
     (per_sides, per_gap), per_ms = _timed(lambda: contacts_per_step(log, PAPER), 1)
-    every = max(1, n_actors * n_steps // TWIN_PAIRS)
-    exact, twin_ms = _timed(lambda: contacts_by_step(_thinned(log, every), PAPER), 1) if twin else ([], None)
+    every = max(1, n_actors * n_steps // REFERENCE_PAIRS)
+    exact, reference_ms = _timed(lambda: contacts_by_step(_thinned(log, every), PAPER), 1) if reference else ([], None)
     ego, table = ego_footprints(log, STRICT, origin), ActorTable(log, STRICT, origin)
     at_steps, _ = find_contacts(ego, table, log.ego.t_us)
     _, ours_ms = _timed(ours, repeats)
@@ -176,9 +177,9 @@ def _contact_row(world: tuple[RolloutLog, Scene], n_actors: int, n_steps: int, r
         per_ms,
         per_ms / ours_ms,
         len(exact),
-        twin_ms,
+        reference_ms,
         _differing(mine, per_sides),
-        _differing(mine[::every], [one.sides for one in exact]) if twin else None,
+        _differing(mine[::every], [one.sides for one in exact]) if reference else None,
         float(max(errors)),
         None,
         swept_ms,
@@ -225,7 +226,7 @@ def _dense(line: F64) -> F64:
     return np.stack([np.interp(at, s, line[:, d]) for d in range(3)], axis=1)
 
 
-def _road_row(world: tuple[RolloutLog, Scene], n_steps: int, repeats: int, twin: bool) -> BenchRow:
+def _road_row(world: tuple[RolloutLog, Scene], n_steps: int, repeats: int, reference: bool) -> BenchRow:
     log, scene = world
     origin = origin_of(scene.ego_log, PAPER)
     xyz = log.ego.xyz - origin
@@ -237,7 +238,7 @@ def _road_row(world: tuple[RolloutLog, Scene], n_steps: int, repeats: int, twin:
     road = Road(scene.lane_map, origin, PAPER)
     _, again_ms = _timed(lambda: containment(road, ego_footprints(log, PAPER, origin).shapes(), xyz), repeats + 1)
     (per_held, per_gap), per_ms = _timed(lambda: on_road_per_step(log, scene, PAPER), 1)
-    exact, twin_ms = _timed(lambda: road_by_step(log, scene, PAPER), 1) if twin else ([], None)
+    exact, reference_ms = _timed(lambda: road_by_step(log, scene, PAPER), 1) if reference else ([], None)
     _, score_ms = _timed(lambda: score(log, scene, PAPER), repeats)
     mine = held.in_one | held.in_union
     gaps = [
@@ -253,9 +254,9 @@ def _road_row(world: tuple[RolloutLog, Scene], n_steps: int, repeats: int, twin:
         per_ms,
         per_ms / ours_ms,
         len(exact),
-        twin_ms,
+        reference_ms,
         int(np.sum(mine != np.array(per_held))),
-        int(np.sum(mine != np.array([one.on_road for one in exact]))) if twin else None,
+        int(np.sum(mine != np.array([one.on_road for one in exact]))) if reference else None,
         float(max(gaps)),
         again_ms,
         None,
@@ -264,10 +265,10 @@ def _road_row(world: tuple[RolloutLog, Scene], n_steps: int, repeats: int, twin:
 
 
 def _timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float]:
-    """Return the answer and the least time in milliseconds."""
-    times, answer = [], None
+    """Return the result and the least time in milliseconds."""
+    times, result = [], None
     for _ in range(repeats):
         began = time.process_time()
-        answer = call()
+        result = call()
         times.append(time.process_time() - began)
-    return answer, min(times) * 1e3
+    return result, min(times) * 1e3

@@ -21,19 +21,21 @@ def evaluators(
     actors: Annotated[str, typer.Option("--actors", help="Numbers of other road users, comma-separated.")] = "10,40,200",
     steps: Annotated[str, typer.Option("--steps", help="Numbers of logged steps, comma-separated.")] = "200,900",
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="Runs of ours per row; the least is printed.")] = 5,
-    twin: Annotated[bool, typer.Option("--twin/--no-twin", help="Also run the exact twin, which takes most of the time.")] = True,
+    reference: Annotated[
+        bool, typer.Option("--reference/--no-reference", help="Also run the exact reference, which takes most of the time.")
+    ] = True,
     rollouts: Annotated[int, typer.Option("--rollouts", min=0, help="Rows of the table to aggregate; 0 leaves it out.")] = 100_000,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Scenes in that table.")] = 1_000,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print a Markdown table.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Time contact and lane keeping against a search step by step and the exact twin, and count disagreements; time a large table.
+    """Time contact and lane keeping against a search step by step and the exact reference, and count disagreements; time a large table.
 
-    Times are CPU times. "twin steps" is how many of the steps the exact twin looked at, "twin ms" its time for these.
+    Times are CPU times. "reference steps" is how many of the steps the exact reference looked at, "reference ms" its time for these.
     """
     del debug
-    rows = bench_evaluators(_counts("--actors", actors), _counts("--steps", steps), repeats, twin)
+    rows = bench_evaluators(_counts("--actors", actors), _counts("--steps", steps), repeats, reference)
     tables = [bench_table(rollouts, scenes)] if rollouts else []
     if as_json:
         print(json.dumps({"evaluators": [asdict(row) for row in rows], "aggregate": [asdict(row) for row in tables]}))
@@ -52,10 +54,10 @@ HEADS = (
         "ours ms",
         "per step ms",
         "ratio",
-        "twin steps",
-        "twin ms",
+        "reference steps",
+        "reference ms",
         "differ: per step",
-        "differ: twin",
+        "differ: reference",
         "gap error m",
     ),
     *("same scene again ms", "between steps ms", "score ms"),

@@ -10,9 +10,8 @@ from itertools import islice
 
 import numpy as np
 
+from alpasim_plugin.image_metrics import decibels
 from alpasim_plugin.types import U8, Fixer, Frame
-
-FULL_SCALE = 255.0  # grey levels
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,8 @@ class Difference:
 
     @property
     def psnr_db(self) -> float:
-        """Peak signal to noise ratio of all values together; infinite for equal streams."""
-        return float("inf") if self.squared == 0 else 10 * float(np.log10(FULL_SCALE**2 * self.values / self.squared))
+        """Peak signal-to-noise ratio of all values together; infinite for equal streams."""
+        return float("inf") if self.squared == 0 else decibels(self.squared / self.values)
 
 
 @dataclass

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from alpasim_plugin.atomic import write_array
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.image_metrics import psnr_db
 from alpasim_plugin.nets.clips import GROUP, SIDE
 from alpasim_plugin.nets.dit import CosmosCausalDiT
 from alpasim_plugin.nets.tiny_vae import TinyVAE
@@ -161,8 +162,8 @@ class PainterTask:
             distance = self.distance[1](frames_of(made[:, :, frames]), frames_of(batch.clean[:, :, frames])).mean()
             parts["perceptual"] = self.recipe.perceptual_weight * distance
         numbers = {name: float(value.detach()) for name, value in parts.items()}
-        numbers["psnr_db"] = psnr_db(made.detach(), batch.clean)
-        numbers["render_psnr_db"] = psnr_db(batch.render, batch.clean)
+        decoded, render, clean = (x.detach().clamp(-1, 1).cpu().numpy() for x in (made, batch.render, batch.clean))
+        numbers["psnr_db"], numbers["render_psnr_db"] = psnr_db(decoded, clean, peak=2.0), psnr_db(render, clean, peak=2.0)
         return torch.stack(list(parts.values())).sum(), numbers
 
     def _crop(self, rng: np.random.Generator) -> tuple[Tensor, ...]:
@@ -176,12 +177,6 @@ class PainterTask:
         render, opacity = clip.frames(end)
         videos = [x[:, :, pixels[0], pixels[1]] for x in (render, opacity, clip.clean(end))]
         return (z[:, :, rows, columns], *videos)
-
-
-def psnr_db(made: Tensor, wanted: Tensor) -> float:
-    """Return the peak signal-to-noise ratio of frames in [-1, 1], made ones cut to that range, in decibels."""
-    error = (made.clamp(-1, 1) - wanted).double().square().mean() / 4
-    return float(-10 * torch.log10(error.clamp_min(1e-12)))
 
 
 def _digest(weights: Mapping[str, Tensor], clips: LatentClips, deployed: str) -> str:

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.atomic import write_text
+from alpasim_plugin.image_metrics import psnr_db, ssim
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.types import F64, U8
+from alpasim_plugin.types import U8
 
 EVERY = 5  # frames are measured this far apart: neighbours hardly differ
 PSNR_EDGES_DB = (0, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 100)
 HOLE_BELOW = 128  # of 255: more of such a pixel is missing than shown
-SSIM_SIGMA_PX, SSIM_K = 1.5, (0.01, 0.03)  # Wang et al. 2004
 ROWS, THUMB_WIDTH = 24, 192
 
 
@@ -32,7 +32,7 @@ class SequenceFacts:
         frames: Frames that every channel has.
         moving_actors: How many actors drive or walk; None where that is unknown.
         psnr_db: Of rgb_input against rgb_gt, every measured frame.
-        ssim: Structural similarity of their grey values.
+        ssim: Structural similarity (`alpasim_plugin.image_metrics.ssim`).
         hole_share: Share of pixels that the reconstruction shows less than half of.
         luminance: Mean of rgb_gt, 0..1.
         map_share: Share of pixels on which the semantic map draws anything.
@@ -66,31 +66,12 @@ def measure_sequence(sequence: PairSequence, split: str) -> SequenceFacts:
         len(clip),
         info.get("moving_actors"),
         tuple(psnr_db(clip.rgb_input[i], clip.rgb_gt[i]) for i in index),
-        _mean([ssim_grey(clip.rgb_input[i], clip.rgb_gt[i]) for i in index]),
+        _mean([ssim(clip.rgb_input[i], clip.rgb_gt[i]) for i in index]),
         _mean([float(np.mean(clip.opacity[i] < HOLE_BELOW)) for i in index]),
         _mean([float(np.mean(clip.rgb_gt[i])) / 255 for i in index]),
         _mean([float(np.mean(clip.sdmap[i].max(axis=-1) > 0)) for i in index]),
         float(np.linalg.norm(np.diff(clip.T_world_camera[:, :3, 3], axis=0), axis=1).sum()),
     )
-
-
-def psnr_db(a: U8, b: U8) -> float:
-    """Return the peak signal-to-noise ratio of two pictures, dB; 100 where they are equal."""
-    mse = float(np.mean((a.astype(np.float32) - b) ** 2))
-    return 100.0 if mse == 0 else min(100.0, float(10 * np.log10(255.0**2 / mse)))
-
-
-def ssim_grey(a: U8, b: U8) -> float:
-    """Return the mean structural similarity of two pictures' grey values (Wang et al. 2004), Gaussian window of 1.5 pixels."""
-    x, y = (cv2.cvtColor(np.ascontiguousarray(p), cv2.COLOR_RGB2GRAY).astype(np.float64) for p in (a, b))
-
-    def smooth(image: F64) -> F64:
-        return np.asarray(cv2.GaussianBlur(image, (11, 11), SSIM_SIGMA_PX))
-
-    mx, my = smooth(x), smooth(y)
-    c1, c2 = ((k * 255) ** 2 for k in SSIM_K)
-    vx, vy, cov = smooth(x * x) - mx * mx, smooth(y * y) - my * my, smooth(x * y) - mx * my
-    return float(np.mean((2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))))
 
 
 def sheet(facts: Sequence[SequenceFacts]) -> dict[str, Any]:

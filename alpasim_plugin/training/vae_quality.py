@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.image_metrics import CAP_DB, decibels
 from alpasim_plugin.nets.clips import crop_clip, pad_clip
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 
@@ -40,6 +41,6 @@ def quality(made: Tensor, wanted: Tensor) -> VaeQuality:
     a, b = (np.rint((x.numpy().astype(np.float64) + 1) * 127.5).clip(0, 255) for x in (made, wanted))
     error = a - b
     mse = (error**2).mean(axis=(0, 1, 3, 4))
-    psnr = 10 * np.log10(255.0**2 / np.maximum(mse, 1e-10))
+    psnr = np.array([min(CAP_DB, decibels(max(float(m), 1e-10))) for m in mse])
     change = np.diff(error, axis=2)
     return VaeQuality(float(psnr.mean()), float(np.sqrt((change**2).mean())), float(np.sqrt((np.diff(b, axis=2) ** 2).mean())))

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.gaussians.scene.degrade import log_actors
+from alpasim_plugin.image_metrics import psnr_db, ssim
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.training.pair_sheet import HOLE_BELOW, psnr_db, ssim_grey
+from alpasim_plugin.training.pair_sheet import HOLE_BELOW
 from alpasim_plugin.training.pairs import beside_log
 from alpasim_plugin.types import F64, U8, Degradation, Frame, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
@@ -80,7 +81,7 @@ def measure(bad: Renderer, clean: Renderer, scenario: Scenario, left_m: float) -
         assert a.alpha is not None
         rows.append(
             [
-                psnr_db(a.rgb, b.rgb), ssim_grey(a.rgb, b.rgb), _detail(a.rgb) / _detail(b.rgb), *_spectrum(error),
+                psnr_db(a.rgb, b.rgb), ssim(a.rgb, b.rgb), _detail(a.rgb) / _detail(b.rgb), *_spectrum(error),
                 float(np.mean(a.alpha < HOLE_BELOW / 255)), float(np.mean(np.abs(later[0] - later[1] - error))),
             ]
         )  # fmt: skip

@@ -1,8 +1,7 @@
 """Quality of video against the frames that there were to see: per frame, per clip, and over clips."""
 
 from evaluators.video.clip import ClipQuality, clip_quality
-from evaluators.video.psnr import psnr_db
-from evaluators.video.ssim import ssim
+from evaluators.video.frames import psnr_db, ssim
 from evaluators.video.summary import summarise
 from evaluators.video.warp import late_window, warp_l1
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 from alpasim_plugin.types import F64, U8
 from evaluators.video.facts import DRIFT, PSNR, SSIM, WARP, WARP_LATE
+from evaluators.video.frames import identical_frames, psnr_db, ssim
 from evaluators.video.perceptual import PictureDistance, picture_distances
-from evaluators.video.psnr import identical_frames, psnr_db
-from evaluators.video.ssim import ssim
 from evaluators.video.warp import late_window, warp_l1
 
 SETTLED = slice(50, 100)  # frames that the end of a long clip is held against

@@ -1,11 +1,38 @@
-"""What the metrics here take: two stacks of frames of one size."""
+"""PSNR and SSIM of every frame of two stacks of one size."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin import image_metrics
 from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.types import U8
+from alpasim_plugin.types import F64, U8
+
+
+def psnr_db(made: U8, truth: U8) -> F64:
+    """Return the PSNR of every frame ``(T,)``, dB, at most 100; stacks ``(T, H, W, 3)``.
+
+    Raises:
+        EvaluatorError: Stacks that do not belong together.
+    """
+    check_stacks("computing PSNR", made, truth)
+    return np.array([image_metrics.psnr_db(a, b) for a, b in zip(made, truth, strict=True)])
+
+
+def ssim(made: U8, truth: U8) -> F64:
+    """Return the mean structural similarity of every frame ``(T,)``, 1 for equal ones; stacks ``(T, H, W, 3)``.
+
+    Raises:
+        EvaluatorError: Stacks that do not belong together.
+    """
+    check_stacks("computing SSIM", made, truth)
+    return np.array([image_metrics.ssim(a, b) for a, b in zip(made, truth, strict=True)])
+
+
+def identical_frames(made: U8, truth: U8) -> int:
+    """Return how many frames are equal in every value; their PSNR is the cap, which a mean should not hide."""
+    check_stacks("counting identical frames", made, truth)
+    return int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
 
 
 def check_stacks(doing: str, made: U8, truth: U8) -> None:

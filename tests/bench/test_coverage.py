@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from alpasim_plugin.bench.coverage import (
+from alpasim_plugin.bench.coverage import write_into
+from alpasim_plugin.bench.interval_study import (
     CORRELATIONS,
     RATES,
     Design,
@@ -19,7 +20,6 @@ from alpasim_plugin.bench.coverage import (
     pairs,
     power_of,
 )
-from alpasim_plugin.bench.coverage_tables import write_into
 from alpasim_plugin.errors import InputError
 from evaluators.aggregate.power import more_scenes, scenes_needed, scenes_without_event
 

@@ -15,12 +15,12 @@ from evaluators.presets import PRESETS
 
 def test_all_three_ways_agree_on_a_small_world_with_contacts_and_departures():
     contact, road = bench_evaluators(actors=(16,), steps=(50,), repeats=1)
-    assert (contact.part, contact.actors, contact.steps, contact.twin_steps) == ("contact", 16, 50, 50)
+    assert (contact.part, contact.actors, contact.steps, contact.reference_steps) == ("contact", 16, 50, 50)
     assert contact.hits > 0
-    assert (contact.differ_per_step, contact.differ_twin) == (0, 0)
+    assert (contact.differ_per_step, contact.differ_reference) == (0, 0)
     assert contact.gap_error_m < 1e-12
     assert contact.ratio > 5
-    assert (road.part, road.differ_per_step, road.differ_twin) == ("road", 0, 0)
+    assert (road.part, road.differ_per_step, road.differ_reference) == ("road", 0, 0)
     assert 0 < road.hits < 50
     assert road.gap_error_m < 1e-9
 
@@ -31,10 +31,10 @@ def test_a_wrong_answer_is_counted(monkeypatch):
         return [{**one, "a0": "rear"} for one in sides], gap_m + 1e-3
 
     monkeypatch.setattr(bench, "contacts_per_step", shifted)
-    row = bench_evaluators(actors=(2,), steps=(20,), repeats=1, twin=False)[0]
+    row = bench_evaluators(actors=(2,), steps=(20,), repeats=1, reference=False)[0]
     assert row.differ_per_step >= 19
     assert np.isclose(row.gap_error_m, 1e-3)
-    assert row.differ_twin is None
+    assert row.differ_reference is None
 
 
 def test_the_search_step_by_step_sees_what_touches():

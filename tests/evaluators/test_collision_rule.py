@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alpasim_plugin.bench.evaluators_reference import contacts_by_step
 from alpasim_plugin.types import Box
 from evaluators import PRESETS, score
 from evaluators.footprint import ActorTable, corners, ego_footprints, origin_of
-from evaluators.reference import contacts_by_step
 from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 

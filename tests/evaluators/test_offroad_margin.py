@@ -15,9 +15,9 @@ from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import Lane, LaneMap
 from evaluators import PRESETS, reduce_rollout, score, surface
 from evaluators.footprint import corners
-from evaluators.reference_strict import depth_by_points
 from evaluators.surface import MARGIN_M, Region, Surface, closed_union
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
+from tests.evaluators.reference_strict import depth_by_points
 
 STRICT = PRESETS["strict"]
 HALF_L, HALF_W = 4.855 / 2, 1.88 / 2

@@ -12,8 +12,8 @@ from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.geometry import inverse, offset_trajectory
 from alpasim_plugin.types import LoggedImage, LoggedPlan, Trajectory
 from evaluators import PRESETS, rollout_values, score
-from evaluators.reference import open_loop_by_plan
 from tests.evaluators.eval_build import DT_US, T_RIG_BOX, TWO_LANES, by_name, car, rollout, scene, track
+from tests.evaluators.reference import open_loop_by_plan
 
 
 def plan(now: int, x, y=0.0, samples=(), dt_us=DT_US) -> LoggedPlan:

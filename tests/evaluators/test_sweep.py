@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluators.reference_strict import Motion, first_touch, separation
 from evaluators.sweep import TOUCH_M, Motions, first_contact, gaps, slope
+from tests.evaluators.reference_strict import Motion, first_touch, separation
 
 EGO = (4.855, 1.88)
 CAR = (4.5, 1.8)

@@ -23,12 +23,12 @@ from alpasim_plugin.gaussians.fit.model import Motion, SplatModel
 from alpasim_plugin.gaussians.fit.panorama import sky_of
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
-from alpasim_plugin.gaussians.fit.ssim_cpu import SsimTruth
+from alpasim_plugin.gaussians.fit.similarity import SsimTarget
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.image_metrics import psnr_db
 from alpasim_plugin.seeding import stream
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
@@ -92,7 +92,7 @@ class _Target:
     sky: Tensor | None  # (H, W) 0 or 1
     counts: Tensor | None  # (H, W, 1) bool
     motion: Motion
-    ssim: SsimTruth | None  # on the CPU
+    ssim: SsimTarget
 
 
 class SplatFit:
@@ -144,7 +144,8 @@ class SplatFit:
         self.adam.update(self.model.params, self._rates())
         self.step += 1
         self._control_density()
-        return {"loss": float(loss.detach()), "psnr_db": psnr_db(rgb.clamp(0, 1), target.rgb), "gaussians": len(self.model)}
+        psnr = psnr_db(rgb.detach().clamp(0, 1).cpu().numpy(), target.rgb.cpu().numpy(), peak=1.0)
+        return {"loss": float(loss.detach()), "psnr_db": psnr, "gaussians": len(self.model)}
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
@@ -195,15 +196,14 @@ def _target(view: PosedView, model: SplatModel, sky: Sky | None, device: str) ->
         None if view.sky is None else torch.as_tensor(view.sky.astype(np.float32), device=device),
         None if view.mask is None else torch.as_tensor(view.mask, device=device)[..., None],
         model.motion(view.actors),
-        SsimTruth(rgb) if rgb.device.type == "cpu" else None,
+        SsimTarget(rgb),
     )
 
 
 def _loss(rgb: Tensor, alpha: Tensor, target: _Target, recipe: SplatRecipe) -> Tensor:
     """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, Eq. 7), and the opacity that stands before the sky."""
     w = recipe.ssim_weight
-    similarity = ssim(rgb, target.rgb) if target.ssim is None else target.ssim.similarity(rgb)
-    loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - similarity)
+    loss = (1 - w) * (rgb - target.rgb).abs().mean() + w * (1 - target.ssim.ssim(rgb))
     return loss if target.sky is None else loss + recipe.sky_weight * (alpha * target.sky).mean()
 
 

@@ -10,12 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.image_metrics import psnr_db, ssim
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +67,5 @@ def _compare(model: SceneGraph, view: PosedView, threads: int | None) -> Compari
     known = {name: T for name, T in view.actors.items() if name in model.actors}
     shown = model.render(view.camera, known, threads).to_uint8()
     counted = shown if view.mask is None else np.where(view.mask[..., None], shown, view.rgb)
-    a, b = (torch.as_tensor(image.astype(np.float32) / 255) for image in (counted, view.rgb))
     share = 1.0 if view.mask is None else max(float(view.mask.mean()), 1e-9)
-    return Comparison(view.name, shown, view.rgb, psnr_db(a, b) + 10 * float(np.log10(share)), float(ssim(a, b)))
+    return Comparison(view.name, shown, view.rgb, psnr_db(counted, view.rgb) + 10 * float(np.log10(share)), ssim(counted, view.rgb))

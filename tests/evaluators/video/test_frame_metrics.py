@@ -1,4 +1,4 @@
-"""PSNR and SSIM of frames against slow float64 twins, and at their edges."""
+"""PSNR and SSIM of frames against slow float64 reference implementations, and at their edges."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.signal import convolve2d
 
+from alpasim_plugin import image_metrics
 from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.image_metrics import CAP_DB
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import U8
-from evaluators.video.psnr import CAP_DB, identical_frames, psnr_db
-from evaluators.video.ssim import ssim
+from evaluators.video.frames import identical_frames, psnr_db, ssim
 
 RNG = stream("video", 0, "frames")
 TRUTH: U8 = RNG.integers(0, 256, (3, 20, 27, 3)).astype(np.uint8)
@@ -77,3 +78,21 @@ def test_one_wrong_value_in_a_large_frame_stays_below_the_cap() -> None:
 def test_videos_that_do_not_belong_together_are_refused(metric, made, words) -> None:
     with pytest.raises(EvaluatorError, match=words):
         metric(made, TRUTH)
+
+
+def test_equal_images_have_ssim_one_and_noise_lowers_it() -> None:
+    a = RNG.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    assert image_metrics.ssim(a, a) == pytest.approx(1.0)
+    near, far = ((a.astype(int) + RNG.integers(-n, n + 1, a.shape)).clip(0, 255).astype(np.uint8) for n in (10, 90))
+    assert 1 > image_metrics.ssim(a, near) > image_metrics.ssim(a, far) > 0
+
+
+@pytest.mark.parametrize(("low", "peak"), [(0, 255.0), (0, 1.0), (-1, 2.0)])
+def test_the_range_of_values_does_not_change_psnr(low: int, peak: float) -> None:
+    a = np.full((2, 2, 3), low, np.float32)
+    assert image_metrics.psnr_db(a, a + np.float32(peak / 255), peak) == pytest.approx(20 * np.log10(255), abs=1e-4)
+
+
+def test_ssim_of_floats_equals_that_of_their_eight_bits() -> None:
+    a, b = TRUTH[0], TRUTH[1]
+    assert image_metrics.ssim(a / np.float32(255), b / np.float32(255), peak=1.0) == pytest.approx(image_metrics.ssim(a, b), abs=1e-6)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import conv2d
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud
@@ -15,10 +16,10 @@ from alpasim_plugin.gaussians.fit.adam import RowAdam
 from alpasim_plugin.gaussians.fit.density import ScreenGradients, densify, reset_opacities
 from alpasim_plugin.gaussians.fit.model import SplatModel
 from alpasim_plugin.gaussians.fit.panorama import sky_of
-from alpasim_plugin.gaussians.fit.similarity import psnr_db, ssim
-from alpasim_plugin.gaussians.fit.ssim_cpu import SsimTruth
+from alpasim_plugin.gaussians.fit.similarity import SsimTarget
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.sh import dc_from_rgb
+from alpasim_plugin.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_db, ssim
 from alpasim_plugin.seeding import stream
 from tests.gaussians.fit.conftest import BOX, FAR, HEIGHT, WIDTH, Posed, actor_pose
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
@@ -37,21 +38,46 @@ def model_of(cloud: GaussianCloud, actors: dict[str, GaussianCloud] | None = Non
 # --- loss -----------------------------------------------------------------------------------------------------------
 
 
+def plain_ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return the mean structural similarity of images ``(H, W, 3)`` through convolutions that autograd can follow."""
+    x = torch.arange(WINDOW_PX, dtype=torch.float64) - WINDOW_PX // 2
+    weight = torch.exp(-(x**2) / (2 * SIGMA_PX**2))
+    kernel = (weight / weight.sum()).to(a.dtype)[None, None, None, :]
+    p, q = a.permute(2, 0, 1), b.permute(2, 0, 1)
+    stack, pad = torch.cat([p, q, p * p, q * q, p * q])[:, None], WINDOW_PX // 2
+    blurred = conv2d(conv2d(stack, kernel.mT, padding=(pad, 0)), kernel, padding=(0, pad))
+    mx, my, mxx, myy, mxy = blurred[:, 0].reshape(5, 3, *a.shape[:2])
+    top = (2 * mx * my + C1) * (2 * (mxy - mx * my) + C2)
+    return (top / ((mx * mx + my * my + C1) * (mxx - mx * mx + myy - my * my + C2))).mean()
+
+
 def test_similarity_and_its_gradient_equal_the_plain_ones() -> None:
     a, b = images()
     a[3:9, 4:12] = b[3:9, 4:12] = 0.5  # flat in both: only the constants keep the quotient
     wanted, found = a.clone().requires_grad_(), a.clone().requires_grad_()
-    plain, fast = ssim(wanted, b), SsimTruth(b).similarity(found)
+    plain, fast = plain_ssim(wanted, b), SsimTarget(b).ssim(found)
     (3 * plain).backward()
     (3 * fast).backward()
     assert float(plain.detach()) == pytest.approx(float(fast.detach()), abs=1e-6)
+    assert float(fast.detach()) == pytest.approx(ssim(a.numpy(), b.numpy(), peak=1.0), abs=1e-6)
     assert float((wanted.grad - found.grad).abs().max()) < 1e-4 * float(wanted.grad.abs().max())
 
 
+@pytest.mark.gpu
+def test_similarity_on_a_gpu_equals_that_on_the_cpu() -> None:
+    a, b = images()
+    on_cpu, on_gpu = a.clone().requires_grad_(), a.cuda().requires_grad_()
+    values = [SsimTarget(b).ssim(on_cpu), SsimTarget(b.cuda()).ssim(on_gpu)]
+    for value in values:
+        value.backward()
+    assert float(values[0].detach()) == pytest.approx(float(values[1].detach()), abs=1e-6)
+    assert float((on_cpu.grad - on_gpu.grad.cpu()).abs().max()) < 1e-4 * float(on_cpu.grad.abs().max())
+
+
 def test_similarity_of_an_image_with_itself_is_one_and_psnr_is_that_of_a_known_error() -> None:
-    a, _ = images()
-    assert float(ssim(a, a)) == pytest.approx(1.0, abs=1e-6)
-    assert psnr_db(a, a + 0.1) == pytest.approx(20.0, abs=1e-4)
+    a = images()[0].numpy()
+    assert ssim(a, a, peak=1.0) == pytest.approx(1.0, abs=1e-6)
+    assert psnr_db(a, a + 0.1, peak=1.0) == pytest.approx(20.0, abs=1e-4)
 
 
 # --- optimiser ------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Slow twins of preset ``strict``: contact between steps in 40-digit decimals, and the off-road margin point by point.
+"""Reference implementations of preset ``strict``: contact between steps in 40-digit decimals, and the off-road margin point by point.
 
 Contact: the largest gap over the directions of both rectangles' sides is sampled densely in time, every dip between samples is searched
 for its bottom, and the first crossing is halved down. Margin: distances to every lane for points of the footprint, no union, no index.
@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from alpasim_plugin.bench.evaluators_reference import point_to_segment
 from alpasim_plugin.types import F64
-from evaluators.reference import point_to_segment
 
 _C = Context(prec=40)
 _TWO_PI = Decimal("6.283185307179586476925286766559005768394338798750")

@@ -1,7 +1,7 @@
-"""Slow, readable twins of the array evaluators: one step at a time, no filters, no caches. Tests hold the two together.
+"""Reference implementations of contact and lane keeping, one step at a time, without filters or an index.
 
-Contact and single-lane containment are decided in exact rational arithmetic on the very corners that the fast path uses, so at touching
-edges and corners the twins must agree without any tolerance. Distances and unions are floating point here as well.
+Contact is decided in exact rational arithmetic on the very corners that the array evaluators use, so at touching edges and corners both
+must agree without any tolerance. Distances and unions are floating point here as well.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, Actor, Lane, RolloutLog, Scene
 from evaluators.footprint import corners, origin_of
-from evaluators.presets import PRESETS, Preset
-from evaluators.route import recorded_path
+from evaluators.presets import Preset
 
 Point = tuple[Fraction, Fraction]
 
@@ -81,9 +80,9 @@ def _corners(xyz: F64, quat: F64, size: F64, origin: F64) -> F64:
 
 def touch(a: F64, b: F64) -> bool:
     """Return whether two convex shapes (or a segment and one) share a point: no edge direction of either separates them. Exact."""
-    shapes = [_exact(a), _exact(b)]
+    shapes = [exact(a), exact(b)]
     for shape in shapes:
-        for p, q in _sides(shape):
+        for p, q in sides_of(shape):
             normal = (p[1] - q[1], q[0] - p[0])
             spans = [[normal[0] * x + normal[1] * y for x, y in other] for other in shapes]
             if max(spans[0]) < min(spans[1]) or max(spans[1]) < min(spans[0]):
@@ -110,11 +109,13 @@ def point_to_segment(p: Sequence[float], a: Sequence[float], b: Sequence[float])
     return math.sqrt(sum((o - f * d) ** 2 for d, o in zip(along, offset, strict=True))), f
 
 
-def _exact(shape: F64) -> list[Point]:
+def exact(shape: F64) -> list[Point]:
+    """Return the points ``(N, 2)`` as fractions."""
     return [(Fraction(x), Fraction(y)) for x, y in shape.tolist()]
 
 
-def _sides(shape: list[Point]) -> list[tuple[Point, Point]]:
+def sides_of(shape: list[Point]) -> list[tuple[Point, Point]]:
+    """Return the sides of a closed ring, or the one segment of two points."""
     return [(shape[0], shape[1])] if len(shape) == 2 else [(shape[i], shape[(i + 1) % len(shape)]) for i in range(len(shape))]
 
 
@@ -176,77 +177,3 @@ def _touches(edge: F64, body: Any, z: float, preset: Preset) -> bool:
         if abs((a[2] + b[2]) / 2 - z) <= preset.edge_height_m and shapely.LineString([a[:2], b[:2]]).distance(body) < preset.edge_touch_m:
             return True
     return False
-
-
-def convex_contains(ring: F64, body: F64) -> bool:
-    """Return whether a convex ring ``(N, 2)`` in either order contains a body's corners, its border included. Exact."""
-    exact_ring = _exact(ring)
-    for x, y in _exact(body):
-        turns = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in _sides(exact_ring)]
-        if not (all(turn >= 0 for turn in turns) or all(turn <= 0 for turn in turns)):
-            return False
-    return True
-
-
-# --- recorded path ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class StepRoute:
-    """Where one step stands against the recording."""
-
-    distance_m: float
-    away_m: float  # from the recorded position at the same time
-    progress: float
-    progress_rel: float
-
-
-def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
-    """Project every step on the recorded path, segment by segment; the recording must cover all steps and have a length."""
-    recorded = recorded_path(rollout, PRESETS["paper"])
-    path = recorded.xyz[:, :2]
-    there = interpolate(recorded, rollout.ego.t_us)[:, :2, 3]
-    out = []
-    for i in range(len(rollout.ego)):
-        point = rollout.ego.xyz[i, :2]
-        distance_m, s, length = _along(path, point)
-        _, s_rel, length_rel = _along(there[: i + 1], point)
-        rel = s_rel / length_rel if length_rel > 0 else 1.0
-        out.append(StepRoute(distance_m, float(np.linalg.norm(point - there[i])), s / length, rel))
-    return out
-
-
-def _along(path: F64, point: F64) -> tuple[float, float, float]:
-    """Return (distance, arc length of the first nearest point, total length)."""
-    best, best_s, s = math.inf, 0.0, 0.0
-    if len(path) == 1:
-        return float(np.linalg.norm(point - path[0])), 0.0, 0.0
-    for a, b in pairwise(path.tolist()):
-        length = math.dist(a, b)
-        distance, f = point_to_segment(point.tolist(), a, b)
-        if distance < best:
-            best, best_s = distance, s + f * length
-        s += length
-    return best, best_s, s
-
-
-# --- plans ------------------------------------------------------------------------------------------------------------
-
-
-def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
-    """Return for each plan with poses whether any of them within the horizon touches an actor; sharp-cornered footprints only."""
-    origin = origin_of(rollout.ego_log, preset)
-    size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (1.0 - preset.shrink)
-    out = []
-    for plan in rollout.plans:
-        hit = False
-        for t_us in plan.trajectory.t_us.tolist():
-            if not plan.now_us < t_us <= plan.now_us + preset.open_loop_horizon_us:
-                continue
-            pose = interpolate(plan.trajectory, t_us) @ rollout.T_rig_box
-            ego = corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0]
-            boxes = [actor_corners(actor, t_us, preset, origin) for actor in rollout.actors.values()]
-            hit = hit or any(box is not None and touch(ego, box) for box in boxes)
-        if len(plan.trajectory):
-            out.append(hit)
-    return out

@@ -1,0 +1,90 @@
+"""Reference implementations that tests hold the route, plan and lane evaluators to: one step at a time, no filters, no caches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from alpasim_plugin.bench.evaluators_reference import actor_corners, exact, point_to_segment, sides_of, touch
+from alpasim_plugin.geometry import interpolate, yaw_of
+from alpasim_plugin.types import F64, RolloutLog
+from evaluators.footprint import corners, origin_of
+from evaluators.presets import PRESETS, Preset
+from evaluators.route import recorded_path
+
+
+def convex_contains(ring: F64, body: F64) -> bool:
+    """Return whether a convex ring ``(N, 2)`` in either order contains a body's corners, its border included. Exact."""
+    exact_ring = exact(ring)
+    for x, y in exact(body):
+        turns = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in sides_of(exact_ring)]
+        if not (all(turn >= 0 for turn in turns) or all(turn <= 0 for turn in turns)):
+            return False
+    return True
+
+
+# --- recorded path ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StepRoute:
+    """Where one step stands against the recording."""
+
+    distance_m: float
+    away_m: float  # from the recorded position at the same time
+    progress: float
+    progress_rel: float
+
+
+def route_by_step(rollout: RolloutLog) -> list[StepRoute]:
+    """Project every step on the recorded path, segment by segment; the recording must cover all steps and have a length."""
+    recorded = recorded_path(rollout, PRESETS["paper"])
+    path = recorded.xyz[:, :2]
+    there = interpolate(recorded, rollout.ego.t_us)[:, :2, 3]
+    out = []
+    for i in range(len(rollout.ego)):
+        point = rollout.ego.xyz[i, :2]
+        distance_m, s, length = _along(path, point)
+        _, s_rel, length_rel = _along(there[: i + 1], point)
+        rel = s_rel / length_rel if length_rel > 0 else 1.0
+        out.append(StepRoute(distance_m, float(np.linalg.norm(point - there[i])), s / length, rel))
+    return out
+
+
+def _along(path: F64, point: F64) -> tuple[float, float, float]:
+    """Return (distance, arc length of the first nearest point, total length)."""
+    best, best_s, s = math.inf, 0.0, 0.0
+    if len(path) == 1:
+        return float(np.linalg.norm(point - path[0])), 0.0, 0.0
+    for a, b in pairwise(path.tolist()):
+        length = math.dist(a, b)
+        distance, f = point_to_segment(point.tolist(), a, b)
+        if distance < best:
+            best, best_s = distance, s + f * length
+        s += length
+    return best, best_s, s
+
+
+# --- plans ------------------------------------------------------------------------------------------------------------
+
+
+def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
+    """Return for each plan with poses whether any of them within the horizon touches an actor; sharp-cornered footprints only."""
+    origin = origin_of(rollout.ego_log, preset)
+    size = np.array(preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)) * (1.0 - preset.shrink)
+    out = []
+    for plan in rollout.plans:
+        hit = False
+        for t_us in plan.trajectory.t_us.tolist():
+            if not plan.now_us < t_us <= plan.now_us + preset.open_loop_horizon_us:
+                continue
+            pose = interpolate(plan.trajectory, t_us) @ rollout.T_rig_box
+            ego = corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0]
+            boxes = [actor_corners(actor, t_us, preset, origin) for actor in rollout.actors.values()]
+            hit = hit or any(box is not None and touch(ego, box) for box in boxes)
+        if len(plan.trajectory):
+            out.append(hit)
+    return out
