@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 REPO = Path(__file__).resolve().parents[1]
 
@@ -49,13 +49,30 @@ MAY_IMPORT: dict[str, set[str]] = {
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs")
 
 
-def modules() -> list[Path]:
-    return [p for package in PACKAGES for p in sorted((REPO / package).rglob("*.py")) if not p.name.endswith("_pb2.py")]
+@dataclass(frozen=True)
+class Module:
+    """One source file, read and parsed once for all rules."""
+
+    path: Path
+    name: str
+    lines: int
+    nodes: tuple[ast.AST, ...]
+    top: tuple[ast.stmt, ...]
 
 
 def name_of(path: Path) -> str:
     parts = list(path.relative_to(REPO).with_suffix("").parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def modules() -> tuple[Module, ...]:
+    found = []
+    for path in (p for package in PACKAGES for p in sorted((REPO / package).rglob("*.py")) if not p.name.endswith("_pb2.py")):
+        text = path.read_text()
+        tree = ast.parse(text)
+        found.append(Module(path, name_of(path), len(text.splitlines()), tuple(ast.walk(tree)), tuple(tree.body)))
+    return tuple(found)
 
 
 def stage_of(module: str) -> str | None:
@@ -64,9 +81,9 @@ def stage_of(module: str) -> str | None:
     return max(inside, key=len) if inside else None
 
 
-def imports_of(path: Path) -> set[str]:
+def imported(nodes: tuple[ast.AST, ...]) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
@@ -74,40 +91,50 @@ def imports_of(path: Path) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("path", modules(), ids=name_of)
-def test_module_imports_only_what_lies_upstream(path: Path) -> None:
-    module = name_of(path)
-    if module.startswith(("alpasim_plugin.cli", "alpasim_plugin.bench")) or module == "alpasim_plugin":
-        return  # the command line, the benches and the package's face may import everything
-    stage = stage_of(module)
-    for name in sorted(imports_of(path)):
-        if name.split(".")[0] not in PACKAGES:
-            continue
-        assert not name.startswith(("alpasim_plugin.cli", "alpasim_plugin.bench")), f"{module} imports the command line or a bench"
+def imports_against_the_stream(module: Module) -> list[str]:
+    """Return a line for every import of this module that its stage may not make."""
+    if module.name.startswith(("alpasim_plugin.cli", "alpasim_plugin.bench")) or module.name == "alpasim_plugin":
+        return []  # the command line, the benches and the package's face may import everything
+    stage = stage_of(module.name)
+    wrong = []
+    for name in sorted(n for n in imported(module.nodes) if n.split(".")[0] in PACKAGES):
         target = stage_of(name)
-        if target is None or target == stage:
+        if name.startswith(("alpasim_plugin.cli", "alpasim_plugin.bench")):
+            wrong.append(f"{module.name} imports the command line or a bench: {name}")
+        elif target is None or target == stage:
             continue
-        assert stage is not None, f"shared module {module} imports stage {target}"
-        assert target in MAY_IMPORT[stage], f"{module} ({stage}) imports {name} ({target})"
+        elif stage is None:
+            wrong.append(f"shared module {module.name} imports stage {target}")
+        elif target not in MAY_IMPORT[stage]:
+            wrong.append(f"{module.name} ({stage}) imports {name} ({target})")
+    return wrong
 
 
-@pytest.mark.parametrize("path", [p for p in modules() if name_of(p).startswith("evaluators")], ids=name_of)
-def test_evaluators_do_not_load_torch(path: Path) -> None:
-    tree = ast.parse(path.read_text())
-    top = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
-    names = {a.name for n in top if isinstance(n, ast.Import) for a in n.names} | {n.module for n in top if isinstance(n, ast.ImportFrom)}
-    assert not any(name and name.split(".")[0] == "torch" for name in names)
+def test_the_rules_see_the_packages() -> None:
+    seen = {module.name for module in modules()}
+    assert {"alpasim_plugin", "alpasim_plugin.runtime.rollout", "evaluators", "policies.base", "scenarios", "configs"} <= seen
 
 
-@pytest.mark.parametrize("path", modules(), ids=name_of)
-def test_modules_stay_readable_in_one_sitting(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 400
+def test_modules_import_only_what_lies_upstream() -> None:
+    assert [line for module in modules() for line in imports_against_the_stream(module)] == []
 
 
-@pytest.mark.parametrize("path", modules(), ids=name_of)
-def test_no_global_random_generator_is_used(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random":
-            assert node.attr in {"Generator", "Philox", "SeedSequence"}, f"{path}:{node.lineno}: np.random.{node.attr}"
-        if isinstance(node, ast.Import):
-            assert all(alias.name != "random" for alias in node.names), f"{path}:{node.lineno}"
+def test_evaluators_do_not_load_torch() -> None:
+    own = [module for module in modules() if module.name.startswith("evaluators")]
+    assert [m.name for m in own if any(name.split(".")[0] == "torch" for name in imported(m.top))] == []
+
+
+def test_modules_stay_readable_in_one_sitting() -> None:
+    assert {module.name: module.lines for module in modules() if module.lines > 400} == {}
+
+
+def test_no_global_random_generator_is_used() -> None:
+    wrong = []
+    for module in modules():
+        for node in module.nodes:
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random":
+                if node.attr not in {"Generator", "Philox", "SeedSequence"}:
+                    wrong.append(f"{module.path}:{node.lineno}: np.random.{node.attr}")
+            elif isinstance(node, ast.Import) and any(alias.name == "random" for alias in node.names):
+                wrong.append(f"{module.path}:{node.lineno}: import random")
+    assert wrong == []

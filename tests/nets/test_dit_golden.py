@@ -14,6 +14,7 @@ from alpasim_plugin.nets.sampling import sample_block
 from alpasim_plugin.nets.schedule import context_level, from_names
 from tests.nets.dit_cases import furthest, stream
 
+EPSILON = torch.finfo(torch.float32).eps
 TOLERANCE = 1e-5  # ten times tighter than asked; the original itself moves by 4e-6 with another arithmetic
 
 
@@ -141,8 +142,13 @@ def test_embeddings(net, io):
 
 
 def test_time_steps_rounded_as_the_training_code_rounds_them(io):
-    assert torch.equal(sinusoid(io["in.time.t"], 64), io["out.time.sinusoid_fp32"])
-    assert torch.equal(sinusoid(io["in.time.t"], 64, torch.bfloat16), io["out.time.sinusoid_bf16_path"])
+    """Sines differ by an ulp or two between processors; a bfloat16 result moves, by one step, only where that crosses a rounding boundary."""
+    t, exact, rounded = io["in.time.t"], io["out.time.sinusoid_fp32"], io["out.time.sinusoid_bf16_path"]
+    torch.testing.assert_close(sinusoid(t, 64), exact, atol=4 * EPSILON, rtol=0)
+    found = sinusoid(t, 64, torch.bfloat16)
+    assert torch.equal(found, found.bfloat16().float())
+    torch.testing.assert_close(found, rounded, atol=4 * EPSILON, rtol=torch.finfo(torch.bfloat16).eps)
+    assert int((found != rounded).sum()) <= 2  # of 512; 22 differ where the steps themselves are not rounded
 
 
 @pytest.mark.parametrize("case", ["rollout", "rollout_nocond_bigcache"])
