@@ -36,7 +36,11 @@ def key_tables(page: str) -> str:
         title = f"`{where}`" if where else "Top level"
         summary = (model.__doc__ or "").strip().split("\n")[0]
         discriminator = "kind" if " kind: " in where else ""  # the heading says it
-        rows = [f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |" for name, f in model.model_fields.items() if name != discriminator]
+        rows = [
+            f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |"
+            for name, f in model.model_fields.items()
+            if name != discriminator
+        ]
         out.append("\n".join([f"### {title}", "", summary, "", "| key | type | default | meaning |", "|---|---|---|---|", *rows, "", ""]))
     return "".join(out)
 

@@ -57,9 +57,8 @@ def test_pages_of_the_docs_that_code_and_pages_name_exist(repo: Path, pages: lis
     code = [path for folder in folders for suffix in ("py", "yaml") for path in (repo / folder).rglob(f"*.{suffix}")]
     missing = []
     for file in [*code, *pages]:
-        for mention in MENTION.findall(file.read_text(encoding="utf-8")):
-            if not (repo / mention).is_file():
-                missing.append(f"{file.relative_to(repo)}: {mention}")
+        mentions = MENTION.findall(file.read_text(encoding="utf-8"))
+        missing += [f"{file.relative_to(repo)}: {mention}" for mention in mentions if not (repo / mention).is_file()]
     assert missing == []
 
 
