@@ -1,7 +1,8 @@
-"""The key tables of docs/scenarios.md, made from the schema. ``python -m scenarios.schema_docs docs/scenarios.md`` rewrites them."""
+"""The key tables of the scenario pages in docs/, made from the schema. ``python -m scenarios.schema_docs docs`` rewrites them."""
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -13,16 +14,33 @@ from scenarios.schema import models
 from scenarios.schema_base import Part
 
 BEGIN, END = "<!-- keys: begin -->\n", "<!-- keys: end -->"
+PAGES = {  # page -> the sections of the schema whose tables it holds, by the first part of their path; the last page holds the rest
+    "scenario-road-keys.md": ("road", "environment"),
+    "scenario-actor-keys.md": ("ego", "actors"),
+    "scenario-keys.md": (),
+}
 
 
-def key_tables() -> str:
-    """Return one Markdown table per section."""
+def page_of(where: str) -> str:
+    """Return the page that documents the section at a dotted path, such as ``road.segments[] kind: arc``."""
+    first = re.split(r"[^a-z]", where)[0]
+    return next((page for page, sections in PAGES.items() if first in sections), list(PAGES)[-1])
+
+
+def key_tables(page: str) -> str:
+    """Return one Markdown table per section of a page."""
     out = []
     for where, model in models().items():
+        if page_of(where) != page:
+            continue
         title = f"`{where}`" if where else "Top level"
         summary = (model.__doc__ or "").strip().split("\n")[0]
-        told = "kind" if " kind: " in where else ""  # the heading says it where a union is told apart by it
-        rows = [f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |" for name, f in model.model_fields.items() if name != told]
+        discriminator = "kind" if " kind: " in where else ""  # the heading says it
+        rows = [
+            f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |"
+            for name, f in model.model_fields.items()
+            if name != discriminator
+        ]
         out.append("\n".join([f"### {title}", "", summary, "", "| key | type | default | meaning |", "|---|---|---|---|", *rows, "", ""]))
     return "".join(out)
 
@@ -74,11 +92,12 @@ def _default(field: FieldInfo) -> str:
     return f"`{value}`" if value not in ("", {}) else "empty"
 
 
-def main(path: Path) -> None:
-    """Rewrite the tables between the marks in a file."""
-    text = path.read_text(encoding="utf-8")
-    head, rest = text.split(BEGIN)
-    path.write_text(head + BEGIN + key_tables() + END + rest.split(END)[1], encoding="utf-8")
+def main(folder: Path) -> None:
+    """Rewrite the tables between the marks of every page in a folder."""
+    for page in PAGES:
+        text = (folder / page).read_text(encoding="utf-8")
+        head, rest = text.split(BEGIN)
+        (folder / page).write_text(head + BEGIN + key_tables(page) + END + rest.split(END)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":

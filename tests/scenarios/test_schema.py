@@ -10,7 +10,7 @@ import yaml
 
 from scenarios.load import LIBRARY, load_scenario, shipped_names
 from scenarios.schema import SCHEMA_FILE, ScenarioSpec, json_schema, models
-from scenarios.schema_docs import key_tables
+from scenarios.schema_docs import BEGIN, END, PAGES, key_tables
 
 
 def test_committed_schema_is_current() -> None:
@@ -31,13 +31,13 @@ def test_every_key_has_a_description() -> None:
 
 
 def test_documented_tables_are_current(repo: Path) -> None:
-    text = (repo / "docs" / "scenarios.md").read_text(encoding="utf-8")
-    begin, end = "<!-- keys: begin -->\n", "<!-- keys: end -->"
-    assert text.split(begin)[1].split(end)[0] == key_tables(), "run python -m scenarios.schema_docs docs/scenarios.md"
+    for page in PAGES:
+        text = (repo / "docs" / page).read_text(encoding="utf-8")
+        assert text.split(BEGIN)[1].split(END)[0] == key_tables(page), "run python -m scenarios.schema_docs docs"
 
 
 def test_examples_in_the_docs_load(repo: Path, tmp_path: Path) -> None:
-    text = (repo / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    text = (repo / "docs" / "scenario-files.md").read_text(encoding="utf-8")
     examples = [block for block in re.findall(r"```yaml\n(.*?)```", text, re.S) if "version: 1" in block and "road:" in block]
     assert examples
     for i, block in enumerate(examples):
