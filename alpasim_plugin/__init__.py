@@ -6,10 +6,11 @@ The public functions are imported on first use, so that reading a log or a type 
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from alpasim_plugin.lazy import lazy_names
 
 if TYPE_CHECKING:
     from alpasim_plugin.runtime.compose import make_renderer
@@ -20,13 +21,6 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 OWN_PACKAGES = ("alpasim_plugin", "configs", "evaluators", "policies", "scenarios")
-
-_HOMES = {
-    "load_scenario": "scenarios.load",
-    "make_policy": "policies",
-    "make_renderer": "alpasim_plugin.runtime.compose",
-    "run_rollout": "alpasim_plugin.runtime.rollout",
-}
 
 __all__ = ["OWN_PACKAGES", "__version__", "load_scenario", "make_policy", "make_renderer", "run_rollout"]
 
@@ -58,7 +52,12 @@ def _claim_packages() -> None:
 _claim_packages()
 
 
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "load_scenario": "scenarios.load",
+        "make_policy": "policies",
+        "make_renderer": ".runtime.compose",
+        "run_rollout": ".runtime.rollout",
+    },
+)

@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import cKDTree
 
 from alpasim_plugin.geometry_lanes import lane_polygon, ring_area
 from alpasim_plugin.types import F64, I64, Bool, Lane, LaneMap
@@ -110,14 +110,14 @@ class _Polylines:
         """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in 3-D."""
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         if len(self.vertices):
-            found = cKDTree(self.vertices).query_ball_point(xyz, radius_m)
+            found = scipy.spatial.cKDTree(self.vertices).query_ball_point(xyz, radius_m)
             for i, vertices in enumerate(found):
                 out[i, self.vertex_owner[vertices]] = True
         return out
 
     def nearest_vertex_owner(self, xyz: F64) -> I64:
         """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in 3-D."""
-        return np.asarray(self.vertex_owner[cKDTree(self.vertices).query(xyz)[1]])
+        return np.asarray(self.vertex_owner[scipy.spatial.cKDTree(self.vertices).query(xyz)[1]])
 
     def touched(self, footprints: Geometries, z: F64, limit_m: float, height_m: float) -> Bool:
         """Return whether each footprint is nearer than a limit to a segment whose middle is at most ``height_m`` above or below it."""

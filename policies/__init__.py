@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from alpasim_plugin.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from policies.base import make_policy
-    from policies.conformance import Check, Report, canned_scenario, check_policy
-    from policies.constant_velocity import ConstantVelocity
-    from policies.lane_camera import LaneCamera
-    from policies.learned import Learned
-    from policies.log_replay import LogReplay
-    from policies.pure_pursuit import PurePursuit
-
-_HOMES = {
-    "Check": "policies.conformance",
-    "ConstantVelocity": "policies.constant_velocity",
-    "LaneCamera": "policies.lane_camera",
-    "Learned": "policies.learned",
-    "LogReplay": "policies.log_replay",
-    "PurePursuit": "policies.pure_pursuit",
-    "Report": "policies.conformance",
-    "canned_scenario": "policies.conformance",
-    "check_policy": "policies.conformance",
-    "make_policy": "policies.base",
-}
+    from policies.base import make_policy as make_policy
+    from policies.conformance import Check as Check
+    from policies.conformance import Report as Report
+    from policies.conformance import canned_scenario as canned_scenario
+    from policies.conformance import check_policy as check_policy
+    from policies.constant_velocity import ConstantVelocity as ConstantVelocity
+    from policies.lane_camera import LaneCamera as LaneCamera
+    from policies.learned import Learned as Learned
+    from policies.log_replay import LogReplay as LogReplay
+    from policies.pure_pursuit import PurePursuit as PurePursuit
 
 __all__ = [
     "Check",
@@ -40,8 +31,18 @@ __all__ = [
     "make_policy",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "Check": ".conformance",
+        "ConstantVelocity": ".constant_velocity",
+        "LaneCamera": ".lane_camera",
+        "Learned": ".learned",
+        "LogReplay": ".log_replay",
+        "PurePursuit": ".pure_pursuit",
+        "Report": ".conformance",
+        "canned_scenario": ".conformance",
+        "check_policy": ".conformance",
+        "make_policy": ".base",
+    },
+)

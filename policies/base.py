@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.parts import build, unidentified
 from alpasim_plugin.types import F64, I64, Policy, Scenario
 
 PLAN_HORIZON_S = 4.0
@@ -22,7 +22,7 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
         InputError: The name is unknown, the import fails, or what it makes is not a policy.
         PolicyError: The policy raised while it was made.
     """
-    policy: Policy = build(resolve("policy", name), scenario=scenario)
+    policy: Policy = build(unidentified("policy", name), scenario=scenario)
     return policy
 
 

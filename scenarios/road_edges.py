@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 from alpasim_plugin.geometry_lanes import densify
 from alpasim_plugin.types import F64
@@ -39,7 +39,7 @@ def border_lines(area: Any, heights: F64, step_m: float = STEP_M) -> tuple[F64, 
         heights: ``(M, 3)`` points of the source; a border vertex takes the height of the nearest one.
         step_m: Largest distance between neighbouring vertices.
     """
-    tree = KDTree(heights[:, :2])
+    tree = scipy.spatial.KDTree(heights[:, :2])
     lines: list[F64] = []
     for part in shapely.get_parts(area):
         for ring in (part.exterior, *part.interiors):

@@ -1,4 +1,4 @@
-"""Clock, seeds, registry and errors."""
+"""Clock, seeds and errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, PolicyError, RendererError
-from alpasim_plugin.registry import Registry
 from alpasim_plugin.seeding import derive_seed, stream
 from alpasim_plugin.types import Rates
 
@@ -56,16 +55,6 @@ def test_streams_are_the_same_on_every_platform() -> None:
 def test_fields_of_a_key_cannot_run_into_each_other(a: str, b: str) -> None:
     if "\x1f" not in a + b and b:
         assert derive_seed(a + b, 0, "c") != derive_seed(a, 0, b + "c")
-
-
-def test_registry_refuses_a_name_twice_and_names_the_nearest_one() -> None:
-    table: Registry[int] = Registry("renderer", "simrun.tests.none")
-    table.register("clean")(lambda: 1)
-    with pytest.raises(InputError, match="that name is taken"):
-        table.register("clean")(lambda: 2)
-    with pytest.raises(InputError, match="did you mean 'clean'"):
-        table.get("claen")
-    assert table.get("clean")() == 1
 
 
 def test_an_error_shows_its_four_parts_one_a_line() -> None:

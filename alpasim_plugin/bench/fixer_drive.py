@@ -137,7 +137,7 @@ class _Watched(Renderer):
         self.ms: list[float] = []
 
     @property
-    def stage_ms(self) -> Mapping[str, float]:
+    def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
         return self._renderer.stage_ms
 
     def render(self, request: RenderRequest) -> Frame:

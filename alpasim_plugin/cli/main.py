@@ -7,36 +7,41 @@ import json
 import os
 import sys
 import traceback
+from importlib import import_module
 from pathlib import Path
 
 import typer
 
-from alpasim_plugin.cli import bench, compare, doctor, fork, gate, listing, refine, report, run, score, train
 from alpasim_plugin.errors import InputError, SimrunError
 
-app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
-    "Without a verb `run` is meant: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
-    "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, "
-    "5 evaluator failure, 130 interrupted.",
-)
-app.command("run", epilog=run.EPILOG)(run.run)
-app.command("score", epilog=score.EPILOG)(score.score)
-app.command("compare", epilog=compare.EPILOG)(compare.compare)
-app.command("gate", epilog=gate.EPILOG)(gate.gate)
-app.command("report", epilog=report.EPILOG)(report.report)
-app.command("list", epilog=listing.EPILOG)(listing.list_parts)
-app.command("doctor", epilog=doctor.EPILOG)(doctor.doctor)
-app.command("refine", epilog=refine.EPILOG)(refine.refine)
-app.command("fork", epilog=fork.FORK_EPILOG)(fork.fork)
-app.command("probe", epilog=fork.PROBE_EPILOG)(fork.probe)
-app.add_typer(bench.app, name="bench")
-app.add_typer(train.app, name="train")
-
-VERBS = ("run", "score", "compare", "gate", "report", "list", "doctor", "refine", "fork", "probe", "bench", "train")
+# Verb -> module of this package, its command or group, its epilog, and the first line of its help. Only the verb that was typed is
+# imported: some need torch, which takes seconds to load.
+VERBS: dict[str, tuple[str, str, str, str]] = {
+    "run": (
+        "run", "run", "EPILOG",
+        "Drive scenarios behind one or more renderers, score the drives, and write a run folder with a report.",
+    ),
+    "score": ("score", "score", "EPILOG", "Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run."),
+    "compare": (
+        "compare", "compare", "EPILOG",
+        "Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are listed.",
+    ),
+    "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
+    "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),
+    "list": (
+        "listing", "list_parts", "EPILOG",
+        "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",
+    ),
+    "doctor": ("doctor", "doctor", "EPILOG", "Try each part on a small case and say what works, what does not, and what to do about it."),
+    "refine": ("refine", "refine", "EPILOG", "Refine a video with a fixer, block by block, at any length in constant memory."),
+    "fork": ("fork", "fork", "FORK_EPILOG", "Continue a logged rollout from an instant on with another renderer, policy or seed."),
+    "probe": (
+        "fork", "probe", "PROBE_EPILOG",
+        "Ask the policy at a logged rollout's own poses behind several renderers and measure how far its plans part.",
+    ),
+    "bench": ("bench", "app", "", "Measure speed and error of parts."),
+    "train": ("train", "app", "", "Make training data and train networks."),
+}  # fmt: skip
 OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
 
 
@@ -52,7 +57,7 @@ def with_verb(args: list[str]) -> list[str]:
     Raises:
         InputError: A word that is no file and nearly a verb.
     """
-    if not args or args[0] in VERBS + OWN_OPTIONS:
+    if not args or args[0] in (*VERBS, *OWN_OPTIONS):
         return args
     near = [] if args[0].startswith("-") or Path(args[0]).exists() else difflib.get_close_matches(args[0], VERBS, 1, 0.7)
     if near:
@@ -61,10 +66,37 @@ def with_verb(args: list[str]) -> list[str]:
     return ["run", *args]
 
 
+def make_app(verb: str | None) -> typer.Typer:
+    """Return the command line with one verb, or with all verbs as a listing of them shows them."""
+    app = typer.Typer(
+        no_args_is_help=True,
+        rich_markup_mode="markdown",
+        pretty_exceptions_enable=False,
+        help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
+        "Without a verb `run` is meant: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
+        "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, "
+        "5 evaluator failure, 130 interrupted.",
+    )
+    app.callback()(lambda: None)  # without it, an app of one command has no verbs
+    if verb in VERBS:
+        module_name, name, epilog, _ = VERBS[verb]
+        module = import_module(f"alpasim_plugin.cli.{module_name}")
+        if epilog:
+            app.command(verb, epilog=getattr(module, epilog))(getattr(module, name))
+        else:
+            app.add_typer(getattr(module, name), name=verb)
+        return app
+    for listed, (*_, text) in VERBS.items():
+        app.command(listed, help=text)(lambda: None)
+    return app
+
+
 def run_command(args: list[str]) -> int:
     """Run one command line and return its exit code; errors are printed, as JSON on stdout with ``--json``."""
     try:
-        app(args=with_verb(args), prog_name="simrun")
+        args = with_verb(args)
+        completing = os.environ.get("COMP_WORDS", "").split()[1:2]  # set by the shell while it completes a word
+        make_app(next(iter([*args, *completing]), None))(args=args, prog_name="simrun")
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 0 if leaving.code is None else 2
     except SimrunError as error:

@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.runtime.flips import write_flips
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.store import read_json
-from evaluators.report import render_table, write_junit, write_report, write_summary_md
+from evaluators.report import render_table
 
 EPILOG = "Example: `simrun report runs/us101`"
 
@@ -24,10 +24,7 @@ def report(
     """Write report.html, summary.md and junit.xml of a run again and print its table."""
     del debug
     summary = read_json(run / "summary.json")
-    write_flips(run)
-    write_summary_md(run)
-    write_junit(run)
-    page = write_report(run)
+    page = write_reports(run)
     if as_json:
         print(json.dumps({"report": str(page), "summary": summary}))
     else:

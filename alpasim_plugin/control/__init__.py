@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.parts import build, unidentified
 from alpasim_plugin.types import Controller, Vehicle
 
 __all__ = ["Controller", "make_controller"]
@@ -18,5 +18,5 @@ def make_controller(name: str, vehicle: Vehicle) -> Controller:
     Raises:
         InputError: No controller has that name.
     """
-    controller: Controller = build(resolve("controller", name), vehicle=vehicle)
+    controller: Controller = build(unidentified("controller", name), vehicle=vehicle)
     return controller

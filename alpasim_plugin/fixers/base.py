@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.parts import build, unidentified
 from alpasim_plugin.types import Fixer
 
 
@@ -31,7 +31,7 @@ def make_fixer(
     Raises:
         InputError: Unknown name, bad settings, or weights that are missing or wrong.
     """
-    spec = resolve("fixer", name)
+    spec = unidentified("fixer", name)
     fixer: Fixer = build(
         spec if settings is None else replace(spec, settings=settings), scene_id=scene_id, seed=seed, device=device, threads=threads
     )
@@ -44,6 +44,6 @@ def fixer_settings(name: str, overrides: Sequence[str] = ()) -> FixerSettings:
     Raises:
         InputError: Unknown name or key (with the nearest), or a bad value, with its position.
     """
-    settings = resolve("fixer", name, overrides).settings
+    settings = unidentified("fixer", name, overrides).settings
     assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
     return settings

@@ -11,7 +11,7 @@ from alpasim_plugin.errors import FixerError, SimrunError
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
 from alpasim_plugin.semantic_map.prepare import PreparedMap
-from alpasim_plugin.types import U8, Actor, Frame, RenderRequest
+from alpasim_plugin.types import U8, Actor, Fixer, Frame, RenderRequest
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 DOING = "fixing a block of frames"
@@ -58,7 +58,7 @@ class Workshop:
             image = draw_map(self.scene_map, request.camera, request.T_world_camera[-1], boxes, threads=self.threads)
         return Shot(request, frame, image)
 
-    def fix(self, fixer: object, call: Call, shots: Sequence[Shot]) -> list[Frame]:
+    def fix(self, fixer: Fixer, call: Call, shots: Sequence[Shot]) -> list[Frame]:
         """Have a block fixed and check what comes back.
 
         Args:
@@ -71,7 +71,7 @@ class Workshop:
         """
         frames, maps = [shot.frame for shot in shots], [shot.map for shot in shots if shot.map is not None]
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
-        before = dict(getattr(fixer, "stage_ms", {}))
+        before = dict(fixer.stage_ms)
         with self._timed("fix"):
             try:
                 fixed = list(call(frames, maps))
@@ -79,7 +79,7 @@ class Workshop:
                 raise
             except Exception as error:
                 raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
-        self._own_stages(before, getattr(fixer, "stage_ms", {}))
+        self._own_stages(before, fixer.stage_ms)
         problem = _problem(frames, fixed)
         if problem:
             raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")

@@ -8,6 +8,7 @@ from alpasim_plugin.fixers.block_runner import Workshop
 from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
+from alpasim_plugin.parts import complete
 from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.types import Fixer, Frame, RenderRequest, Scenario
 
@@ -36,6 +37,10 @@ def fixed_renderer(
     """
     scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
     workshop = Workshop(render, scene_map, scenario.actors, threads)
+
+    def make() -> Fixer:
+        return complete(make_fixer(), Fixer)
+
     if settings.mode == "chunk":
-        return ChunkRenderer(workshop, make_fixer())
-    return SpeculativeRenderer(workshop, make_fixer, settings)
+        return ChunkRenderer(workshop, make())
+    return SpeculativeRenderer(workshop, make, settings)

@@ -24,7 +24,7 @@ class ChunkRenderer(Renderer):
         self.frames = self.blocks = 0
 
     @property
-    def stage_ms(self) -> Mapping[str, float]:
+    def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
         """Give the times of the last call by stage, the base renderer's left out."""
         return self.workshop.stage_ms
 

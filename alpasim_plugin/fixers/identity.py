@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.views import group_views
 from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
@@ -32,6 +31,8 @@ class IdentityFixer(Fixer):
 
     def preview(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
         """Return the block, checked as every fixer checks it."""
+        from alpasim_plugin.fixers.views import group_views  # loads torch
+
         group_views(block, maps, self.blocks.frames(self._done))
         return tuple(block)
 

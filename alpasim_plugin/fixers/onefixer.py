@@ -77,7 +77,7 @@ class OneFixer(Fixer):
         self.reset(seed)
 
     @property
-    def stage_ms(self) -> dict[str, float]:
+    def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
         """Wall time by stage since the session was made, milliseconds; sums that only grow. Empty where stages are not timed."""
         return {} if self._clock is None else {name: self._clock.ms.get(name, 0.0) for name in TIMED}
 

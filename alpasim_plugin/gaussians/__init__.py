@@ -1,13 +1,23 @@
 """3D Gaussians: clouds, files, cameras and rasterisers."""
 
-from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud
-from alpasim_plugin.gaussians.files.formats import read_gaussians
-from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
-from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.raster.prepared import PreparedCloud, prepare
-from alpasim_plugin.gaussians.raster.rasterize import rasterize
-from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from alpasim_plugin.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from alpasim_plugin.gaussians.camera import PinholeCamera as PinholeCamera
+    from alpasim_plugin.gaussians.cloud import CleanReport as CleanReport
+    from alpasim_plugin.gaussians.cloud import GaussianCloud as GaussianCloud
+    from alpasim_plugin.gaussians.files.formats import read_gaussians as read_gaussians
+    from alpasim_plugin.gaussians.files.ply import read_ply as read_ply
+    from alpasim_plugin.gaussians.files.ply import write_ply as write_ply
+    from alpasim_plugin.gaussians.raster.output import RasterOutput as RasterOutput
+    from alpasim_plugin.gaussians.raster.prepared import PreparedCloud as PreparedCloud
+    from alpasim_plugin.gaussians.raster.prepared import prepare as prepare
+    from alpasim_plugin.gaussians.raster.rasterize import rasterize as rasterize
+    from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared as rasterize_prepared
 
 __all__ = [
     "CleanReport",
@@ -22,3 +32,20 @@ __all__ = [
     "read_ply",
     "write_ply",
 ]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "CleanReport": ".cloud",
+        "GaussianCloud": ".cloud",
+        "PinholeCamera": ".camera",
+        "PreparedCloud": ".raster.prepared",
+        "RasterOutput": ".raster.output",
+        "prepare": ".raster.prepared",
+        "rasterize": ".raster.rasterize",
+        "rasterize_prepared": ".raster.rasterize_cpu",
+        "read_gaussians": ".files.formats",
+        "read_ply": ".files.ply",
+        "write_ply": ".files.ply",
+    },
+)

@@ -1,11 +1,22 @@
 """Rollout logs: AlpaSim's ASL format, camera images, videos and our own side facts."""
 
-from alpasim_plugin.log.facts import read_facts, write_facts
-from alpasim_plugin.log.images import decode_image, encode_image
-from alpasim_plugin.log.reader import read_asl
-from alpasim_plugin.log.schema import RolloutHeader, header_from_scenario
-from alpasim_plugin.log.video import read_mp4, write_mp4
-from alpasim_plugin.log.writer import AslWriter
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from alpasim_plugin.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from alpasim_plugin.log.facts import read_facts as read_facts
+    from alpasim_plugin.log.facts import write_facts as write_facts
+    from alpasim_plugin.log.images import decode_image as decode_image
+    from alpasim_plugin.log.images import encode_image as encode_image
+    from alpasim_plugin.log.reader import read_asl as read_asl
+    from alpasim_plugin.log.schema import RolloutHeader as RolloutHeader
+    from alpasim_plugin.log.schema import header_from_scenario as header_from_scenario
+    from alpasim_plugin.log.video import read_mp4 as read_mp4
+    from alpasim_plugin.log.video import write_mp4 as write_mp4
+    from alpasim_plugin.log.writer import AslWriter as AslWriter
 
 __all__ = [
     "AslWriter",
@@ -19,3 +30,19 @@ __all__ = [
     "write_facts",
     "write_mp4",
 ]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "AslWriter": ".writer",
+        "RolloutHeader": ".schema",
+        "decode_image": ".images",
+        "encode_image": ".images",
+        "header_from_scenario": ".schema",
+        "read_asl": ".reader",
+        "read_facts": ".facts",
+        "read_mp4": ".video",
+        "write_facts": ".facts",
+        "write_mp4": ".video",
+    },
+)

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from alpasim_plugin.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from alpasim_plugin.nets.dit import CosmosCausalDiT, TextContext
-    from alpasim_plugin.nets.sizes import DiTSizes
-    from alpasim_plugin.nets.taehv import TinyDecoder
-    from alpasim_plugin.nets.tiny_vae import TinyVAE
-    from alpasim_plugin.nets.wan_vae import WanVAE
+    from alpasim_plugin.nets.dit import CosmosCausalDiT as CosmosCausalDiT
+    from alpasim_plugin.nets.dit import TextContext as TextContext
+    from alpasim_plugin.nets.sizes import DiTSizes as DiTSizes
+    from alpasim_plugin.nets.taehv import TinyDecoder as TinyDecoder
+    from alpasim_plugin.nets.tiny_vae import TinyVAE as TinyVAE
+    from alpasim_plugin.nets.wan_vae import WanVAE as WanVAE
 
-_HOMES = {
-    "CosmosCausalDiT": "dit",
-    "DiTSizes": "sizes",
-    "TextContext": "dit",
-    "TinyDecoder": "taehv",
-    "TinyVAE": "tiny_vae",
-    "WanVAE": "wan_vae",
-}
+__all__ = [
+    "CosmosCausalDiT",
+    "DiTSizes",
+    "TextContext",
+    "TinyDecoder",
+    "TinyVAE",
+    "WanVAE",
+]
 
-__all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a network on first use: the noise schedule and the headers of weight files do not need torch."""
-    if name in _HOMES:
-        return getattr(import_module(f"alpasim_plugin.nets.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "CosmosCausalDiT": ".dit",
+        "DiTSizes": ".sizes",
+        "TextContext": ".dit",
+        "TinyDecoder": ".taehv",
+        "TinyVAE": ".tiny_vae",
+        "WanVAE": ".wan_vae",
+    },
+)

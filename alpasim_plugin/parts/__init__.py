@@ -6,7 +6,7 @@ A name is resolved once, into a `PartSpec` that carries the part's identity; a w
 
 from alpasim_plugin.parts.build import build, complete
 from alpasim_plugin.parts.registry import find, names
-from alpasim_plugin.parts.resolve import RendererSpec, resolve, resolve_renderer
+from alpasim_plugin.parts.resolve import RendererSpec, resolve, resolve_renderer, unidentified
 from alpasim_plugin.parts.spec import PartSpec, digest
 
-__all__ = ["PartSpec", "RendererSpec", "build", "complete", "digest", "find", "names", "resolve", "resolve_renderer"]
+__all__ = ["PartSpec", "RendererSpec", "build", "complete", "digest", "find", "names", "resolve", "resolve_renderer", "unidentified"]

@@ -56,10 +56,12 @@ def load(target: str, kind: str) -> Any:
 
 
 def file_of(target: str) -> Path | None:
-    """Return the source file of a loaded target's module; None where it has none."""
+    """Return the source file of a target's module, which need not have been imported; None where it has none."""
     name, _, _ = target.rpartition(":")
-    file = name if name.endswith(".py") else getattr(sys.modules[name], "__file__", None)
-    return None if file is None else Path(file)
+    if name.endswith(".py"):
+        return Path(name)
+    spec = importlib.util.find_spec(name)
+    return Path(spec.origin) if spec is not None and spec.has_location and spec.origin is not None else None
 
 
 def _from_file(file: Path) -> ModuleType:

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from alpasim_plugin.config import apply_overrides, validate
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.interfaces import Declaration
+from alpasim_plugin.parts.builtin import BUILTIN
 from alpasim_plugin.parts.kinds import KindName
 from alpasim_plugin.parts.loading import absolute_target, file_of, is_target, load
 from alpasim_plugin.parts.registry import entries, find, names
@@ -22,6 +23,7 @@ from alpasim_plugin.yaml_marks import Document
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said
 DOING = "choosing a renderer"
+PLAIN_KINDS = ("renderer", "evaluator", "controller")  # whose shipped parts declare nothing; a test holds them to it
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,12 @@ def resolve(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpe
     Raises:
         InputError: Unknown name (with the nearest), a failing import, a bad setting, or a declared file that cannot be read.
     """
+    spec = unidentified(kind, name, overrides)
+    return _described(spec, None if _declares_nothing(kind, spec.target) else load(spec.target, kind))
+
+
+def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpec:
+    """Resolve a name as far as building the part needs it: no file is read, and there is no digest. See `resolve`."""
     plain, steps, address = name, None, None
     if is_target(name):
         target = absolute_target(name)
@@ -69,10 +77,9 @@ def resolve(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpe
         elif kind == "fixer":
             plain, steps = split_steps(name)
         target = find(kind, plain).target
-    factory = load(target, kind)
     at_steps = () if steps is None else (f"steps={steps}",)
-    settings = _settings(kind, plain, factory, (*at_steps, *overrides))
-    return _described(PartSpec(kind, name, target, settings, address=address), factory)
+    settings = None if _declares_nothing(kind, target) else _settings(kind, plain, load(target, kind), (*at_steps, *overrides))
+    return PartSpec(kind, name, target, settings, address=address)
 
 
 def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
@@ -126,6 +133,11 @@ def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> De
         attributes = ("trained", "note", "is_remote")
         declared = Declaration(**{key: getattr(factory, key) for key in attributes if isinstance(getattr(factory, key, None), bool | str)})
     return Declaration({key: folder / path for key, path in files.items()}, declared.trained, declared.note, declared.is_remote)
+
+
+def _declares_nothing(kind: KindName, target: str) -> bool:
+    """Tell whether a factory need not be imported before it is used: shipped parts of some kinds have nothing to declare."""
+    return kind in PLAIN_KINDS and any(target == shipped for shipped, _ in BUILTIN[kind].values())
 
 
 def _described(spec: PartSpec, factory: Any) -> PartSpec:

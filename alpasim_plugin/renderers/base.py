@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.parts import build, unidentified
 from alpasim_plugin.types import Renderer, Scenario
 
 
@@ -22,5 +22,5 @@ def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "c
         InputError: Unknown name or device.
         RendererError: The device does not work.
     """
-    renderer: Renderer = build(resolve("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads)
+    renderer: Renderer = build(unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads)
     return renderer

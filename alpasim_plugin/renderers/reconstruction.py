@@ -77,13 +77,6 @@ def model_of(scenario: Scenario, threads: int | None = None) -> Model:
     return in_memory(f"reconstruction:{key}", lambda: scene_from(scenario, *ensure(scenario, recipe, threads)))
 
 
-def model_key(scenario: Scenario) -> str | None:
-    """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is fitted."""
-    if scenario.degradation.kind not in ("reconstruction", "cycle"):
-        return None
-    return reconstruction_key(scenario, recipe_of(scenario))
-
-
 def ensure(
     scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None = None, *, again: bool = False
 ) -> tuple[Reconstruction, list[SkyView]]:

@@ -10,16 +10,18 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
 from alpasim_plugin.types import Scenario
 
-VERSION = 1  # raise when the same scene and recipe give another model: a change of the scene's builders, the rasteriser or the fit
+BUILD = "alpasim_plugin.renderers.reconstruction_build"  # what it imports decides, with the scene and the recipe, what the model is
 
 # What neither the frames of the logged drive nor the fit depend on. The source's hash is left out because everything it stands for is here,
 # the path of a background file because its bytes are.
 _NO_MATTER = frozenset(
     {
         "source", "rates", "start_us", "end_us", "warmup_us", "latency", "degradation", "world_origin", "content_hash", "notes",
-        "alpasim_map", "behaviour", "path",
+        "alpasim_map", "behaviour", "path", "source_part",
     }
 )  # fmt: skip
 
@@ -44,11 +46,18 @@ def reconstruction_key(scenario: Scenario, recipe: object) -> str:
         OSError: The scenario's background file cannot be read.
     """
     digest = hashlib.blake2b(digest_size=16)
-    feed(digest, [VERSION, recipe, scenario], skip=_NO_MATTER)
+    feed(digest, [own_code_digest(BUILD), recipe, scenario], skip=_NO_MATTER)
     if scenario.background is not None:
         with Path(scenario.background.path).open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
+
+
+def model_key(scenario: Scenario) -> str | None:
+    """Return the key of what the renderer ``3dgs`` shows of a scenario; None where nothing is fitted."""
+    if scenario.degradation.kind not in ("reconstruction", "cycle"):
+        return None
+    return reconstruction_key(scenario, recipe_of(scenario))
 
 
 def feed(sink: Sink, value: Any, skip: frozenset[str] = frozenset()) -> None:

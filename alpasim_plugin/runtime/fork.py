@@ -23,16 +23,15 @@ from alpasim_plugin.log.trace import Difference, Trace, first_difference, trace_
 from alpasim_plugin.parts import digest, resolve, resolve_renderer
 from alpasim_plugin.runtime.cell import MANIFEST, Parts, own_parts, run_cell
 from alpasim_plugin.runtime.execute import thread_budget
-from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.past import PastRollout
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.run import RunResult, write_run_info
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.switch import SwitchedController, SwitchedPolicy, SwitchedRenderer
 from alpasim_plugin.runtime.tables import write_tables
 from alpasim_plugin.types import Scenario
-from evaluators.report import write_junit, write_report, write_summary_md
 
 DOING = "continuing a logged rollout"
 UNCHANGED = "replay"
@@ -98,10 +97,7 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     write_run_info(root, plan, command, threads)
     write_json(root / "run.json", read_json(root / "run.json") | {"fork": manifest.get("fork")})
     summary = write_tables(root, [original, manifest], options.preset, past.cell.renderer.name, threads, time.perf_counter() - began)
-    write_flips(root)
-    write_summary_md(root)
-    write_junit(root)
-    write_report(root)
+    write_reports(root)
     return RunResult(root, summary, 2, summary["failures"]["n_failed"])
 
 

@@ -11,18 +11,17 @@ from typing import Any, Protocol
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.renderers.reconstruction import model_key
+from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.execute import Threads, execute, thread_budget
-from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.plan import RunPlan, slug
 from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.tables import write_tables
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import declared
-from evaluators.report import write_junit, write_report, write_summary_md
 
 SCHEMA_VERSION = 1
 
@@ -99,10 +98,7 @@ def execute_run(
     summary["determinism"] = determinism
     write_json(tables, summary)
     write_json(root / "run.json", read_json(root / "run.json") | {"determinism": determinism})
-    write_flips(root)
-    write_summary_md(root)
-    write_junit(root)
-    write_report(root)
+    write_reports(root)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 

@@ -20,6 +20,7 @@ from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.run import SCHEMA_VERSION
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
@@ -38,7 +39,6 @@ from evaluators.alpasim import (
 )
 from evaluators.metrics import declared, info
 from evaluators.presets import Preset
-from evaluators.report import write_junit, write_report, write_summary_md
 
 AGGREGATE = "aggregate"
 
@@ -94,9 +94,7 @@ def execute_score(
     code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
     summary |= {"exit_code": code} | ({} if aggregation is None else {"alpasim": aggregation})
     write_json(root / "summary.json", summary)
-    write_summary_md(root)
-    write_junit(root)
-    write_report(root)
+    write_reports(root, flips=False)
     return ScoreResult(root, summary, code)
 
 

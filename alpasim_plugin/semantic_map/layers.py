@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import arc_lengths, resample
@@ -109,7 +109,7 @@ def _edges_once(lane_map: LaneMap) -> list[tuple[F64, Paint]]:
     if not edges:
         return []
     points, headings, owner = _samples([line for line, _, _ in edges])
-    near = KDTree(points).query_ball_point(points, SAME_EDGE_M)
+    near = scipy.spatial.KDTree(points).query_ball_point(points, SAME_EDGE_M)
     samples_of = np.split(np.arange(len(owner)), np.flatnonzero(np.diff(owner)) + 1)
     taken = np.zeros(len(edges), dtype=bool)
     chosen: list[tuple[F64, Paint]] = []

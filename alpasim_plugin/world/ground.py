@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import KDTree
+import scipy
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, HeightField
@@ -60,11 +59,11 @@ def _cell_means(xyz: F64, low: F64, cell_m: float, nx: int) -> F64:
 
 
 def _interpolate(samples: F64, nodes: F64) -> F64:
-    nearest = samples[KDTree(samples[:, :2]).query(nodes)[1], 2]
+    nearest = samples[scipy.spatial.KDTree(samples[:, :2]).query(nodes)[1], 2]
     local = samples[:, :2] - samples[0, :2]
     if len(samples) < 3 or np.linalg.matrix_rank(local, tol=1e-6) < 2:
         return np.asarray(nearest)  # a line of points spans no triangle
-    z = LinearNDInterpolator(local, samples[:, 2])(nodes - samples[0, :2])
+    z = scipy.interpolate.LinearNDInterpolator(local, samples[:, 2])(nodes - samples[0, :2])
     return np.asarray(np.where(np.isnan(z), nearest, z))
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import shapely
-from scipy.spatial import KDTree
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import arc_lengths, project, resample, wrap_angle
@@ -45,7 +45,7 @@ class LaneIndex:
         dense = [densify(lane_map.lanes[i].centre, VERTEX_STEP_M) for i in self.ids]
         self._vertices = np.concatenate(dense) if dense else np.zeros((0, 3))
         self._owner: I64 = np.repeat(np.arange(len(dense)), [len(d) for d in dense]).astype(np.int64)
-        self._kd = {dim: KDTree(self._vertices[:, :dim]) for dim in (2, 3)} if dense else {}
+        self._kd = {dim: scipy.spatial.KDTree(self._vertices[:, :dim]) for dim in (2, 3)} if dense else {}
 
     def containing(self, point: F64) -> tuple[str, ...]:
         """Return the lanes whose polygon holds the point in plan view, its border included."""

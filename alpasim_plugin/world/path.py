@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
+import scipy
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import arc_lengths
@@ -87,7 +87,7 @@ def polyline_path(xyz: F64, doing: str = "building a path") -> Path:
 def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
     """Build a path through the points by a cubic spline over arc length, resampled every ``step_m``."""
     coarse = polyline_path(xyz)
-    spline = CubicSpline(coarse.s, coarse.xyz, axis=0)
+    spline = scipy.interpolate.CubicSpline(coarse.s, coarse.xyz, axis=0)
     fine = np.linspace(0.0, coarse.length_m, max(2, int(np.ceil(coarse.length_m / step_m)) + 1))
     d, dd = spline(fine, 1), spline(fine, 2)
     speed2 = d[:, 0] ** 2 + d[:, 1] ** 2

@@ -1,9 +1,27 @@
 """Reports from a run folder: HTML, Markdown, JUnit and the terminal table. A pure reader: no renderer, no policy, no scenario files."""
 
-from evaluators.report.fixers import fixer_lines
-from evaluators.report.html import write_report
-from evaluators.report.junit import write_junit
-from evaluators.report.summary import write_summary_md
-from evaluators.report.terminal import render_table
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from alpasim_plugin.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from evaluators.report.fixers import fixer_lines as fixer_lines
+    from evaluators.report.html import write_report as write_report
+    from evaluators.report.junit import write_junit as write_junit
+    from evaluators.report.summary import write_summary_md as write_summary_md
+    from evaluators.report.terminal import render_table as render_table
 
 __all__ = ["fixer_lines", "render_table", "write_junit", "write_report", "write_summary_md"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "fixer_lines": ".fixers",
+        "render_table": ".terminal",
+        "write_junit": ".junit",
+        "write_report": ".html",
+        "write_summary_md": ".summary",
+    },
+)

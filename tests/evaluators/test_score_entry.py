@@ -9,7 +9,7 @@ import pytest
 
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.types import Box, LoggedPlan, Trajectory
-from evaluators import EVALUATORS, METRICS, MetricInfo, score
+from evaluators import METRICS, MetricInfo, resolve_evaluators, score
 from evaluators.base import run_evaluator, series
 from evaluators.metrics import declare, info
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
@@ -120,12 +120,15 @@ def test_an_invalid_value_without_a_reason_is_refused():
         run_evaluator("silent", silent, log, where)
 
 
-def test_a_metric_given_twice_is_refused(monkeypatch):
+class Again:
+    def __call__(self, rollout, scene):
+        return [series("offroad", rollout.ego.t_us, 0.0)]
+
+
+def test_a_metric_given_twice_is_refused():
     log, where = bad()
-    monkeypatch.setitem(EVALUATORS._builtin, "again", lambda preset: lambda rollout, scene: [series("offroad", rollout.ego.t_us, 0.0)])
-    monkeypatch.setitem(EVALUATORS._help, "again", "")
     with pytest.raises(EvaluatorError, match="metric 'offroad' was given twice"):
-        score(log, where)
+        score(log, where, evaluators=resolve_evaluators([f"{__name__}:Again"]))
 
 
 def test_a_metric_nobody_declared_is_refused_and_can_be_declared(monkeypatch):

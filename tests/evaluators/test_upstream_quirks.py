@@ -19,7 +19,7 @@ from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.geometry import inverse, offset_trajectory
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.types import LaneMap, LoggedImage, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
-from evaluators import EVALUATORS, PRESETS, aggregate, reduce_rollout, rollout_values, score
+from evaluators import PRESETS, aggregate, reduce_rollout, resolve_evaluators, rollout_values, score
 from evaluators.alpasim import EvalSettings, ScoredRollout, metrics_unprocessed_table, over_sweeps, reduce_run, scene_score
 from evaluators.alpasim.settings import PlanDeviation, SceneScoreSettings, Scorers
 from tests.evaluators.eval_build import DT_US, T_RIG_BOX, TWO_LANES, by_name, car, lane, road_map, rollout, scene, track
@@ -267,20 +267,16 @@ def test_d24_nothing_in_a_log_is_ever_unpickled(tmp_path):
     assert proof.exists()  # the bomb was live
 
 
-def test_d18_an_evaluator_that_fails_is_never_swallowed(monkeypatch):
+class OutOfOrder:
+    def __call__(self, rollout: RolloutLog, scene: Scene):
+        raise ValueError("out of order")
+
+
+def test_d18_an_evaluator_that_fails_is_never_swallowed():
     log = rollout(STAND)
-
-    def broken(preset):
-        def evaluator(rollout: RolloutLog, scene: Scene):
-            raise ValueError("out of order")
-
-        return evaluator
-
-    monkeypatch.setitem(EVALUATORS._builtin, "broken", broken)
-    monkeypatch.setitem(EVALUATORS._help, "broken", "")
     for preset in ("alpasim", "strict"):
         with pytest.raises(EvaluatorError, match="out of order"):
-            score(log, scene(TWO_LANES, log), preset)
+            score(log, scene(TWO_LANES, log), preset, resolve_evaluators([f"{__name__}:OutOfOrder"]))
 
 
 # --- tables over rollouts ---------------------------------------------------------------------------------------------

@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.errors import FixerError, InputError
-from alpasim_plugin.fixers import FIXERS, fixer_settings, make_fixer
+from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings, WeightsSettings, load_settings
 from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from alpasim_plugin.parts import names
 from alpasim_plugin.types import BlockRule
 from tests.fixers.fixer_cases import small_settings
 
@@ -25,7 +26,7 @@ def refusal(*overrides: str, name: str = "onefixer") -> str:
 
 @pytest.mark.parametrize("name", ["onefixer", "onefixer-tiny", "onefixer-s", "onefixer-2b", "identity"])
 def test_every_fixer_has_settings_that_load(name: str) -> None:
-    assert name in FIXERS
+    assert name in names("fixer")
     assert isinstance(fixer_settings(name), FixerSettings)
 
 

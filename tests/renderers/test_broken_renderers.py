@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.geometry import se3
-from alpasim_plugin.renderers import RENDERERS, make_renderer
+from alpasim_plugin.parts import names as known
+from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.broken import LATE_US, SHIFT_M
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.types import Renderer, RenderRequest, Scenario
@@ -32,7 +33,7 @@ def requests(scenario: Scenario, n: int) -> list[RenderRequest]:
 
 
 def test_every_broken_renderer_differs_from_clean_and_keeps_the_contract(scenario: Scenario) -> None:
-    names = [name for name in RENDERERS if name.startswith("broken-")]
+    names = [name for name in known("renderer") if name.startswith("broken-")]
     assert len(names) == 6
     for name in names:
         clean, broken = make_renderer("clean", scenario), make_renderer(name, scenario)

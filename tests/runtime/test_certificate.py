@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from alpasim_plugin.renderers import RENDERERS
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
 from alpasim_plugin.runtime.execute import Threads, execute
@@ -48,31 +45,25 @@ def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Pat
     assert "smoke-straight" in certificate_line(found)
 
 
-@pytest.fixture
-def flicker() -> Iterator[str]:
-    """Give a renderer that changes one pixel of the fourth frame of every rollout after the process's first."""
+class Flicker(CleanRenderer):
+    """Changes one pixel of the fourth frame of every rollout after the process's first."""
 
-    class Flicker(CleanRenderer):
-        lives = 0
+    lives = 0
 
-        def __init__(self, scenario: Scenario, *more: object) -> None:
-            super().__init__(scenario, *more)  # type: ignore[arg-type]
-            Flicker.lives += 1
-            self.due_us = scenario.start_us + 400_000
+    def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
+        super().__init__(scenario, seed, device, threads)
+        Flicker.lives += 1
+        self.due_us = scenario.start_us + 400_000
 
-        def render(self, request: RenderRequest) -> Frame:
-            frame = super().render(request)
-            if request.t_us == self.due_us:
-                frame.rgb[0, 0, 0] = np.uint8(Flicker.lives)
-            return frame
-
-    RENDERERS.register("flicker-of-a-test", "changes")(Flicker)
-    yield "flicker-of-a-test"
-    del RENDERERS._builtin["flicker-of-a-test"]
+    def render(self, request: RenderRequest) -> Frame:
+        frame = super().render(request)
+        if request.t_us == self.due_us:
+            frame.rgb[0, 0, 0] = np.uint8(Flicker.lives)
+        return frame
 
 
-def test_one_changed_pixel_is_found_without_images_in_the_log(tmp_path: Path, flicker: str) -> None:
-    found = certificate(plan_of(flicker, "tests.runtime.test_certificate:Blind"), tmp_path)
+def test_one_changed_pixel_is_found_without_images_in_the_log(tmp_path: Path) -> None:
+    found = certificate(plan_of(f"{__name__}:Flicker", "tests.runtime.test_certificate:Blind"), tmp_path)
     assert found["status"] == "different"
     first = found["first_difference"]
     assert (first["component"], first["step"]) == ("frames", 4)

@@ -15,7 +15,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.nets.checkpoints import file_sha256
-from alpasim_plugin.runtime.compose import card_of, parse_renderer
+from alpasim_plugin.parts import resolve, resolve_renderer, spec
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.types import Scenario
 from scenarios.suite import expand
@@ -32,7 +32,7 @@ from scenarios.suite import expand
     ],
 )
 def test_a_name_is_a_renderer_or_a_fixer_over_one(name: str, meant: str) -> None:
-    assert str(parse_renderer(name)) == meant
+    assert str(resolve_renderer(name)) == meant
 
 
 @pytest.mark.parametrize(
@@ -46,15 +46,15 @@ def test_a_name_is_a_renderer_or_a_fixer_over_one(name: str, meant: str) -> None
         ("3dgs@2", "'3dgs' has no step count", "write 3dgs"),
         ("onefixer@0", "'0' after @ is no step count", "NAME@STEPS"),
         ("onefixer@x", "'x' after @ is no step count", "NAME@STEPS"),
-        ("nre://host:50051", "not built yet", "use 3dgs"),
-        ("onefixer+nre://host:50051", "not built yet", "use 3dgs"),
+        ("nre://host:50051", "no renderer has that name", "known: clean"),
+        ("onefixer+nre://host:50051", "no renderer has that name", "known: clean"),
         ("+clean", "no fixer has the name ''", "fixers"),
         ("onefixer+", "no renderer has that name", "known"),
     ],
 )
 def test_a_name_that_stands_for_nothing_is_refused_with_the_nearest(name: str, found: str, do: str) -> None:
     with pytest.raises(InputError, match=found) as caught:
-        parse_renderer(name)
+        resolve_renderer(name)
     assert re.search(do, caught.value.do_this)
 
 
@@ -63,10 +63,10 @@ def test_the_mode_decides_the_kind_of_session(straight_road: Scenario) -> None:
     assert isinstance(make_renderer("identity+clean", straight_road, overrides=("mode=chunk",)), ChunkRenderer)
 
 
-def test_a_plain_renderer_does_not_load_torch() -> None:
+def test_resolving_a_renderer_or_a_fixer_does_not_load_torch() -> None:
     code = (
-        "import sys; from alpasim_plugin.runtime.compose import parse_renderer, card_of;"
-        "parse_renderer('3dgs'); card_of('clean'); print('torch' in sys.modules)"
+        "import sys; from alpasim_plugin.parts import resolve_renderer;"
+        "resolve_renderer('3dgs'); resolve_renderer('onefixer'); print('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"
 
@@ -88,9 +88,12 @@ def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other() -> None:
     assert keys(("onefixer",), ("tolerance_m=0.02", "tolerance_deg=0.1")) == [fixed]  # the defaults, said aloud
 
 
-def test_what_3dgs_shows_enters_the_keys_of_its_rollouts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     before = keys(("clean", "3dgs", "identity", "identity+clean"))
-    monkeypatch.setattr("alpasim_plugin.renderers.reconstruction_key.VERSION", 0)
+    digest = spec.code_digest
+    monkeypatch.setattr(
+        spec, "code_digest", lambda file: digest(file) + ("edited" if str(file).endswith("renderers/reconstruction.py") else "")
+    )
     after = keys(("clean", "3dgs", "identity", "identity+clean"))
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, False, True]
 
@@ -103,10 +106,9 @@ def test_weights_enter_the_key_by_their_content_and_not_by_their_time(tmp_path: 
     assert keys(("onefixer",), (f"weights.dit={path}",)) == first
     path.write_bytes(b"two")
     assert keys(("onefixer",), (f"weights.dit={path}",)) != first
-    card = card_of("onefixer", (f"weights.dit={path}",))
-    assert card is not None
-    assert dict(card.weights) == {str(path): file_sha256(path)}
-    json.dumps(card.as_dict())
+    fixer = resolve("fixer", "onefixer", (f"weights.dit={path}",))
+    assert dict(fixer.files) == {str(path): file_sha256(path)}
+    json.dumps(fixer.as_dict())
 
 
 def test_one_renderer_under_two_names_is_refused() -> None:

@@ -11,7 +11,6 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from policies.base import loaded_by
 from policies.learned import Learned
 from scenarios.suite import expand
 
@@ -25,13 +24,12 @@ def keys() -> list[str]:
 def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     blind, seeing = keys()
     assert keys() == [blind, seeing]
-    monkeypatch.setattr(Learned, "loads", tmp_path / "other.safetensors")
+    monkeypatch.setattr(Learned, "files", (tmp_path / "other.safetensors",))
     with pytest.raises(InputError, match="policy 'learned'"):
         keys()
     (tmp_path / "other.safetensors").write_bytes(b"other")
     assert keys()[0] == blind
     assert keys()[1] != seeing
-    assert loaded_by("pure-pursuit") == ""
 
 
 def fixed_key(*overrides: str) -> str:

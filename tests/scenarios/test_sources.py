@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.parts import names
 from alpasim_plugin.types import Scenario
 from alpasim_plugin.world.actors import make_actors
 from alpasim_plugin.world.ego import ego_state_from_log
 from scenarios.load import load_scenario
-from scenarios.sources import SOURCES, detect
+from scenarios.sources import detect
 
 FOLDERS = {
     "argoverse": "av2/7fab2350",
@@ -90,5 +91,5 @@ def test_default_camera_looks_ahead_and_a_little_down() -> None:
 
 
 def test_every_source_has_help_and_a_reader() -> None:
-    assert list(SOURCES) == ["argoverse", "commonroad", "cosmos", "usdz"]
-    assert all(source.help for source in SOURCES.values())
+    assert list(names("source")) == ["argoverse", "commonroad", "cosmos", "usdz"]
+    assert all(names("source").values())

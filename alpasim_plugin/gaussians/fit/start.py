@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -108,7 +108,7 @@ def cloud_from_points(points: F64, rgb: F64, size: float = 1.0) -> GaussianCloud
     """
     n = len(points)
     if n > 1:
-        distance, _ = KDTree(points).query(points, k=min(4, n))
+        distance, _ = scipy.spatial.KDTree(points).query(points, k=min(4, n))
         sigma = (size * np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1))).clip(SMALLEST_M, LARGEST_M)
     else:
         sigma = np.full(n, LARGEST_M / 10)

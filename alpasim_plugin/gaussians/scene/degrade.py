@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
+import scipy
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
@@ -72,7 +72,7 @@ class Surrogate:
         self._line = resample(path, np.linspace(0.0, length, max(2, int(length) + 1))) if length > 0 else np.repeat(path[:1], 2, axis=0)
         self._eyes = self._line + np.array([0.0, 0.0, camera[2]])
         self._sway = _sway(scenario, self._line)
-        self._tree = KDTree(self._line[:, :2])
+        self._tree = scipy.spatial.KDTree(self._line[:, :2])
         self._reach = extended(path, scenario.ego_log.quat[0])
         self._recipes: dict[tuple[str, int], _Recipe] = {}
 

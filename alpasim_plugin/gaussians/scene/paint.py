@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site
 from alpasim_plugin.geometry import arc_lengths, resample
@@ -87,7 +87,7 @@ def _painted_edges(site: Site) -> list[tuple[F64, Paint]]:
     if not edges:
         return []
     owner, points, headings = _sample(edges)
-    near = KDTree(points).query_ball_point(points, SAME_EDGE_M)
+    near = scipy.spatial.KDTree(points).query_ball_point(points, SAME_EDGE_M)
     samples_of = [np.flatnonzero(owner == i) for i in range(len(edges))]
     accepted = np.zeros(len(edges), dtype=bool)
     chosen: list[tuple[F64, Paint]] = []

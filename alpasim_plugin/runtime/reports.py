@@ -1,0 +1,24 @@
+"""The reports of a run folder, written together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def write_reports(root: Path, flips: bool = True) -> Path:
+    """Write ``summary.md``, ``junit.xml`` and ``report.html`` of a run folder and return the path of the last.
+
+    Args:
+        root: A run folder whose tables are written.
+        flips: Look for scene-seed cells with another outcome than their baseline's first; logs of others have none.
+    """
+    # Plotting libraries take a second to load, and a run needs them only now.
+    from evaluators.report import write_junit, write_report, write_summary_md
+
+    if flips:
+        from alpasim_plugin.runtime.flips import write_flips
+
+        write_flips(root)
+    write_summary_md(root)
+    write_junit(root)
+    return write_report(root)

@@ -1,0 +1,178 @@
+"""A package with one part of every kind, installed for real, driven by two workers, edited, driven again."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TOY = Path(__file__).parent / "toy"
+REPO = Path(__file__).resolve().parents[2]
+NAMED = ("--renderer", "toy-grey,toy-brighten+toy-grey", "--policy", "toy-straight", "--controller", "toy-jump")
+IMPORTED = (
+    "--renderer",
+    "toy_parts:Grey,toy_parts:Brighten+toy_parts:Grey",
+    "--policy",
+    "toy_parts:Straight",
+    "--controller",
+    "toy_parts:Jump",
+)
+
+
+@dataclass(frozen=True)
+class Installed:
+    """A virtual environment with the toy package, and a folder to work in."""
+
+    python: Path
+    package: Path  # folder of the installed modules
+    work: Path
+
+    def simrun(self, *arguments: str, code: int = 0) -> Any:
+        """Run a command in the folder and return its JSON document."""
+        command = [str(self.python), "-m", "alpasim_plugin.cli.main", *arguments, "--json"]
+        path = os.pathsep.join([str(REPO), *(p for p in sys.path if "site-packages" in p)])
+        environment = os.environ | {"PYTHONPATH": path}
+        done = subprocess.run(command, cwd=self.work, env=environment, capture_output=True, text=True, check=False, timeout=240)
+        assert done.returncode == code, done.stdout + done.stderr
+        return json.loads(done.stdout)
+
+    def drive(self, out: str, *parts: str, scenario: str = "drive.toycsv", workers: int = 2) -> dict[str, bool]:
+        """Drive and return for every rollout whether it was made anew."""
+        rest = ("--seeds", "2", "--out", out, "--images", "none", "--certify", "none", "--workers", str(workers))
+        before = self.made(out)
+        self.simrun(*parts, *rest, scenario)
+        return {path: before.get(path) != at for path, at in self.made(out).items()}
+
+    def made(self, out: str) -> dict[str, int]:
+        """Return when every rollout's log was written."""
+        folder = self.work / out / "rollouts"
+        return {str(log.parent.relative_to(folder)): log.stat().st_mtime_ns for log in sorted(folder.rglob("rollout.asl"))}
+
+    def edit(self, name: str, old: str, new: str) -> None:
+        """Change a file of the installed package."""
+        file = self.package / name
+        assert old in file.read_text()
+        file.write_text(file.read_text().replace(old, new))
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """Install the toy with pip from a wheel; no index is needed, and the libraries are those of this environment."""
+    folder = tmp_path_factory.mktemp("toy")
+    wheel = folder / "simrun_toy-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name in ("toy_parts.py", "gain.txt"):
+            archive.write(TOY / name, name)
+        info = "simrun_toy-1.0.dist-info"
+        archive.write(TOY / "entry_points.txt", f"{info}/entry_points.txt")
+        archive.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: simrun-toy\nVersion: 1.0\n")
+        archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        files = ("toy_parts.py", "gain.txt", *(f"{info}/{name}" for name in ("entry_points.txt", "METADATA", "WHEEL", "RECORD")))
+        archive.writestr(f"{info}/RECORD", "".join(f"{name},,\n" for name in files))
+    subprocess.run([sys.executable, "-m", "venv", str(folder / "env")], check=True)
+    python = folder / "env" / "bin" / "python"
+    subprocess.run([str(python), "-m", "pip", "install", "-q", "--no-index", "--no-deps", str(wheel)], check=True, capture_output=True)
+    found = subprocess.run([str(python), "-c", "import site; print(site.getsitepackages()[0])"], check=True, capture_output=True, text=True)
+    work = folder / "work"
+    work.mkdir()
+    (work / "drive.toycsv").write_text("\n".join(f"{100_000 * i},{0.5 * i},0" for i in range(26)))
+    return Installed(python, Path(found.stdout.strip()), work)
+
+
+def test_parts_of_a_package_are_listed_driven_scored_and_compared(installed: Installed) -> None:
+    for kind in ("renderers", "fixers", "policies", "controllers", "evaluators", "sources"):
+        assert any(name.startswith("toy") for name in installed.simrun("list", kind)), kind
+    assert "toy_wobble_m" in installed.simrun("list", "metrics")
+
+    anew = installed.drive("run", *NAMED)
+    assert len(anew) == 4
+    assert all(anew.values())
+    summary = json.loads((installed.work / "run" / "summary.json").read_text())
+    assert set(summary["metrics"]) == {"toy-grey", "toy-brighten+toy-grey"}
+    assert summary["metrics"]["toy-grey"]["toy_wobble_m"]["unit"] == "m"
+    info = json.loads((installed.work / "run" / "run.json").read_text())
+    assert info["fixers"]["toy-brighten+toy-grey"]["label"] == "toy-brighten, trained"
+    assert info["metrics"]["toy_wobble_m"]["direction"] == "lower"
+    assert installed.simrun("compare", "run")["paired"]
+    assert not any(installed.drive("run", *NAMED).values()), "nothing has changed"
+
+
+def test_a_run_can_be_compared_where_its_plugins_are_not_installed(installed: Installed) -> None:
+    installed.drive("run", *NAMED)
+    elsewhere = Installed(Path(sys.executable), installed.package, installed.work)
+    assert "toy_wobble_m" in json.dumps(elsewhere.simrun("compare", "run"))
+
+
+@pytest.mark.parametrize("parts", [NAMED, IMPORTED], ids=["entry points", "package.module:Class"])
+def test_what_was_edited_is_driven_again_and_nothing_else(installed: Installed, parts: tuple[str, ...]) -> None:
+    out = "edited-" + ("named" if parts is NAMED else "imported")
+    source = () if parts is NAMED else ("--source", "toy_parts:Csv", "--evaluator", "toy_parts:Wobble")
+    if parts is IMPORTED:  # the metric would be given twice
+        installed.edit("simrun_toy-1.0.dist-info/entry_points.txt", "toy-wobble = toy_parts:Wobble\n", "")
+    everything = (*parts, *source)
+    try:
+        assert all(installed.drive(out, *everything).values())
+        assert not any(installed.drive(out, *everything).values())
+
+        installed.edit("gain.txt", "30", "31")  # the fixer's weights
+        anew = installed.drive(out, *everything)
+        assert {path: made for path, made in anew.items() if made} == {
+            path: True for path in anew if "Brighten" in path or "brighten" in path
+        }
+
+        installed.edit("toy_parts.py", "SPEED_MPS = 5.0", "SPEED_MPS = 4.0")  # code of the module that holds them all
+        assert all(installed.drive(out, *everything).values())
+        assert not any(installed.drive(out, *everything).values())
+    finally:
+        shutil.copy(TOY / "gain.txt", installed.package)
+        shutil.copy(TOY / "toy_parts.py", installed.package)
+        shutil.copy(TOY / "entry_points.txt", installed.package / "simrun_toy-1.0.dist-info")
+
+
+def test_an_edited_policy_file_is_driven_again(installed: Installed) -> None:
+    mine = installed.work / "policies"
+    mine.mkdir()
+    (mine / "helper.py").write_text("SPEED_MPS = 3.0\n")
+    text = (TOY / "toy_parts.py").read_text().replace("SPEED_MPS = 5.0", "from helper import SPEED_MPS")
+    (mine / "mine.py").write_text(text)
+    for name in ("policies.mine:Straight", "policies/mine.py:Straight"):
+        parts = ("--renderer", "toy-grey", "--policy", name)
+        out = f"file-{'py' in name}"
+        assert all(installed.drive(out, *parts).values())
+        assert not any(installed.drive(out, *parts).values())
+        (mine / "helper.py").write_text(f"SPEED_MPS = {2.0 + len(name) * 1e-3}\n")
+        assert all(installed.drive(out, *parts).values()), "the policy imports a file that was edited"
+
+
+def test_a_remote_part_is_never_reused_unasked(installed: Installed) -> None:
+    parts = ("--renderer", "toy://host:1", "--policy", "toy-straight")
+    assert all(installed.drive("remote", *parts).values())
+    assert all(installed.drive("remote", *parts).values())
+    assert not any(installed.drive("remote", *parts, "--resume").values())
+
+
+def test_folders_named_like_ours_do_not_shadow_them(installed: Installed) -> None:
+    for name in ("policies", "evaluators", "scenarios", "configs"):
+        (installed.work / name).mkdir(exist_ok=True)
+        (installed.work / name / "__init__.py").write_text("raise ImportError('the wrong package')\n")
+    try:
+        assert "lane-camera" in installed.simrun("list", "policies")
+        assert all(installed.drive("shadow", "--renderer", "toy-grey", "--policy", "toy-straight").values())
+    finally:
+        for name in ("policies", "evaluators", "scenarios", "configs"):
+            (installed.work / name / "__init__.py").unlink()
+
+
+def test_a_factory_that_asks_for_something_else_is_told_what_there_is(installed: Installed) -> None:
+    (installed.work / "odd.py").write_text("class Odd:\n    def __init__(self, gain):\n        pass\n")
+    error = installed.simrun("--renderer", "toy-grey", "--policy", "odd.py:Odd", "--seeds", "1", "--out", "odd", "drive.toycsv", code=4)
+    failed = error["summary"]["failures"]["cells"][0]["error"]
+    assert (failed["found"], failed["failure_class"]) == ("its factory asks for gain", "input")
