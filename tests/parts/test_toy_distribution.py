@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +44,11 @@ class Installed:
         assert done.returncode == code, done.stdout + done.stderr
         return json.loads(done.stdout)
 
-    def drive(self, out: str, *parts: str, scenario: str = "drive.toycsv", workers: int = 2) -> dict[str, bool]:
+    def drive(self, out: str, *parts: str, workers: int = 1) -> dict[str, bool]:
         """Drive and return for every rollout whether it was made anew."""
         rest = ("--seeds", "2", "--out", out, "--images", "none", "--certify", "none", "--workers", str(workers))
         before = self.made(out)
-        self.simrun(*parts, *rest, scenario)
+        self.simrun(*parts, *rest, "drive.toycsv")
         return {path: before.get(path) != at for path, at in self.made(out).items()}
 
     def made(self, out: str) -> dict[str, int]:
@@ -87,12 +87,14 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     return Installed(python, Path(found.stdout.strip()), work)
 
 
-def test_parts_of_a_package_are_listed_driven_scored_and_compared(installed: Installed) -> None:
-    for kind in ("renderers", "fixers", "policies", "controllers", "evaluators", "sources"):
-        assert any(name.startswith("toy") for name in installed.simrun("list", kind)), kind
-    assert "toy_wobble_m" in installed.simrun("list", "metrics")
+def test_parts_of_a_package_are_listed(installed: Installed) -> None:
+    listed = {kind: installed.simrun("list", kind) for kind in ("renderers", "metrics")}
+    assert {"toy-grey", "toy://"} <= set(listed["renderers"])
+    assert "toy_wobble_m" in listed["metrics"]
 
-    anew = installed.drive("run", *NAMED)
+
+def test_a_run_is_driven_scored_compared_and_driven_again_where_it_was_edited(installed: Installed) -> None:
+    anew = installed.drive("run", *NAMED, workers=2)
     assert len(anew) == 4
     assert all(anew.values())
     summary = json.loads((installed.work / "run" / "summary.json").read_text())
@@ -102,54 +104,51 @@ def test_parts_of_a_package_are_listed_driven_scored_and_compared(installed: Ins
     assert info["fixers"]["toy-brighten+toy-grey"]["label"] == "toy-brighten, trained"
     assert info["metrics"]["toy_wobble_m"]["direction"] == "lower"
     assert installed.simrun("compare", "run")["paired"]
-    assert not any(installed.drive("run", *NAMED).values()), "nothing has changed"
-
-
-def test_a_run_can_be_compared_where_its_plugins_are_not_installed(installed: Installed) -> None:
-    installed.drive("run", *NAMED)
-    elsewhere = Installed(Path(sys.executable), installed.package, installed.work)
+    elsewhere = replace(installed, python=Path(sys.executable))  # the plug-ins are not installed there
     assert "toy_wobble_m" in json.dumps(elsewhere.simrun("compare", "run"))
+    edit_and_drive_again(installed, "run", *NAMED)
 
 
-@pytest.mark.parametrize("parts", [NAMED, IMPORTED], ids=["entry points", "package.module:Class"])
-def test_what_was_edited_is_driven_again_and_nothing_else(installed: Installed, parts: tuple[str, ...]) -> None:
-    out = "edited-" + ("named" if parts is NAMED else "imported")
-    source = () if parts is NAMED else ("--source", "toy_parts:Csv", "--evaluator", "toy_parts:Wobble")
-    if parts is IMPORTED:  # the metric would be given twice
-        installed.edit("simrun_toy-1.0.dist-info/entry_points.txt", "toy-wobble = toy_parts:Wobble\n", "")
-    everything = (*parts, *source)
+@pytest.mark.slow
+def test_parts_named_by_import_path_are_driven_again_where_they_were_edited(installed: Installed) -> None:
+    installed.edit("simrun_toy-1.0.dist-info/entry_points.txt", "toy-wobble = toy_parts:Wobble\n", "")  # or the metric is given twice
     try:
-        assert all(installed.drive(out, *everything).values())
-        assert not any(installed.drive(out, *everything).values())
-
-        installed.edit("gain.txt", "30", "31")  # the fixer's weights
-        anew = installed.drive(out, *everything)
-        assert {path: made for path, made in anew.items() if made} == {
-            path: True for path in anew if "Brighten" in path or "brighten" in path
-        }
-
-        installed.edit("toy_parts.py", "SPEED_MPS = 5.0", "SPEED_MPS = 4.0")  # code of the module that holds them all
-        assert all(installed.drive(out, *everything).values())
-        assert not any(installed.drive(out, *everything).values())
+        parts = (*IMPORTED, "--source", "toy_parts:Csv", "--evaluator", "toy_parts:Wobble")
+        assert all(installed.drive("imported", *parts).values())
+        edit_and_drive_again(installed, "imported", *parts)
     finally:
-        shutil.copy(TOY / "gain.txt", installed.package)
-        shutil.copy(TOY / "toy_parts.py", installed.package)
         shutil.copy(TOY / "entry_points.txt", installed.package / "simrun_toy-1.0.dist-info")
 
 
-def test_an_edited_policy_file_is_driven_again(installed: Installed) -> None:
+def edit_and_drive_again(installed: Installed, out: str, *parts: str) -> None:
+    """Edit the fixer's weights and then the module of all parts, and check after each what is driven anew."""
+    try:
+        assert not any(installed.drive(out, *parts, workers=2).values()), "nothing has changed"
+        installed.edit("gain.txt", "30", "31")
+        anew = installed.drive(out, *parts, workers=2)
+        assert anew == {path: "righten" in path for path in anew}, "the fixer's rollouts alone"
+        installed.edit("toy_parts.py", "SPEED_MPS = 5.0", "SPEED_MPS = 4.0")
+        assert all(installed.drive(out, *parts, workers=2).values())
+    finally:
+        shutil.copy(TOY / "gain.txt", installed.package)
+        shutil.copy(TOY / "toy_parts.py", installed.package)
+
+
+@pytest.mark.parametrize(
+    "name", ["policies.mine:Straight", pytest.param("policies/mine.py:Straight", marks=pytest.mark.slow)], ids=["module", "file"]
+)
+def test_an_edited_policy_file_is_driven_again(installed: Installed, name: str) -> None:
     mine = installed.work / "policies"
-    mine.mkdir()
+    mine.mkdir(exist_ok=True)
     (mine / "helper.py").write_text("SPEED_MPS = 3.0\n")
     text = (TOY / "toy_parts.py").read_text().replace("SPEED_MPS = 5.0", "from helper import SPEED_MPS")
     (mine / "mine.py").write_text(text)
-    for name in ("policies.mine:Straight", "policies/mine.py:Straight"):
-        parts = ("--renderer", "toy-grey", "--policy", name)
-        out = f"file-{'py' in name}"
-        assert all(installed.drive(out, *parts).values())
-        assert not any(installed.drive(out, *parts).values())
-        (mine / "helper.py").write_text(f"SPEED_MPS = {2.0 + len(name) * 1e-3}\n")
-        assert all(installed.drive(out, *parts).values()), "the policy imports a file that was edited"
+    parts = ("--renderer", "toy-grey", "--policy", name)
+    out = f"file-{'.py' in name}"
+    assert all(installed.drive(out, *parts).values())
+    assert not any(installed.drive(out, *parts).values())
+    (mine / "helper.py").write_text("SPEED_MPS = 2.5\n")
+    assert all(installed.drive(out, *parts).values()), "the policy imports a file that was edited"
 
 
 def test_a_remote_part_is_never_reused_unasked(installed: Installed) -> None:

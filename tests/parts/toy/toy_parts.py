@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -81,7 +82,7 @@ class Jump:
 class Wobble:
     """A metric of its own."""
 
-    metrics = {"toy_wobble_m": MetricInfo("m", "lower", "max", "largest lateral coordinate, for a test")}
+    metrics: ClassVar = {"toy_wobble_m": MetricInfo("m", "lower", "max", "largest lateral coordinate, for a test")}
 
     def __call__(self, rollout, scene):
         return [series("toy_wobble_m", rollout.ego.t_us, np.abs(rollout.ego.xyz[:, 1]) / DIVISOR)]
@@ -100,7 +101,8 @@ class Csv:
         rows = np.array([line.split(",") for line in data.decode().split()], dtype=np.float64)
         xyz = np.column_stack([rows[:, 1:], np.zeros(len(rows))])
         drive = Trajectory(rows[:, 0].astype(np.int64), xyz, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)))
-        lane = Lane("lane", xyz, xyz + [0, 2, 0], xyz - [0, 2, 0])
+        aside = np.array([0.0, 2.0, 0.0])
+        lane = Lane("lane", xyz, xyz + aside, xyz - aside)
         return RecordedLog(
             path.stem, "toy", LaneMap({"lane": lane}), flat(0.0), drive, Vehicle(Box(4.0, 1.8, 1.5)), (), (), (0.0, 0.0, 0.0),
             hashlib.sha256(data).hexdigest(),
