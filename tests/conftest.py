@@ -1,17 +1,25 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests.
+
+Hypothesis draws few examples of each property by default, the same ones in every run. The full numbers, which stand beside the properties
+(`tests.examples`), are drawn with ``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-settings.register_profile("same-every-time", derandomize=True, deadline=None)
-settings.load_profile("same-every-time")
+from tests.examples import PROFILE, examples
+
+settings.register_profile(PROFILE, derandomize=PROFILE == "quick", deadline=None, max_examples=examples(100))
+settings.load_profile(PROFILE)
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one worker a core: threads of several workers on the same cores wait for each other
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -27,9 +35,34 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
+# A kernel's first call compiles it, for half a minute, and leaves it on disk for every later process. The files that compile the three
+# groups of kernels come first, one a worker, so that no two processes compile the same ones; then what takes longest, so that no worker is
+# left alone with it at the end.
+FIRST = ("gaussians/test_rasterize_hard_cases.py", "semantic_map/test_draw.py", "gaussians/test_rasterize_gradient.py")
+LONG = ("runtime", "gaussians", "cli", "renderers", "training", "fixers")
+
+
+def order_of(item: pytest.Item) -> int:
+    """Return when the file of a test is due: smaller is earlier."""
+    folder, file = item.path.parent.name, item.path.name
+    if f"{folder}/{file}" in FIRST:
+        return FIRST.index(f"{folder}/{file}")
+    return len(FIRST) + (LONG.index(folder) if folder in LONG else len(LONG))
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that take longest, so that no worker is left alone with one at the end."""
-    items.sort(key=lambda item: item.path.parent.name != "runtime")
+    """Put the files in the order in which workers take them."""
+    items.sort(key=order_of)
+
+
+@pytest.fixture(autouse=True)
+def same_threads() -> Iterator[None]:
+    """Leave torch's number of threads as it was: two workers with two threads each wait for one another most of the time."""
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch else 0
+    yield
+    if torch and torch.get_num_threads() != before:
+        torch.set_num_threads(before)
 
 
 def find_shared_data() -> Path | None:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.config import apply_overrides, load_yaml, parse_scalar, validate
 from alpasim_plugin.errors import InputError
+from tests.examples import examples
 
 
 class Wheel(BaseModel):
@@ -239,7 +240,7 @@ def test_bad_overrides_are_refused(tmp_path: Path, text: str, found: str) -> Non
     assert f"--set {text}" in e.value.with_what
 
 
-@settings(deadline=None, max_examples=80)
+@settings(deadline=None, max_examples=examples(80))
 @given(st.text(max_size=60))
 def test_any_text_gives_data_or_a_four_part_error(text: str) -> None:
     error = None

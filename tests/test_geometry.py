@@ -26,6 +26,7 @@ from alpasim_plugin.geometry import (
     yaw_from_quat,
 )
 from alpasim_plugin.types import Trajectory
+from tests.examples import examples
 
 EPOCH_US = 1_689_697_803_493_732  # a recorded time stamp: larger than a float32, and than 2^50
 
@@ -56,7 +57,7 @@ def test_heading_of_180_degrees_wraps_to_the_lower_end() -> None:
     np.testing.assert_allclose(yaw_from_quat(quat_from_yaw(np.array([3.0, -3.0]))), [3.0, -3.0])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(unit_quats, unit_quats, st.floats(0, 1))
 def test_slerp_agrees_with_scipy(q0: np.ndarray, q1: np.ndarray, fraction: float) -> None:
     ours = slerp(q0[None], q1[None], np.array([fraction]))[0]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.alpasim.asl import AslFile, AslReader
 from alpasim_plugin.alpasim.wire import logging_pb2
 from alpasim_plugin.errors import InfrastructureError, InputError
+from tests.examples import examples
 
 
 def entry(t_us: int = 7, ids: tuple[str, ...] = ("EGO",)) -> logging_pb2.LogEntry:
@@ -31,7 +32,7 @@ entries_strategy = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(entries=entries_strategy)
 def test_any_entries_come_back_in_order(tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry]) -> None:
     path = write(tmp_path_factory.mktemp("asl") / "a.asl", entries)
@@ -41,7 +42,7 @@ def test_any_entries_come_back_in_order(tmp_path_factory: pytest.TempPathFactory
     assert path.stat().st_size == sum(4 + e.ByteSize() for e in entries)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(entries=entries_strategy, data=st.data())
 def test_a_cut_anywhere_loses_only_the_last_entry(
     tmp_path_factory: pytest.TempPathFactory, entries: list[logging_pb2.LogEntry], data: st.DataObject

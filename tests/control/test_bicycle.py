@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.control.bicycle import BicycleState, Command, exact_arc, step
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import Vehicle
+from tests.examples import examples
 
 VEHICLE = Vehicle()
 # No limits: the wheel follows at once, so that a manoeuvre can be anything.
@@ -37,7 +38,7 @@ def test_default_step_stays_within_a_tenth_of_a_millimetre_on_the_tightest_circl
     assert error_m(end, exact_arc(start, 0.0, 60.0, VEHICLE.wheelbase_m)) < 1e-4
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(speed=st.floats(-10, 40), steer=st.floats(-0.55, 0.55), yaw=st.floats(-4, 4), drive=st.floats(-3, 3), seconds=st.floats(0.001, 2.0))
 def test_any_held_command_matches_the_closed_solution(speed: float, steer: float, yaw: float, drive: float, seconds: float) -> None:
     start = BicycleState(1e5, -2e5, yaw, speed, steer)

@@ -16,6 +16,7 @@ from alpasim_plugin.control.tracker import MAX_LATERAL_MPS2
 from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_of
 from alpasim_plugin.types import EgoState, Trajectory, Vehicle
+from tests.examples import examples
 
 VEHICLE = Vehicle()
 TRACKER = make_controller("bicycle", VEHICLE)
@@ -166,7 +167,7 @@ def test_plan_beside_a_fast_car_is_not_met_with_more_grip_than_tyres_have() -> N
     assert max(abs(s.yaw_rate_radps * s.speed_mps) for s in states) <= MAX_LATERAL_MPS2 * 1.02
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(data=st.data())
 def test_any_finite_plan_keeps_state_finite_and_within_the_limits(data: st.DataObject) -> None:
     n = data.draw(st.integers(1, 12))

@@ -15,6 +15,7 @@ from evaluators import PRESETS, score
 from evaluators.footprint import ActorTable, corners, ego_footprints, origin_of
 from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
+from tests.examples import examples
 
 PAPER = PRESETS["paper"]
 HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
@@ -183,7 +184,7 @@ def situations(draw):
     return rollout(ego, actors), size
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(situations())
 def test_array_search_and_exact_twin_agree_on_hard_situations(case):
     log, size = case
@@ -192,7 +193,7 @@ def test_array_search_and_exact_twin_agree_on_hard_situations(case):
     assert_twins_agree(log, replace(PAPER, ego_size_m=size))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.floats(-1e-9, 1e-9), st.floats(-np.pi, np.pi), st.sampled_from([0.0, 5e6]))
 def test_flips_stay_within_a_nanometre_of_touching(nudge, yaw, offset):
     """Whole scene turned and moved: rounding of the corners may flip a contact only next to the touching position."""

@@ -18,6 +18,7 @@ from evaluators.footprint import corners
 from evaluators.surface import MARGIN_M, Region, Surface, closed_union
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference_strict import depth_by_points
+from tests.examples import examples
 
 STRICT = PRESETS["strict"]
 HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
@@ -203,7 +204,7 @@ def layouts(draw):
     return rings
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=examples(15), deadline=None, derandomize=True)
 @given(layouts(), COORDINATE, COORDINATE, st.sampled_from([0.0, math.pi, math.pi / 2, 0.4, -2.0]))
 def test_random_layouts_agree_with_distances_point_by_point(rings, x, y, yaw):
     areas = np.array([lane_polygon(_as_lane(ring)) for ring in rings], dtype=object)
@@ -231,7 +232,7 @@ def _as_lane(ring):
     return Lane("l", points[:2], points[: len(points) // 2 + 1], points[len(points) // 2 + 1 :][::-1])
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=examples(25), deadline=None, derandomize=True)
 @given(st.floats(-6, 6), st.floats(-6, 6), st.floats(-3.2, 3.2), st.sampled_from([(0.0, 0.0), (691_608.0, 5_334_760.0)]))
 def test_moving_the_world_moves_no_margin_by_more_than_the_tolerance(x, y, yaw, offset):
     square = np.array([[-5.0, -4.0], [5.0, -4.0], [5.0, 4.0], [-5.0, 4.0]])

@@ -18,6 +18,7 @@ from evaluators.offroad import containment
 from evaluators.road import road_of
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference import convex_contains
+from tests.examples import examples
 
 PAPER = PRESETS["paper"]
 HALF_W = 0.94
@@ -227,7 +228,7 @@ def roads(draw):
     return road_map(*lanes, edges=edges)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=examples(120), deadline=None)
 @given(
     roads(),
     st.lists(st.tuples(half_metre, half_metre, st.sampled_from([0.0, np.pi, -np.pi, 0.3, np.pi / 2])), min_size=1, max_size=4),
@@ -252,7 +253,7 @@ def test_array_evaluation_and_twin_agree_on_hard_roads(lane_map, poses, offset):
     assert (held(log, lane_map).in_one | held(log, lane_map).in_union).tolist() == [one.on_road for one in slow]
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(st.floats(-1e-12, 1e-12), st.floats(0.0, 2 * np.pi))
 def test_a_footprint_on_the_lane_border_flips_only_next_to_it(nudge, turn):
     """The road turned as a whole; the exact twin decides on the same rounded corners."""

@@ -14,12 +14,13 @@ from evaluators import aggregate
 from evaluators.aggregate.bootstrap import cluster_bootstrap
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, rate_interval, wilson_rate
 from tests.evaluators.test_tables_over_rollouts import rows_of
+from tests.examples import examples
 
 shares = st.lists(st.sampled_from([0.0, 0.2, 1 / 3, 0.5, 0.8, 1.0]), min_size=2, max_size=40)
 
 
 @given(shares)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_bounds_of_a_rate_hold_its_centre_and_never_leave_zero_to_one(means):
     one = rate_interval(np.array(means))
     assert 0.0 <= one.low <= one.centre + 1e-12
@@ -28,7 +29,7 @@ def test_bounds_of_a_rate_hold_its_centre_and_never_leave_zero_to_one(means):
 
 
 @given(shares)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_counting_non_events_instead_of_events_mirrors_the_bounds(means):
     one, other = rate_interval(np.array(means)), rate_interval(1.0 - np.array(means))
     assert (one.low, one.high) == pytest.approx((1 - other.high, 1 - other.low), abs=1e-9)

@@ -15,6 +15,7 @@ from evaluators import rollout_values, score
 from evaluators.route import progress_so_far, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step
+from tests.examples import examples
 
 
 def scored(log):
@@ -100,7 +101,7 @@ def test_a_polyline_with_repeated_points_and_a_path_that_comes_back():
 xy = st.tuples(st.integers(-6, 6).map(float), st.integers(-6, 6).map(float))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(st.lists(st.tuples(xy, xy), min_size=2, max_size=8), st.sampled_from([0.0, 5_334_000.0]))
 def test_array_projection_and_twin_agree(points, offset):
     recorded, driven = (np.array(column) for column in zip(*points, strict=True))

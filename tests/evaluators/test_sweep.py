@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from evaluators.sweep import TOUCH_M, Motions, first_contact, gaps, slope
 from tests.evaluators.reference_strict import Motion, first_touch, separation
+from tests.examples import examples
 
 EGO = (4.855, 1.88)
 CAR = (4.5, 1.8)
@@ -114,7 +115,7 @@ SIZE = st.sampled_from([CAR, EGO, (12.0, 2.5), (0.1, 0.1), (0.5, 0.5), (30.0, 0.
 BODIES = st.builds(lambda x, y, dx, dy, *rest: Motion((x, y), (dx, dy), *rest), NEAR, NEAR, NEAR, NEAR, HEADING, TURN, SIZE)
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=examples(25), deadline=None, derandomize=True)
 @given(BODIES, BODIES)
 def test_random_motions_agree_with_the_decimal_twin(a, b):
     assert_twins_agree(a, b)
@@ -123,7 +124,7 @@ def test_random_motions_agree_with_the_decimal_twin(a, b):
 GRAZE = st.sampled_from([0.0, 1e-12, -1e-12, 9e-10, 1.1e-9, 1e-8, -1e-8, 1e-6])
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=examples(20), deadline=None, derandomize=True)
 @given(HEADING, st.floats(1.0, 20.0), GRAZE, st.booleans())
 def test_grazing_passes_flip_only_inside_the_band_and_to_either_side(heading, speed, out, left):
     """A car passes a parked one at a given gap; turned as a whole, as the rounding of corners differs with the heading."""

@@ -22,6 +22,7 @@ from evaluators.step_contact import find_contacts
 from evaluators.swept_contact import PLACE_M, find_swept
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 from tests.evaluators.reference_strict import Motion, first_touch, side_at
+from tests.examples import examples
 
 STRICT = PRESETS["strict"]
 HALF_L, HALF_W = 4.855 / 2, 1.88 / 2
@@ -282,7 +283,7 @@ def worlds(draw):
     return rollout(track(ego_x, y0, yaw=ego_yaw), actors)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=examples(40), deadline=None, derandomize=True)
 @given(worlds())
 def test_random_worlds_agree_with_the_twin(log):
     fast, slow = fast_rows(log), twin_rows(log)

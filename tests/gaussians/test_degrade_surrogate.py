@@ -28,6 +28,7 @@ from alpasim_plugin.gaussians.scene.surfels import cloud_of, with_sheen
 from alpasim_plugin.gaussians.sh import dc_from_rgb, sh_colours
 from alpasim_plugin.geometry import se2
 from alpasim_plugin.types import Degradation, Scenario
+from tests.examples import examples
 from tests.gaussians.scene_maps import camera_spec, curve, parked, straight
 
 UNIT = Degradation("surrogate", severity=1.0, onset_m=0.3, full_m=3.0)  # the amounts that the expectations below are written for
@@ -72,7 +73,7 @@ def test_weight_of_a_log_that_stands_still_is_measured_from_its_heading_line() -
     assert s.weight(se2(0.0, 2.0, 0.0)) == 1.0
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(st.floats(-3.0, 3.0), st.floats(0.05, 0.9))
 def test_weight_follows_the_lateral_offset_along_a_curve(offset_m: float, share: float) -> None:
     scenario = curve(degradation=UNIT)

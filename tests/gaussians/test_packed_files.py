@@ -21,6 +21,7 @@ from alpasim_plugin.gaussians.files.ply_header import read_ply_header
 from alpasim_plugin.gaussians.files.splat import read_splat, write_splat
 from alpasim_plugin.gaussians.files.spz import read_spz, unpack_smallest_three
 from alpasim_plugin.gaussians.sh import sh_basis
+from tests.examples import examples
 
 
 @pytest.fixture
@@ -221,7 +222,7 @@ def test_version_2_rotation_is_xyz_bytes(tmp_path: Path) -> None:
     np.testing.assert_allclose(quat, [0, 1, 1 / 255, -1 / 255], atol=1e-2)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: max(map(abs, q)) > 0.1))
 def test_smallest_three_rotation_is_restored(q: list[float]) -> None:
     xyzw = np.array(q) / np.linalg.norm(q)

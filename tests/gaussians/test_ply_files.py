@@ -15,6 +15,7 @@ from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
 from alpasim_plugin.gaussians.files.formats import read_gaussians
 from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays
 from alpasim_plugin.gaussians.files.ply_header import read_ply_element, read_ply_header
+from tests.examples import examples
 
 
 def make_cloud(n: int = 5, k: int = 16, seed: int = 3) -> GaussianCloud:
@@ -113,7 +114,7 @@ def test_every_degree_survives_a_round_trip(tmp_path: Path, k: int, precision: s
     np.testing.assert_allclose(back.opacities, cloud.opacities, rtol=max(exact, 1e-15))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(
     sh=hnp.arrays(
         np.float32, st.tuples(st.integers(0, 4), st.sampled_from([1, 4, 9, 16]), st.just(3)), elements=st.floats(-9, 9, width=32)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
+from tests.examples import examples
 from tests.gaussians.gaussian_scenes import assert_same_image, camera, random_cloud, random_rigid, splats
 
 BACKENDS = ("reference", "cpu", "torch")
@@ -57,7 +58,7 @@ def test_reference_boxes_change_nothing_against_all_pixels():
 
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 @given(seed=st.integers(0, 10_000), degree=st.integers(0, 3), near_m=st.sampled_from([0.1, 1.0, 3.0]))
 def test_random_scenes_equal_brute_force(backend, seed, degree, near_m):
     cloud, T = random_cloud(200, seed, degree), random_rigid(seed)

@@ -15,6 +15,7 @@ from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from alpasim_plugin.geometry import quat_from_yaw, se2, se3
 from alpasim_plugin.seeding import stream
+from tests.examples import examples
 from tests.gaussians.scene_maps import camera_spec, straight
 
 SKY = make_sky("clear", stream("t", 0, "sky"))
@@ -91,7 +92,7 @@ def test_node_beyond_its_far_limit_is_not_drawn() -> None:
     assert graph.render(camera(), {}).stats["nodes"] == 0
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 @given(st.tuples(*[st.floats(-30, 30)] * 3), st.floats(0.0, 5.0), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(-np.pi, np.pi))
 def test_sphere_with_a_visible_point_is_always_in_view(
     centre: tuple[float, float, float], radius: float, inside: tuple[float, float, float], yaw: float

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import sph_harm_y
 
 from alpasim_plugin.gaussians.sh import C0, dc_from_rgb, rotate_sh, sh_basis, sh_colours, sh_rotation
+from tests.examples import examples
 from tests.gaussians.gaussian_scenes import random_rigid
 
 
@@ -52,7 +53,7 @@ def test_colours_are_clamped_below_and_not_above():
     assert sh_colours(sh, [[0, 0, 1.0]])[0].tolist() == pytest.approx([0.0, 0.5 + 5 * C0, 0.5])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(seed=st.integers(0, 10_000), size=st.sampled_from([1, 4, 9, 16]))
 def test_rotated_coefficients_show_the_colour_of_the_turned_back_direction(seed, size):
     R = random_rigid(seed)[:3, :3]

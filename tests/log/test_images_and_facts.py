@@ -12,9 +12,10 @@ from hypothesis.extra import numpy as hnp
 
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log import decode_image, encode_image, read_facts, write_facts
+from tests.examples import examples
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(hnp.arrays(np.uint8, st.tuples(st.integers(1, 20), st.integers(1, 20), st.just(3))))
 def test_png_is_exact(rgb: np.ndarray) -> None:
     np.testing.assert_array_equal(decode_image(encode_image(rgb, "png")), rgb)

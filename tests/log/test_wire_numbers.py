@@ -16,10 +16,11 @@ from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_from_quat
 from alpasim_plugin.log import AslWriter
 from alpasim_plugin.log.schema import read_poses, wire_poses, wire_trajectory
 from alpasim_plugin.types import Actor, Box, Trajectory
+from tests.examples import examples
 from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(
     xyz=st.lists(st.floats(-9e4, 9e4), min_size=3, max_size=3),
     quat=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3),
@@ -33,7 +34,7 @@ def test_any_pose_survives_within_float32(xyz: list[float], quat: list[float]) -
     assert abs(np.linalg.norm(back_quat[0]) - 1) < 1e-12
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(n=st.integers(0, 6), seed=st.integers(0, 1000), zeros=st.booleans())
 def test_trajectory_laid_out_by_arrays_equals_one_built_message_by_message(n: int, seed: int, zeros: bool) -> None:
     rng = np.random.default_rng(seed)

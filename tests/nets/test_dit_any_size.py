@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
+from tests.examples import examples
 from tests.nets.dit_cases import clip, furthest, stream
 from tests.nets.dit_reference import random_weights, velocity
 
@@ -30,7 +31,7 @@ def sizes(draw) -> DiTSizes:
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(data=st.data(), sizes=sizes())
 def test_any_size_is_read_and_computed(data, sizes):
     frames, block = data.draw(st.integers(1, 5)), data.draw(st.none() | st.integers(1, 4))
@@ -54,7 +55,7 @@ def test_any_size_is_read_and_computed(data, sizes):
     assert furthest(v, expected) < 1e-4
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(data=st.data(), sizes=sizes())
 def test_any_size_streams_as_its_mask_says(data, sizes):
     block, blocks = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 4))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.nets import DiTSizes
 from alpasim_plugin.nets.attention import block_causal_attention, block_causal_reference
+from tests.examples import examples
 from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
 from tests.nets.dit_reference import latent_mask, random_weights, velocity
 
@@ -34,7 +35,7 @@ def test_network_is_the_written_out_one_at_any_size(sizes, frames, block, ratios
     assert furthest(v, velocity(weights, x, t, text, hdmap, mask, block, ratios)) < 1e-4
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     blocks=st.lists(st.integers(1, 4), min_size=1, max_size=5),
     window=st.integers(1, 12),
@@ -54,7 +55,7 @@ def test_rolling_cache_is_the_growing_one(blocks, window, sink, batch, size):
             assert furthest(ours, twins) < 1e-5
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     frames=st.integers(1, 9),
     block=st.integers(1, 4),
@@ -74,7 +75,7 @@ def test_blocks_through_a_cache_are_the_whole_clip_under_the_same_window(frames,
             assert furthest(blocks, net(x, t, text, hdmap, None, block)) < 1e-5
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     frames=st.integers(1, 8),
     block=st.integers(1, 5),

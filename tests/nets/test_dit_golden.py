@@ -142,7 +142,7 @@ def test_embeddings(net, io):
 
 
 def test_time_steps_rounded_as_the_training_code_rounds_them(io):
-    """Sines differ by an ulp or two between processors; a bfloat16 result moves by one step, and only at a rounding boundary."""
+    """Sines differ by an ulp or two between processors; a bfloat16 result moves only where that crosses a rounding boundary."""
     t, exact, rounded = io["in.time.t"], io["out.time.sinusoid_fp32"], io["out.time.sinusoid_bf16_path"]
     torch.testing.assert_close(sinusoid(t, 64), exact, atol=4 * EPSILON, rtol=0)
     found = sinusoid(t, 64, torch.bfloat16)

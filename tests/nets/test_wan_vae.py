@@ -16,6 +16,7 @@ from alpasim_plugin.nets.clips import crop_clip, pad_clip
 from alpasim_plugin.nets.wan_vae import WanVAE
 from alpasim_plugin.nets.wan_vae_blocks import causal_conv, causal_conv_reference
 from alpasim_plugin.nets.wan_vae_layout import WanLayout, read_layout
+from tests.examples import examples
 from tests.nets.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 
 
@@ -219,7 +220,7 @@ def test_one_bad_pixel_does_not_reach_earlier_frames(vae: WanVAE) -> None:
 # Convolutions
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(past=st.integers(0, 2), frames=st.integers(1, 5), inputs=st.integers(1, 5), outputs=st.integers(1, 5), side=st.sampled_from([1, 3]))
 def test_summed_2d_convolutions_equal_the_3d_one(past: int, frames: int, inputs: int, outputs: int, side: int) -> None:
     joined = noise(2, past + frames, 4, 5, inputs, seed=past)

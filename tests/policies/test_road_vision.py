@@ -14,6 +14,7 @@ from policies.lane_filter import LaneState, predict, search, shift, start, updat
 from policies.lane_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Block, Line, PaintedRoad, pinhole_camera
+from tests.examples import examples
 
 CAMERA = pinhole_camera()
 GRID = make_grid(CAMERA)
@@ -125,7 +126,7 @@ def settled(points: PaintPoints, lane: LaneState) -> LaneState:
     return lane
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(offset=st.floats(-0.6, 0.6), heading=st.floats(-0.08, 0.08), curvature=st.floats(-0.015, 0.015), width=st.floats(3.0, 4.0))
 def test_lane_is_recovered_from_its_paint(offset: float, heading: float, curvature: float, width: float) -> None:
     points = paint_of(offset, heading, curvature, width)

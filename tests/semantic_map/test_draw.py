@@ -17,6 +17,7 @@ from alpasim_plugin.semantic_map.projection import FThetaCamera
 from alpasim_plugin.semantic_map.reference import draw_map_reference, draw_reference
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL
 from alpasim_plugin.types import Actor, Box, CameraSpec, FTheta, LaneMap, Trajectory
+from tests.examples import examples
 
 # Camera axes in a rig that looks along x.
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -364,7 +365,7 @@ def test_few_pieces_draw_what_dense_points_draw(camera):
     assert (difference > 100).mean() < 0.001
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     a=st.tuples(*[st.floats(-30, 60)] * 2, st.floats(-3, 6)),
     b=st.tuples(*[st.floats(-30, 60)] * 2, st.floats(-3, 6)),
@@ -383,7 +384,7 @@ def test_any_line_is_drawn_like_its_dense_points(a, b, fish, yaw):
     assert (np.abs(fast.astype(int) - twin).max(axis=2)[same] > 16).mean() < 0.002
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(x=st.floats(-4, 30), y=st.floats(-8, 8), yaw=st.floats(-3.1, 3.1), fish=st.booleans())
 def test_any_box_is_drawn_like_its_small_pieces(x, y, yaw, fish):
     camera = SMALL[fish]

@@ -13,6 +13,7 @@ from alpasim_plugin.semantic_map.prepare import cut_dashes, prepare_map
 from alpasim_plugin.semantic_map.style import LUDUS, OPENGL, STYLES, box_class
 from alpasim_plugin.semantic_map.triangulate import ear_clip
 from alpasim_plugin.types import Lane, LaneMap, Marking
+from tests.examples import examples
 
 
 def lane(key, y, left_paint="unknown", right_paint="unknown", reverse=False, **more):
@@ -96,7 +97,7 @@ def test_patterns_paint_their_share(style, pattern, share):
     assert painted / line[-1, 0] == pytest.approx(share, rel=2e-3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-5, 5)), min_size=2, max_size=8),
     st.floats(0.3, 4),
@@ -142,7 +143,7 @@ def test_triangles_fill_the_ring_exactly(name):
     assert shapely.union_all([p for p in parts if p.area > 0]).symmetric_difference(whole).area < 1e-9
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.lists(st.floats(0.3, 5.0), min_size=3, max_size=14))
 def test_star_shaped_rings_are_filled(radii):
     angle = np.linspace(0, 2 * np.pi, len(radii), endpoint=False)

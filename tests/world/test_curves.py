@@ -11,6 +11,7 @@ from scipy.special import fresnel
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.world.curves import connect, offset_line, sample_clothoid, smoothstep
 from alpasim_plugin.world.path import polyline_path, smooth_path
+from tests.examples import examples
 
 
 def clothoid_by_fresnel(s: np.ndarray, rate: float) -> np.ndarray:
@@ -46,7 +47,7 @@ def test_no_length_is_refused() -> None:
         sample_clothoid((0, 0, 0), 0.0, 0.0, 0.0)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(st.floats(8, 40), st.floats(8, 40), st.sampled_from([np.pi / 2, -np.pi / 2, 0.0]))
 def test_connector_meets_both_poses_exactly_and_never_bends_backwards(ahead: float, aside: float, turn: float) -> None:
     p0 = np.array([1.0, 2.0, 0.0])
@@ -73,7 +74,7 @@ def test_smoothstep_is_flat_at_both_ends() -> None:
     np.testing.assert_array_equal(smoothstep([-1.0, 2.0]), [0.0, 1.0])
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(st.floats(1, 58), st.floats(-6, 6), st.sampled_from([0.0, 0.03, -0.06]))
 def test_projection_finds_arc_length_and_offset_again(s: float, d: float, curvature: float) -> None:
     curve = sample_clothoid((10.0, -3.0, 0.7), 60.0, curvature, curvature)

@@ -9,6 +9,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import se2, yaw_of
 from alpasim_plugin.types import HeightField
 from alpasim_plugin.world.ground import flat, from_points, ground_pose, height_at
+from tests.examples import examples
 
 
 def slow_height(field, x, y):
@@ -44,7 +45,7 @@ def test_one_cell_grid_is_level():
 
 
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-50, 50), st.sampled_from([0.0, 5_000.0, 4_512_345.0]))
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 def test_points_of_a_plane_give_back_the_plane_wherever_it_lies(slope_x, slope_y, height, shift):
     rng = np.random.default_rng(0)
     xy = rng.uniform(-40, 40, (400, 2))

@@ -11,6 +11,7 @@ from alpasim_plugin.geometry import arc_lengths
 from alpasim_plugin.geometry_lanes import centre_line, densify, lane_polygon
 from alpasim_plugin.types import Lane, LaneMap
 from alpasim_plugin.world.lane_map import LaneIndex
+from tests.examples import examples
 from tests.world.small_maps import FAR, arc, make, straight
 
 GRID = make(*(straight(f"{i}{j}", 20.0 * i, 20.0 * i + 20, 3.5 * j) for i in range(4) for j in range(4)), arc("turn", 15.0, 90.0))
@@ -21,7 +22,7 @@ def slow_containing(lane_map, point):
 
 
 @given(st.lists(st.tuples(st.floats(-5, 85), st.floats(-5, 20)), min_size=1, max_size=30))
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 def test_index_finds_the_same_lanes_as_a_loop_over_all_polygons(points):
     found = LaneIndex(GRID).containing_many(np.array(points))
     assert found == [slow_containing(GRID, p) for p in points]
@@ -84,7 +85,7 @@ def test_long_segments_are_found_by_their_middle():
 
 
 @given(st.floats(-20, 100), st.floats(-20, 40))
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 def test_nearest_lane_is_the_one_a_search_over_all_vertices_finds(x, y):
     point = np.array([x, y, 0.0])
     _, distance = LaneIndex(GRID).nearest(point)

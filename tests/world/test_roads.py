@@ -12,6 +12,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import LaneMap
 from alpasim_plugin.world.road_elements import Curve, Intersection, LaneChangeCount, Profile
 from alpasim_plugin.world.roads import Road, build_road, polyline
+from tests.examples import examples
 
 TOWN = [
     Curve(60),
@@ -172,7 +173,7 @@ def test_impossible_roads_are_refused(elements: list, profile: Profile, text: st
     assert text in str(e.value)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(
     st.lists(st.tuples(st.floats(5, 60), st.floats(-0.04, 0.04)), min_size=1, max_size=6),
     st.integers(1, 4),
