@@ -2,7 +2,7 @@
 
 What is checked: cameras asked for exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
 radians and microseconds; they reach two seconds ahead; the same seed gives the same plans; a reset forgets the drive before; an
-older frame is accepted; the answer is in time.
+older frame is accepted; the plan is in time.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Report:
 
     checks: tuple[Check, ...]
     notes: tuple[str, ...]
-    latency_ms: tuple[float, float]  # median and worst answer, the first excluded
+    latency_ms: tuple[float, float]  # median and worst policy query, the first excluded
 
     @property
     def ok(self) -> bool:
@@ -89,7 +89,7 @@ class Report:
     def __str__(self) -> str:
         lines = [f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.sentence}" for check in self.checks]
         lines += [f"note {note}" for note in self.notes]
-        return "\n".join([*lines, f"answers in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)"])
+        return "\n".join([*lines, f"plans in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)"])
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
     Args:
         policy: A policy made for ``scenario``, or its name (see `make_policy`).
         scenario: Whose cameras the frames imitate; by default `canned_scenario`.
-        latency_limit_ms: Longest acceptable median answer.
+        latency_limit_ms: Longest acceptable median time of a policy query.
 
     Raises:
         InputError: The name is unknown, or what it names is not a policy.
@@ -159,12 +159,12 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
     durations: list[float] = []
     broken: list[Check] = []
     for situation in (STRAIGHT, OLD_FRAME) if replays else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING):
-        answer = _drive(policy, situation, used, durations)
-        if isinstance(answer, str):
-            broken.append(Check("answers", False, answer))
+        made = _drive(policy, situation, used, durations)
+        if isinstance(made, str):
+            broken.append(Check("plans", False, made))
             continue
-        plans[situation.name] = answer
-        broken += _plan_faults(situation, answer)
+        plans[situation.name] = made
+        broken += _plan_faults(situation, made)
     checks += broken
     if not broken:
         checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
@@ -174,7 +174,7 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
         checks += _memory_checks(policy, used, plans["straight"], OLD_FRAME if replays else LEFT)
     median, worst = (float(np.median(durations)), max(durations)) if durations else (0.0, 0.0)
     if durations:
-        checks.append(Check("latency", median <= latency_limit_ms, f"answers in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
+        checks.append(Check("latency", median <= latency_limit_ms, f"plans in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
     return Report(tuple(checks), tuple(remarks(plans)), (median, worst))
 
 
@@ -203,7 +203,7 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
 
 
 def _drive(policy: Policy, situation: Situation, cameras: dict[str, CameraSpec], durations: list[float]) -> list[Plan] | str:
-    """Return the answers, or a sentence where the policy raised."""
+    """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
     where = f"in the situation {situation.name!r} the policy"
     plans: list[Plan] = []

@@ -1,4 +1,4 @@
-"""Faults of plans, each found by one function that answers a readable sentence, or an empty one."""
+"""Faults of plans, each found by one function that returns a readable sentence, or an empty one."""
 
 from __future__ import annotations
 
@@ -119,6 +119,6 @@ def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[str]:
     if "standing" in plans:
         last = plans["standing"][-1]
         out.append(f"from standstill on a free road it moves {float(np.hypot(*(last.xy[-1] - last.xy[0]))):.1f} m within its horizon")
-    if not any(plan.samples for answers in plans.values() for plan in answers):
+    if not any(plan.samples for drive in plans.values() for plan in drive):
         out.append("it carries no sampled alternatives, so plan metrics see one trajectory")
     return out

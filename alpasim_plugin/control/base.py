@@ -15,7 +15,7 @@ GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 
 
 class Controller(Protocol):
-    """Moves the ego along a plan. Pure: the answer depends on the arguments only."""
+    """Moves the ego along a plan. Pure: the result depends on the arguments only."""
 
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
         """Return the state at ``to_us``.
@@ -51,7 +51,7 @@ def check_plan(plan: Trajectory) -> None:
             "following a plan",
             f"a plan of {len(plan)} poses",
             found,
-            "make the policy answer at least one finite pose and strictly increasing times; `check_policy` finds such faults",
+            "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults",
         )
 
 

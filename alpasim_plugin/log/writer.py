@@ -158,11 +158,11 @@ class AslWriter:
         self._write(route_request=egodriver_pb2.RouteRequest(session_uuid=self._uuid, route=route))
 
     def driver_request(self, now_us: int, query_us: int) -> None:
-        """Write that the driver is asked at ``now_us`` for a plan through ``query_us`` (one control step later)."""
+        """Write the query to the driver at ``now_us`` for a plan through ``query_us`` (one control step later)."""
         self._write(driver_request=egodriver_pb2.DriveRequest(session_uuid=self._uuid, time_now_us=now_us, time_query_us=query_us))
 
     def driver_return(self, plan: Trajectory, samples: Sequence[Trajectory] = (), terminate: bool = False) -> None:
-        """Write the driver's answer.
+        """Write the driver's plan.
 
         Args:
             plan: Absolute rig poses in the world, the first at the time of the request; empty where the driver gave none.
@@ -183,7 +183,7 @@ class AslWriter:
             state: True state now.
             plan: Active plan; stored in the rig frame of its first pose, or empty.
             to_us: Time to reach.
-            forced: The recording is forced, so the answer will be ignored.
+            forced: The recording is forced, so the result is ignored.
         """
         if len(plan):
             poses = se3(plan.xyz, plan.quat)

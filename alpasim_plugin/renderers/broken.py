@@ -1,7 +1,7 @@
 """Renderers with one deliberate fault each: known-bad input with which metrics, guards and gates prove that they notice.
 
-Each renders the clean scene and spoils the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays as
-a fault in a real pipeline would leave it.
+Each renders the clean scene and corrupts the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays
+as a fault in a real pipeline would leave it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ SHIFT_M = 0.5
 BLUR_SHARE = 0.02  # of the image's width
 LATE_US = 1_000_000
 
-Spoil = Callable[[U8], U8]
+Corruption = Callable[[U8], U8]
 
 
 class BrokenRenderer:
-    """Render the clean scene and spoil every frame on its own."""
+    """Render the clean scene and corrupt every frame on its own."""
 
-    def __init__(self, clean: CleanRenderer, spoil: Spoil) -> None:
-        self.clean, self.spoil = clean, spoil
+    def __init__(self, clean: CleanRenderer, corrupt: Corruption) -> None:
+        self.clean, self.corrupt = clean, corrupt
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame and spoil it."""
+        """Render one frame and corrupt it."""
         frame = self.clean.render(request)
-        return replace(frame, rgb=self.spoil(frame.rgb))
+        return replace(frame, rgb=self.corrupt(frame.rgb))
 
 
 class ShiftedRenderer:
@@ -82,10 +82,10 @@ def blurred(rgb: U8) -> U8:
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1]), dtype=np.uint8)
 
 
-def _register_spoiled(name: str, spoil: Spoil, help_text: str) -> None:
+def _register_corrupted(name: str, corrupt: Corruption, help_text: str) -> None:
     @RENDERERS.register(name, help_text)
     def _make(scenario: Scenario, seed: int, device: str, threads: int | None) -> Renderer:
-        return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), spoil)
+        return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), corrupt)
 
 
 def _register_stale(name: str, age_us: int | None, help_text: str) -> None:
@@ -99,8 +99,8 @@ def _shifted(scenario: Scenario, seed: int, device: str, threads: int | None) ->
     return ShiftedRenderer(CleanRenderer(scenario, seed, device, threads), SHIFT_M)
 
 
-_register_spoiled("broken-black", black, "deliberate fault: black frames")
-_register_spoiled("broken-mirrored", mirrored, "deliberate fault: left and right swapped")
-_register_spoiled("broken-blurred", blurred, "deliberate fault: strong blur")
+_register_corrupted("broken-black", black, "deliberate fault: black frames")
+_register_corrupted("broken-mirrored", mirrored, "deliberate fault: left and right swapped")
+_register_corrupted("broken-blurred", blurred, "deliberate fault: strong blur")
 _register_stale("broken-frozen", None, "deliberate fault: the first frame for ever")
 _register_stale("broken-late", LATE_US, f"deliberate fault: pictures {LATE_US / 1e6:g} s old")

@@ -7,8 +7,8 @@ import numpy as np
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.scene.contours import contours, places
+from alpasim_plugin.gaussians.scene.ground_texture import KERB_M
 from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.scene.plan_image import KERB_M
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
 from alpasim_plugin.geometry import arc_lengths, resample
@@ -187,7 +187,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     starts = [foot, top, *[p[:-1] for p in mapped]]
     ends = [top, tip, *[p[1:] for p in mapped]]
     start, end = np.concatenate(starts), np.concatenate(ends)
-    owner = np.concatenate([at, at, *[site.frame.to_plan(p[:-1]) for p in mapped]])
+    owner = np.concatenate([at, at, *[site.frame.to_ground(p[:-1]) for p in mapped]])
     items: list[Item] = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         length = np.linalg.norm(end - start, axis=1)
@@ -221,11 +221,11 @@ def _signs(site: Site) -> list[Item]:
             corners.append(local @ T[:3, :3].T + T[:3, 3])
             rgbs.append(rgb)
             at.append(T[:2, 3])
-        foot = site.world(site.frame.to_plan(T[None, :2, 3]))[0]
+        foot = site.world(site.frame.to_ground(T[None, :2, 3]))[0]
         if 0.5 < T[2, 3] - foot[2] < 4.5:
             feet.append(foot)
             tops.append(T[:3, 3])
-    plan = site.frame.to_plan(np.array(at))
+    plan = site.frame.to_ground(np.array(at))
     items: list[Item] = []
     for cell_m, size in ((0.12, 0.15), (0.4, 0.5)):
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
@@ -233,6 +233,6 @@ def _signs(site: Site) -> list[Item]:
         if feet:
             posts = rods(np.stack(feet), np.stack(tops), 0.04, np.tile([0.45, 0.46, 0.47], (len(feet), 1)), 3.0)
             clouds.append(posts)
-            where.append(site.frame.to_plan(posts.means.astype(np.float64)))
+            where.append(site.frame.to_ground(posts.means.astype(np.float64)))
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(where)))
     return items
