@@ -1,4 +1,4 @@
-"""Quality of the policy's plans: how steady they are, what they would hit, and how near their samples come to the recording.
+"""Quality of the policy's plans: consistency, open-loop collisions, and minADE of their samples.
 
 Plans are rig poses; they are moved to the box centre before use. All errors are in plan view. One row per policy query, at its time.
 """

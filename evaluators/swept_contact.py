@@ -1,7 +1,7 @@
 """Contact between logged instants: when each actor begins to touch the ego, where on the footprint, and on which side.
 
 Between two logged poses a body's centre moves straight and its heading turns at a constant rate the shorter way. Which actors can come
-near is asked of an R-tree over x, y and t that holds stretches of their tracks; what is left is solved by `evaluators.sweep`, for all pairs
+near is found by an R-tree over x, y and t of stretches of their tracks; the rest is solved by `evaluators.sweep`, for all pairs
 of a rollout at once.
 
 An actor's contact has one side from its beginning to its end: the one that the contact's normal leaves the ego through, front, rear or
@@ -70,7 +70,7 @@ def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contact
 
     Args:
         ego: Footprints at the times, sharp-cornered.
-        actors: Everybody else.
+        actors: All other actors.
         t_us: ``(T,)`` times.
         at_steps: What touches at the times themselves; decided by exact predicates.
         handover_us: When the policy takes over. A contact before it belongs to the row before it, although the next row is the policy's.

@@ -1,6 +1,6 @@
-"""Does a policy keep the contract? Canned situations, and a readable sentence for every fault.
+"""Conformance test of a policy: synthetic situations, and a readable sentence for every fault.
 
-What is checked: cameras asked for exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
+What is checked: the policy's cameras exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
 radians and microseconds; they reach two seconds ahead; the same seed gives the same plans; a reset forgets the drive before; an
 older frame is accepted; the plan is in time.
 """
@@ -48,7 +48,7 @@ from policies.conformance_faults import (
 from policies.painted_road import PaintedRoad, pinhole_camera
 
 START_US = 1_700_000_000_000_000  # recordings use epoch time: a policy that counts in float32 is found out
-T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)  # away from the origin: world coordinates are told from rig coordinates
+T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)  # away from the origin: world coordinates differ from rig coordinates
 STEPS = 6
 STEP_US = 100_000
 
@@ -61,7 +61,7 @@ PLAN_FAULTS: tuple[tuple[str, Fault, str], ...] = (
 
 @dataclass(frozen=True)
 class Check:
-    """One property and whether it holds; ``sentence`` tells what was found."""
+    """One property and whether it holds; ``sentence`` says what was found."""
 
     name: str
     ok: bool
@@ -78,7 +78,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Tell whether every check passed."""
+        """Return whether every check passed."""
         return all(check.ok for check in self.checks)
 
     @property
@@ -94,7 +94,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Situation:
-    """A stretch of road driven at a constant speed, the policy being asked every 0.1 s."""
+    """A stretch of road driven at a constant speed, with a policy query every 0.1 s."""
 
     name: str
     curvature_1pm: float = 0.0
@@ -135,7 +135,7 @@ def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scen
 def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency_limit_ms: float = 100.0) -> Report:
     """Drive a policy through the canned situations and report every breach of the contract.
 
-    A policy with ``controller = "perfect"`` replays a recording, so it is only asked what `canned_scenario` records.
+    A policy with ``controller = "perfect"`` replays a recording, so it is only queried where `canned_scenario` has a recording.
 
     Args:
         policy: A policy made for ``scenario``, or its name (see `make_policy`).

@@ -112,7 +112,7 @@ def difference(a: Sequence[Plan], b: Sequence[Plan]) -> float:
 
 
 def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[str]:
-    """Tell what is legal but worth knowing."""
+    """List legal but unusual properties."""
     out = []
     if {"left", "right"} <= plans.keys() and difference(plans["left"], plans["right"]) == 0:
         out.append("the plan depends neither on the route nor on the frames: left and right give the same")

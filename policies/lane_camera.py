@@ -1,4 +1,4 @@
-"""Drive by looking: lane paint and obstacles from the pixels of one front camera."""
+"""Drive from the pixels of one front camera: lane markings and obstacles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MIN_CRUISE_MPS = 8.0
 MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
 UNCERTAIN_M, UNCERTAIN_PAINT_M = 1.2, 3.0
 LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
-OTHER_LANE = 0.55  # the route asks for the next lane when it lies this share of a width off the centre
+OTHER_LANE = 0.55  # the route is in the next lane when it lies this share of a width off the centre
 OTHER_LANE_FRAMES = 5
 SAME_HEADING_RAD, TURN_OFF_RAD = 0.25, 0.3
 CHOOSE_AT_M, CHOOSE_AT_S = 12.0, 1.2

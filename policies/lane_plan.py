@@ -1,4 +1,4 @@
-"""From what was seen to a plan: where to drive, how fast, and the sampled alternatives."""
+"""From the estimated lane, route and obstacle to a plan: path, speed, and sampled alternatives."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Blend:
 def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
 
-    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route has no say in the
+    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route does not affect the
     lateral position; it takes over beyond the paint that is seen, where it turns away from the lane (an intersection, an exit), and
     where the two are more than `SAME_LANE_M` apart.
     """
@@ -138,7 +138,7 @@ def correlated_noise(before: F64 | None, dt_s: float, random: np.random.Generato
 
 
 def sample_sigma_m(lane_sigma_m: float) -> float:
-    """Return the standard deviation of the samples to the side: what is seen badly is also driven badly.
+    """Return the lateral standard deviation of the samples, which grows with that of the lane.
 
     Args:
         lane_sigma_m: Standard deviation of the lane's centre.
@@ -173,7 +173,7 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
 
 
 def _retimed(line: F64, s: F64, at: F64) -> F64:
-    """Return rows of ``line`` (T, 3) at progress ``at``, straight on beyond the end; a standing plan stays as it is."""
+    """Return rows of ``line`` (T, 3) at progress ``at``, straight on beyond the end; a standing plan is unchanged."""
     if s[-1] < 0.1:
         return line
     keep = np.concatenate([[True], np.diff(s) > 1e-9])

@@ -1,4 +1,4 @@
-"""What the navigation says to the learned policy: one of five words, read off the shape of the route ahead."""
+"""Navigation command of the learned policy: one of five words, derived from the shape of the route ahead."""
 
 from __future__ import annotations
 

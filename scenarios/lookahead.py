@@ -33,7 +33,7 @@ class ScriptedTracks:
 
     Args:
         scripts: Tracks.
-        end_us: Last time that will be asked for, before the look-ahead.
+        end_us: Last queried time, before the look-ahead.
         step_us: Grid.
     """
 

@@ -58,7 +58,7 @@ def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
 
 
 def expand(item: str, overrides: Sequence[str] = ()) -> list[ScenarioRef]:
-    """Return what one command-line argument stands for, with overrides on top of the suite's own."""
+    """Expand one command-line argument into scenarios, with overrides on top of the suite's own."""
     return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
 
 

@@ -83,7 +83,7 @@ def spatial(now: BicycleState, t_us: int, z_m: float, accel_mps2: float, vehicle
 
 
 def coast_to_stop(state: EgoState, to_us: int, vehicle: Vehicle) -> EgoState:
-    """Return the state at ``to_us`` when nobody steers: gentle brake, wheel held."""
+    """Return the state at ``to_us`` without a plan: gentle braking, steering held."""
     dt_s = check_interval(state, to_us)
     before = planar(state)
     after = step(before, Command(before.steer_rad, 0.0, GENTLE_BRAKE_MPS2), dt_s, vehicle)

@@ -1,4 +1,4 @@
-"""A plan as the tracker sees it: a path over signed arc length, and the arc length over time."""
+"""A plan as the reference of the tracker: a path over signed arc length, and the arc length over time."""
 
 from __future__ import annotations
 

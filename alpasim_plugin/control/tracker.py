@@ -28,7 +28,7 @@ MIN_PREVIEW_MPS = 5.0  # below it the nodes stay this speed's distance apart: 10
 GAUSS_NEWTON_STEPS = 2
 PREVIEW_S = np.linspace(0.2, 0.8, 4)
 HOLD_SPEED_MPS = 0.5
-HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S asks to stand
+HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S is a stop
 HOLD_S = 2.0
 
 _BEFORE = np.tril(np.ones((NODES, NODES)), -1)  # d steer at the start of step k / d change in step j

@@ -1,4 +1,4 @@
-"""Read an ASL log, whoever wrote it, into a `RolloutLog`.
+"""Read an ASL log of any writer into a `RolloutLog`.
 
 Reads what AlpaSim's evaluation reads and ignores the rest. Nothing is ever unpickled: the driver's unstructured debug bytes stay unread.
 """
@@ -43,7 +43,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         images: Keep the encoded camera images; False saves their memory.
 
     Returns:
-        The rollout. ``warnings`` tells of a cut last entry and of entries of unknown kind; ``info`` holds ``entries`` (count by kind),
+        The rollout. ``warnings`` lists a truncated last entry and entries of unknown kind; ``info`` holds ``entries`` (count by kind),
         ``n_steps``, ``empty_plans`` and ``unanswered`` (drive requests without a plan), ``terminated`` (the driver ended the
         rollout), ``cameras`` (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``, and
         ``undefined_actors`` (poses of ids that the header does not define are left out).

@@ -101,7 +101,7 @@ class AslWriter:
     # --- each step --------------------------------------------------------------------------------------------------
 
     def actor_poses(self, t_us: int, T_world_rig: F64, actors: Mapping[str, F64]) -> None:
-        """Write true poses at one instant: the ego's rig pose, and ``T_world_box`` of the actors present.
+        """Write ground-truth poses at one instant: the ego's rig pose, and ``T_world_box`` of the actors present.
 
         Raises:
             InputError: An actor that the header does not define, or a pose that is not finite.
@@ -122,7 +122,7 @@ class AslWriter:
         self._write(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=entries))
 
     def render_request(self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png") -> None:
-        """Write the frames asked for at one instant, bundled as AlpaSim sends them by default."""
+        """Write the render requests of one instant, bundled as AlpaSim sends them by default."""
         items = [
             sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=r.camera.name, request=self._render_request(r, encoding)) for r in requests
         ]
@@ -177,7 +177,7 @@ class AslWriter:
         )
 
     def controller_request(self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False) -> None:
-        """Write what the vehicle model is asked: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
+        """Write the request to the vehicle model: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
 
         Args:
             state: True state now.

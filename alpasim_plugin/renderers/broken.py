@@ -1,4 +1,4 @@
-"""Renderers with one deliberate fault each: known-bad input with which metrics, guards and gates prove that they notice.
+"""Renderers with one deliberate fault each: known-bad input that metrics, guards and gates must detect.
 
 Each renders the clean scene and corrupts the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays
 as a fault in a real pipeline would leave it.
@@ -50,7 +50,7 @@ class ShiftedRenderer:
 
 
 class StaleRenderer:
-    """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or the first one for ever."""
+    """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or always the first one."""
 
     def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
         self.clean, self.age_us = clean, age_us
@@ -102,5 +102,5 @@ def _shifted(scenario: Scenario, seed: int, device: str, threads: int | None) ->
 _register_corrupted("broken-black", black, "deliberate fault: black frames")
 _register_corrupted("broken-mirrored", mirrored, "deliberate fault: left and right swapped")
 _register_corrupted("broken-blurred", blurred, "deliberate fault: strong blur")
-_register_stale("broken-frozen", None, "deliberate fault: the first frame for ever")
+_register_stale("broken-frozen", None, "deliberate fault: the first frame repeated")
 _register_stale("broken-late", LATE_US, f"deliberate fault: pictures {LATE_US / 1e6:g} s old")

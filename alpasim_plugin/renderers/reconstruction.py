@@ -35,7 +35,7 @@ class Model:
 
 
 class ReconstructionRenderer:
-    """Render a reconstruction of the scenario's logged drive; it is fitted now if nobody has yet.
+    """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in the cache.
 
     Attributes:
         stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.

@@ -1,4 +1,4 @@
-"""The censoring ledger: what every rule removed, per renderer, and what the removed part could have made of each rate."""
+"""Censoring: what each rule removed, per renderer, and the bounds on each rate that the removed part allows."""
 
 from __future__ import annotations
 

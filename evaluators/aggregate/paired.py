@@ -63,7 +63,7 @@ def compare(here: RendererRows, there: RendererRows, metric: str, baseline: str,
     Returns:
         ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
         and its ``method``; ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference`` (better,
-        worse, none shown: whatever the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
+        worse, none shown; independent of the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
         ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
         exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
         independent);

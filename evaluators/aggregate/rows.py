@@ -62,7 +62,7 @@ def metric_names(rows: Iterable[Row]) -> list[str]:
 
 
 def is_ok(row: Row) -> bool:
-    """Tell whether a rollout ran to its end."""
+    """Return whether a rollout ran to its end."""
     return bool(row.get("status", "ok") == "ok")
 
 

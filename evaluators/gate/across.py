@@ -22,8 +22,8 @@ class Comparison:
     """Paired differences.
 
     Attributes:
-        paired: ARM -> METRIC -> what `evaluators.aggregate.paired.compare` gives; an arm is RENDERER, or RENDERER/POLICY with several
-            policies.
+        paired: VARIANT -> METRIC -> what `evaluators.aggregate.paired.compare` gives; a variant is RENDERER, or RENDERER/POLICY where there
+            are several policies.
         notes: What a reader must know, such as policies that were paired although their names differ.
     """
 
@@ -91,8 +91,8 @@ def _pairs(
         here, there = by_renderer(of_policy(rows, policy)), by_renderer(of_policy(base_rows, policy))
         for renderer, other in partner.items():
             if renderer in here and other in there:
-                arm = renderer if len(policies) == 1 else f"{renderer}/{policy}"
-                out[arm] = {
+                variant = renderer if len(policies) == 1 else f"{renderer}/{policy}"
+                out[variant] = {
                     name: compare(
                         here[renderer], there[other], name, prefix + other, (margins or {}).get(name, default_margin(name)), listed
                     )

@@ -124,34 +124,34 @@ def _baseline_name(
 
 
 def _margin(
-    side: RendererRows, base: RendererRows, arm: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec
+    side: RendererRows, base: RendererRows, variant: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec
 ) -> Check:
     entry = compare(side, base, metric, name, rule.margin or 0.0)
     planned = entry["n_cells"] + entry["n_missing"]
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
-    said = _paired_text(entry, metric, arm[0])
+    said = _paired_text(entry, metric, variant[0])
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
         said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
     elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
         cause = "undecided"
         said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
-    return Check(*arm, metric, "margin", cause, said, entry, rule.must_decide)
+    return Check(*variant, metric, "margin", cause, said, entry, rule.must_decide)
 
 
-def _limit(side: RendererRows, arm: tuple[str, str], metric: str, rule: MetricRule) -> Check:
+def _limit(side: RendererRows, variant: tuple[str, str], metric: str, rule: MetricRule) -> Check:
     values = side.values(metric)
     known = values[np.isfinite(values)]
     unit = info(metric).unit
     bounds = {"max": rule.max, "min": rule.min}
     limits = " and ".join(f"{kind} {value:g}" for kind, value in bounds.items() if value is not None)
     if not len(known):
-        text = f"{arm[0]}: {metric} has no valid value, its limit is {limits}"
-        return Check(*arm, metric, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
+        text = f"{variant[0]}: {metric} has no valid value, its limit is {limits}"
+        return Check(*variant, metric, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
     mean = float(known.mean())
     broken = (rule.max is not None and mean > rule.max) or (rule.min is not None and mean < rule.min)
-    text = f"{arm[0]}: {metric} {_number(mean, unit)}, limit {limits}"
-    return Check(*arm, metric, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)})
+    text = f"{variant[0]}: {metric} {_number(mean, unit)}, limit {limits}"
+    return Check(*variant, metric, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)})
 
 
 def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str) -> str:

@@ -19,7 +19,7 @@ from evaluators.aggregate.rows import by_renderer
 from evaluators.video.facts import FACTS, MS, WARP
 
 Row = Mapping[str, Any]
-TRUTH = "truth"  # the arm of the frames that there were to see: what needs no truth is measured of it
+TRUTH = "truth"  # the arm of the ground-truth frames: only metrics without a reference are measured on it
 BINS = 20  # windows of frames
 LEAST_BIN = 5  # frames
 

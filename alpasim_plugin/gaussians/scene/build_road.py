@@ -96,7 +96,7 @@ def _pyramid(image: F32) -> list[F32]:
 
 
 def _leaves(level: I64, floor: int) -> list[Bool | None]:
-    """Return per quadtree level which squares are leaves: the largest ones in which no cell asks for a smaller square."""
+    """Return per quadtree level which squares are leaves: the largest ones in which no cell needs a smaller square."""
     can: list[Bool] = []
     least = level
     for k in range(MAX_LEVEL + 1):

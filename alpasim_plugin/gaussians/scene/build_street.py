@@ -39,7 +39,7 @@ def _nodes(site: Site, name: str, items: list[Item]) -> list[SceneNode]:
 
 
 def _kerbs(site: Site) -> list[Item]:
-    """Stand a stone along the road's edge: a face towards the road and a top."""
+    """Place a kerb along the road's edge: a face towards the road and a top."""
     items: list[Item] = []
     lines = contours(site, 0.0, 60.0)
     for cell_m, step in ((0.25, 0.5), (0.7, 1.0), (1.6, 2.0)):
@@ -65,7 +65,7 @@ def _kerbs(site: Site) -> list[Item]:
 
 
 def _rails(site: Site) -> list[Item]:
-    """Run a guard rail along a fast road."""
+    """Place a guard rail along a highway."""
     items: list[Item] = []
     lines = contours(site, 1.2, 60.0)
     for cell_m, step in ((0.3, 1.0), (0.9, 2.0), (2.0, 4.0)):
@@ -89,7 +89,7 @@ def _rails(site: Site) -> list[Item]:
 
 
 def _trees(site: Site, houses: Houses) -> list[Item]:
-    """Plant street trees along the road and woods where no houses stand."""
+    """Place street trees along the road and woods where there are no houses."""
     per_100m = site.scenario.environment.trees_per_100m
     if per_100m <= 0:
         return []
@@ -201,7 +201,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
 
 
 def _signs(site: Site) -> list[Item]:
-    """Hang the map's signs: a coloured plate with a pale rim, and a post down to the ground where it is near."""
+    """Place the map's signs: a coloured plate with a pale rim, and a post down to the ground where it is near."""
     signs = site.scenario.lane_map.signs
     if not signs:
         return []

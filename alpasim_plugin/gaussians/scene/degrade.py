@@ -1,4 +1,4 @@
-"""Stand in for a bad reconstruction: a seeded surrogate whose error grows with the distance from the logged path.
+"""Surrogate of a bad reconstruction: seeded errors that grow with the distance from the logged path.
 
 Nothing is trained here. A reconstruction from one drive is right where its cameras were and wrong elsewhere, and this module models the
 causes one by one (fact sheet on splatting, section 9): surfaces that no log camera saw are missing; depth along the log cameras' rays is

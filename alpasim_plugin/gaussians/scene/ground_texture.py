@@ -66,7 +66,7 @@ def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int,
     rgb[:] = _verge(site, off, grain, texture)
     tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
     rgb[road] = (np.array(ASPHALT, dtype=np.float32) * tone[..., None])[road]
-    # Next to the crisp strokes laid over them, cells half covered by a thin line would show as teeth along it.
+    # Cells half covered by a thin line would alias along the crisp strokes laid over them.
     thinnest = 0.3 if cell_m < CELL_M else 0.0
     covers = [_coverage(strokes, colour, low, cell_m, (rows, columns), thinnest) for colour in (WHITE, YELLOW)]
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):

@@ -212,7 +212,7 @@ def _taken(scenario: Scenario, frame: GroundFrame, low: F64, shape: tuple[int, i
 
 
 def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
-    """Tell a fast road by its limits, or where none are given by four lanes side by side without any crossing."""
+    """Return whether the road is a highway: by speed limits, or without them by four parallel lanes and no crossing."""
     if scenario.lane_map.crosswalks or any(lane.is_intersection for lane in near) or scenario.lane_map.stop_lines:
         return False
     limits = [lane.speed_limit_mps for lane in near if lane.speed_limit_mps is not None]
