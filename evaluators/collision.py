@@ -58,7 +58,7 @@ def contact_events(rollout: RolloutLog, preset: str | Preset = "strict") -> tupl
     origin = origin_of(rollout.ego, chosen)
     ego, actors = ego_footprints(rollout, chosen, origin), ActorTable(rollout, chosen, origin)
     at_steps, _ = find_contacts(ego, actors, rollout.ego.t_us)
-    begun = find_swept(ego, actors, rollout.ego.t_us, at_steps, handover_us(rollout)).beginnings
+    begun = find_swept(ego, actors, rollout.ego.t_us, at_steps, handover_us(rollout)).onsets
     places = in_rig(begun.xy, rollout)
     return tuple(
         ContactEvent(actors.ids[begun.actor[k]], float(begun.t_s[k]), SIDES[int(begun.side[k])], float(places[k, 0]), float(places[k, 1]))
@@ -100,7 +100,7 @@ def _gap(t_us: I64, gap_m: F64, preset: Preset) -> MetricSeries:
 def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSeries]:
     """Give time and place of the earliest begun among the contacts of each row."""
     t_us = rollout.ego.t_us
-    began = swept.beginnings
+    began = swept.onsets
     order = np.lexsort((began.t_s[swept.begin], swept.step))
     step, first = np.unique(swept.step[order], return_index=True)
     begin = swept.begin[order][first]

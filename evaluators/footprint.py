@@ -79,7 +79,7 @@ class Footprints:
         return corners(self.xy, self.yaw, self.size)
 
     def centres(self) -> F64:
-        """Return the point ``(N, 2)`` that stands for the body: the box centre, or for float32 presets the rounded shape's centroid."""
+        """Return the reference point ``(N, 2)`` of the body: the box centre, or for float32 presets the rounded shape's centroid."""
         return np.asarray(shapely.get_coordinates(shapely.centroid(self.shapes()))) if self.float32 else self.xy
 
     def shapes(self) -> Geometries:

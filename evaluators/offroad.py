@@ -6,7 +6,7 @@ inside), or else if the union of all nearby areas does. Only if neither holds, t
 is nearer than 1 mm to a road-edge polyline. "Off-road" thus means *touching the edge* outside the lanes: far beyond the edge, where nothing
 is touched, a step counts as on the road. The drive to there has crossed the edge, and steps after the first event are dropped.
 
-Preset ``strict`` asks instead whether the footprint sticks out of the drivable surface, and by how much (`evaluators.surface`).
+Preset ``strict`` measures by how much the footprint leaves the drivable surface (`evaluators.surface`).
 """
 
 from __future__ import annotations

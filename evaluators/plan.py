@@ -1,6 +1,6 @@
-"""Quality of the policy's plans: how steady they are, what they would hit, and how near their samples come to the recording.
+"""Quality of the policy's plans: consistency, open-loop collisions, and minADE of their samples.
 
-Plans are rig poses; they are moved to the box centre before use. All errors are in plan view. One row per policy answer, at its time.
+Plans are rig poses; they are moved to the box centre before use. All errors are in plan view. One row per policy query, at its time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _CHUNK = 20_000  # plan poses looked up at once
 
 
 @dataclass(frozen=True)
-class PlanTable:
+class TrajectoryTable:
     """Box centres of many trajectories laid end to end."""
 
     t_us: I64  # (P,)
@@ -47,7 +47,7 @@ class PlanTable:
         return np.repeat(np.arange(len(self.start) - 1), np.diff(self.start))
 
 
-def plan_table(trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, preset: Preset) -> PlanTable:
+def trajectory_table(trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, preset: Preset) -> TrajectoryTable:
     """Move rig trajectories in the world to the box centre and lay them end to end."""
     sizes = [len(one) for one in trajectories]
     xyz = np.concatenate([np.zeros((0, 3)), *(one.xyz for one in trajectories)])
@@ -57,14 +57,14 @@ def plan_table(trajectories: Sequence[Trajectory], T_rig_box: F64, origin: F64, 
     forward = rotation @ T_rig_box[:3, 0]  # box x in the world
     t_us = np.concatenate([np.zeros(0, dtype=np.int64), *(one.t_us for one in trajectories)])
     start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    return PlanTable(t_us, centre, np.arctan2(forward[:, 1], forward[:, 0]), start)
+    return TrajectoryTable(t_us, centre, np.arctan2(forward[:, 1], forward[:, 0]), start)
 
 
 def evaluate_plans(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``plan_deviation``, ``open_loop_collision`` and ``min_ade@...`` per policy answer; empty answers have no row."""
+    """Give ``plan_deviation``, ``open_loop_collision`` and ``min_ade@...`` per policy query; empty plans have no row."""
     plans = [plan for plan in rollout.plans if len(plan.trajectory)]
     origin = origin_of(rollout.ego_log, preset)
-    table = plan_table([plan.trajectory for plan in plans], rollout.T_rig_box, origin, preset)
+    table = trajectory_table([plan.trajectory for plan in plans], rollout.T_rig_box, origin, preset)
     now_us = np.array([plan.now_us for plan in plans], dtype=np.int64)
     out = [series("open_loop_collision", now_us, open_loop_collisions(rollout, table, now_us, preset, origin))]
     deviation = plan_deviation(table, preset)
@@ -77,7 +77,7 @@ def evaluate_plans(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
     return out
 
 
-def plan_deviation(table: PlanTable, preset: Preset) -> F64:
+def plan_deviation(table: TrajectoryTable, preset: Preset) -> F64:
     """Return the weighted mean distance ``(N - 1,)`` between consecutive plans, NaN where they share no time.
 
     The old plan is read at the new plan's times, its first pose (where the ego is) left out, up to the old plan's end; the k-th such time
@@ -97,8 +97,8 @@ def plan_deviation(table: PlanTable, preset: Preset) -> F64:
     return out
 
 
-def open_loop_collisions(rollout: RolloutLog, table: PlanTable, now_us: I64, preset: Preset, origin: F64) -> F64:
-    """Return per answer ``(N,)`` 1 if a planned footprint within the horizon touches an actor where the log has it at that time, else 0."""
+def open_loop_collisions(rollout: RolloutLog, table: TrajectoryTable, now_us: I64, preset: Preset, origin: F64) -> F64:
+    """Return per plan ``(N,)`` 1 if a planned footprint within the horizon touches an actor where the log has it at that time, else 0."""
     out = np.zeros(len(now_us))
     actors = ActorTable(rollout, preset, origin)
     owner = table.owner
@@ -118,9 +118,9 @@ def open_loop_collisions(rollout: RolloutLog, table: PlanTable, now_us: I64, pre
 
 
 def min_ade(rollout: RolloutLog, plans: Sequence[LoggedPlan], preset: Preset, origin: F64) -> list[MetricSeries]:
-    """Return minADE per horizon, one row per answer that has samples.
+    """Return minADE per horizon, one row per plan that has samples.
 
-    The error of a sample is the mean, over the log's times from the answer's query time to the first one at or after now + horizon, of its
+    The error of a sample is the mean, over the log's times from the plan's query time to the first one at or after now + horizon, of its
     distance from the target path at the same time; the least over the samples counts. It is invalid where the log, the target or every
     sample ends before the horizon.
     """
@@ -134,7 +134,7 @@ def min_ade(rollout: RolloutLog, plans: Sequence[LoggedPlan], preset: Preset, or
         return _min_ade_by_index(rollout, asked, usable, target_xyz, preset, origin)
     values = np.full((len(asked), len(preset.min_ade_horizons_s)), np.nan)
     for i, plan in enumerate(asked):
-        samples = plan_table(plan.samples, rollout.T_rig_box, origin, preset)
+        samples = trajectory_table(plan.samples, rollout.T_rig_box, origin, preset)
         first = int(np.searchsorted(usable, plan.query_us))
         for j, horizon_s in enumerate(preset.min_ade_horizons_s):
             last = int(np.searchsorted(usable, plan.now_us + round(horizon_s * 1e6)))
@@ -160,7 +160,7 @@ def _min_ade_by_index(
     rows: list[list[tuple[int, float]]] = [[] for _ in preset.min_ade_horizons_s]
     longest_us = max(preset.min_ade_horizons_s) * 1e6
     for plan in asked:
-        samples = plan_table(plan.samples, rollout.T_rig_box, origin, preset)
+        samples = trajectory_table(plan.samples, rollout.T_rig_box, origin, preset)
         until = min(plan.now_us + longest_us, float(line_us[-1]))
         span = np.flatnonzero((line_us >= plan.query_us) & (line_us <= until))
         if not all(_covers(samples, k, line_us[span]) for k in range(len(plan.samples))):
@@ -180,12 +180,12 @@ def _min_ade_by_index(
     ]
 
 
-def _covers(samples: PlanTable, k: int, t_us: I64) -> bool:
+def _covers(samples: TrajectoryTable, k: int, t_us: I64) -> bool:
     t = samples.t_us[samples.rows(k)]
     return len(t) > 0 and (len(t_us) == 0 or bool(t[0] <= t_us[0] and t_us[-1] <= t[-1]))
 
 
-def _errors(samples: PlanTable, k: int, t_us: I64, target_xyz: F64, preset: Preset) -> F64:
+def _errors(samples: TrajectoryTable, k: int, t_us: I64, target_xyz: F64, preset: Preset) -> F64:
     off = held(samples.position(k, t_us), preset) - target_xyz
     return np.asarray(np.linalg.norm(off[:, : 3 if preset.min_ade_with_z else 2], axis=1))
 

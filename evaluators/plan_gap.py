@@ -1,4 +1,4 @@
-"""How far apart two answers to the same question are: the distance and the turn between two plans at times ahead."""
+"""Distance and heading difference between two plans for the same policy query, at times ahead."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ DIVERGED_M = 0.5  # a 1.88 m car has 0.8 m to either side in a 3.5 m lane
 
 @dataclass(frozen=True)
 class Divergence:
-    """The first question that two policies, or one policy behind two renderers, answer differently.
+    """The first query at which the plans of two policies, or of one policy behind two renderers, differ.
 
     Attributes:
-        t_us: Time of the question.
+        t_us: Time of the query.
         gap_m: Distance between the plans at the horizon, or at the end of the shorter plan where that comes first.
-        ahead_us: How far ahead of the question that is.
+        ahead_us: How far ahead of the query that is.
     """
 
     t_us: int
@@ -55,15 +55,15 @@ def plan_gap(one: Trajectory, other: Trajectory, at_us: Sequence[int]) -> tuple[
 def first_divergence(
     one: Sequence[LoggedPlan], other: Sequence[LoggedPlan], threshold_m: float = DIVERGED_M, horizon_us: int = HORIZON_US
 ) -> Divergence | None:
-    """Return the first question asked of both at which their plans lie more than a threshold apart at the horizon; None if there is none.
+    """Return the first query common to both at which their plans lie more than a threshold apart at the horizon; None if there is none.
 
     Plans that end before the horizon are compared at the end of the shorter one.
     """
-    answers = {plan.now_us: plan.trajectory for plan in other if len(plan.trajectory)}
+    plans = {plan.now_us: plan.trajectory for plan in other if len(plan.trajectory)}
     for plan in one:
-        if plan.now_us not in answers or not len(plan.trajectory):
+        if plan.now_us not in plans or not len(plan.trajectory):
             continue
-        mine, theirs = plan.trajectory, answers[plan.now_us]
+        mine, theirs = plan.trajectory, plans[plan.now_us]
         at_us = min(plan.now_us + horizon_us, int(mine.t_us[-1]), int(theirs.t_us[-1]))
         gap = float(plan_gap(mine, theirs, [at_us])[0][0])
         if gap > threshold_m:

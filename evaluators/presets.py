@@ -22,7 +22,7 @@ class Preset:
     ego_size_m: tuple[float, float] | None = None  # length, width; None: as logged
     shrink: float = 0.0
     roundness: float = 0.0
-    # Collision. "every": each touching actor is classified. "last": only the last one of the spatial index's answer is.
+    # Collision. "every": each touching actor is classified. "last": only the last one that the spatial index returns is.
     hits: Literal["every", "last"] = "every"
     # "at_steps": logged instants only. "between_steps": the motion between them too.
     contact: Literal["at_steps", "between_steps"] = "at_steps"

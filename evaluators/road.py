@@ -133,7 +133,7 @@ class _Polylines:
 def join(areas: Geometries, seam_m: float) -> Any:
     """Return the union of lane areas with gaps up to ``seam_m`` wide closed.
 
-    Lanes that share an edge, but not its vertices, differ there by rounding. Without closing, that hair would decide whether a footprint
+    Lanes that share an edge, but not its vertices, differ there by rounding. Without closing, rounding would decide whether a footprint
     across the edge is contained, and differently at every origin.
     """
     shape = areas[0] if len(areas) == 1 else shapely.union_all(areas)
@@ -158,7 +158,7 @@ def road_of(lane_map: LaneMap, origin: F64, preset: Preset) -> Road:
     """Return the prepared road of a map; the last few are kept, as rollouts of one scene come in a row."""
     key = (id(lane_map), origin.tobytes(), preset)
     held = _cache.get(key)
-    # An id can be reused after its object is gone; the weak reference tells.
+    # An id can be reused after its object is gone; the weak reference shows that.
     if held is not None and held[0]() is lane_map:
         return held[1]
     while len(_cache) >= _CACHED_ROADS:

@@ -36,11 +36,11 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
 
     Args:
         ego: Footprints at the times.
-        actors: Everybody else.
+        actors: All other actors.
         t_us: ``(T,)`` times.
 
     Returns:
-        The contacts, and ``(T,)`` metres from the ego to the nearest actor: 0 on touch, inf where nobody is present.
+        The contacts, and ``(T,)`` metres from the ego to the nearest actor: 0 on touch, inf where no actor is present.
     """
     gap_m = np.full(len(t_us), np.inf)
     none = np.zeros(0, dtype=np.int64)
@@ -69,7 +69,7 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
 def last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us: I64) -> Contacts:
     """Keep of each step's contacts the one that the spatial index names last.
 
-    AlpaSim builds an STRtree of the ego and all present actors at every step, in the log's order, and lets the last answer decide. The
+    AlpaSim builds an STRtree of the ego and all present actors at every step, in the log's order, and the last result decides. The
     order depends on the tree's layout, so the tree is built the same way here, for the steps with more than one contact.
     """
     keep = np.ones(len(contacts.step), dtype=np.bool_)

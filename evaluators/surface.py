@@ -34,7 +34,7 @@ class Surface:
 
         Args:
             areas: ``(B,)`` plan-view polygons.
-            outlines: B polylines ``(N, 3)`` that tell their heights.
+            outlines: B polylines ``(N, 3)`` that give their heights.
             seam_m: Widest gap to close.
             level_m: What lies farther above or below than this, and `SLOPE` per metre of distance, is another road.
         """
@@ -45,7 +45,7 @@ class Surface:
 
     @property
     def is_empty(self) -> bool:
-        """Tell whether nothing here has an area."""
+        """Return whether nothing here has an area."""
         return bool(np.all(shapely.is_empty(self._areas)))
 
     def margin_m(self, footprints: Geometries, xyz: F64) -> F64:
@@ -171,8 +171,8 @@ def closed_union(areas: Geometries, seam_m: float) -> Any:
     """Return the union of areas with the gaps between them up to ``seam_m`` wide filled.
 
     Filled is what a disc of that diameter cannot reach from outside (morphological closing). Closing also rounds off bends of the outer
-    border by hairs; those are told from gaps by being open to the outside along much of their outline, and are left out, so that the
-    outer border is the map's own.
+    border by small slivers. These are open to the outside along much of their outline, unlike gaps, and are left out, so that the outer
+    border is the map's own.
     """
     shape = shapely.union_all(areas[~shapely.is_empty(areas)], grid_size=_GRID_M)
     if seam_m <= 0 or shapely.is_empty(shape):

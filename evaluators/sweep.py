@@ -1,4 +1,4 @@
-"""When do two moving rectangles first touch? Exact in both answers but for a band of one nanometre.
+"""First contact of two moving rectangles, exact to one nanometre.
 
 Each body's centre moves on a straight line and its heading turns at a constant rate. Two rectangles are apart if and only if one of the
 four directions of their sides separates them (separating axis theorem). The gap along such a direction is a smooth function of time, up
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.types import F64, I64
 
 TOUCH_M = 1e-9  # bodies this near touch; the first contact is found to this much of motion
 _N_GAPS = 8  # both sides of four directions
@@ -113,8 +113,3 @@ def first_contact(pairs: Motions) -> F64:
         owner, low, width = np.tile(owner, 2), np.concatenate([low, low + width]), np.tile(width, 2)
         at_low, at_high = np.concatenate([at_low, at_middle]), np.concatenate([at_middle, at_high])
     return found
-
-
-def touching_at(pairs: Motions, tau: F64) -> Bool:
-    """Return whether the pairs touch at times ``(M,)``, to `TOUCH_M`."""
-    return np.asarray(gaps(pairs, tau).max(axis=1) <= TOUCH_M)

@@ -1,7 +1,7 @@
 """Contact between logged instants: when each actor begins to touch the ego, where on the footprint, and on which side.
 
 Between two logged poses a body's centre moves straight and its heading turns at a constant rate the shorter way. Which actors can come
-near is asked of an R-tree over x, y and t that holds stretches of their tracks; what is left is solved by `evaluators.sweep`, for all pairs
+near is found by an R-tree over x, y and t of stretches of their tracks; the rest is solved by `evaluators.sweep`, for all pairs
 of a rollout at once.
 
 An actor's contact has one side from its beginning to its end: the one that the contact's normal leaves the ego through, front, rear or
@@ -30,7 +30,7 @@ _SLACK_S = 1e-9  # far below the microsecond of the logs, far above the rounding
 
 
 @dataclass(frozen=True)
-class Beginnings:
+class ContactOnsets:
     """When and where contacts begin, by actor and then by time."""
 
     actor: I64  # (B,) index into the actor table
@@ -45,13 +45,13 @@ class SweptContacts:
 
     step: I64  # (M,)
     actor: I64  # (M,)
-    begin: I64  # (M,) index into the beginnings
-    beginnings: Beginnings
+    begin: I64  # (M,) index into the onsets
+    onsets: ContactOnsets
 
     @property
     def side(self) -> I64:
         """Side of each row's contact."""
-        return self.beginnings.side[self.begin]
+        return self.onsets.side[self.begin]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contact
 
     Args:
         ego: Footprints at the times, sharp-cornered.
-        actors: Everybody else.
+        actors: All other actors.
         t_us: ``(T,)`` times.
         at_steps: What touches at the times themselves; decided by exact predicates.
         handover_us: When the policy takes over. A contact before it belongs to the row before it, although the next row is the policy's.
@@ -85,22 +85,22 @@ def find_swept(ego: Footprints, actors: ActorTable, t_us: I64, at_steps: Contact
     before = np.zeros_like(touch)
     before[:, 1:] = touch[:, :-1]
     fresh = np.flatnonzero(~(before | began)[at_steps.actor, at_steps.step])
-    beginnings, order = _beginnings(found, at_steps, fresh, ego, actors, t_us)
+    onsets, order = _onsets(found, at_steps, fresh, ego, actors, t_us)
     place_of = np.empty(len(order), dtype=np.int64)
     place_of[order] = np.arange(len(order))
     # Rows with contact at their own time follow the latest beginning of that actor; the others are the beginning's own row.
     span = (t_us[-1] - t_us[0]) * 1e-6 + 1.0
-    keys = beginnings.actor * span + beginnings.t_s
+    keys = onsets.actor * span + onsets.t_s
     at = at_steps.actor * span + (t_us[at_steps.step] - t_us[0]) * 1e-6
     latest = np.searchsorted(keys, at + _SLACK_S, side="right") - 1
     alone = np.flatnonzero(~touch[found.actor, row])
     step, actor = np.concatenate([at_steps.step, row[alone]]), np.concatenate([at_steps.actor, found.actor[alone]])
     begin = np.concatenate([latest, place_of[alone]])
     rank = np.lexsort((actor, step))
-    return SweptContacts(step[rank], actor[rank], begin[rank], beginnings)
+    return SweptContacts(step[rank], actor[rank], begin[rank], onsets)
 
 
-def _beginnings(found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Beginnings, I64]:
+def _onsets(found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[ContactOnsets, I64]:
     """Join contacts found between steps with those that are there at once; also return how they were sorted (found ones first)."""
     step, actor = at_steps.step[fresh], at_steps.actor[fresh]
     boxes = actors.boxes(actor, t_us[step])
@@ -113,7 +113,7 @@ def _beginnings(found: _Found, at_steps: Contacts, fresh: I64, ego: Footprints, 
     t_s = np.concatenate([found.t_s, (t_us[step] - t_us[0]) * 1e-6])
     side = np.concatenate([found.side, at_once])
     order = np.lexsort((t_s, who))
-    return Beginnings(who[order], t_s[order], side[order], np.concatenate([found.xy, xy])[order]), order
+    return ContactOnsets(who[order], t_s[order], side[order], np.concatenate([found.xy, xy])[order]), order
 
 
 def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Found:

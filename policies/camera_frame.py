@@ -1,4 +1,4 @@
-"""The frame that a camera policy asks for, checked."""
+"""The newest frame of a policy's camera, checked."""
 
 from __future__ import annotations
 

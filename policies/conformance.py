@@ -1,8 +1,8 @@
-"""Does a policy keep the contract? Canned situations, and a readable sentence for every fault.
+"""Conformance test of a policy: synthetic situations, and a readable sentence for every fault.
 
-What is checked: cameras asked for exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
+What is checked: the policy's cameras exist; plans are finite, begin now, at the ego, in the rig frame (x forward, y left), in metres,
 radians and microseconds; they reach two seconds ahead; the same seed gives the same plans; a reset forgets the drive before; an
-older frame is accepted; the answer is in time.
+older frame is accepted; the plan is in time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from policies.conformance_faults import (
 from policies.painted_road import PaintedRoad, pinhole_camera
 
 START_US = 1_700_000_000_000_000  # recordings use epoch time: a policy that counts in float32 is found out
-T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)  # away from the origin: world coordinates are told from rig coordinates
+T_WORLD_ROAD = se2(1200.0, -800.0, 0.7)  # away from the origin: world coordinates differ from rig coordinates
 STEPS = 6
 STEP_US = 100_000
 
@@ -61,7 +61,7 @@ PLAN_FAULTS: tuple[tuple[str, Fault, str], ...] = (
 
 @dataclass(frozen=True)
 class Check:
-    """One property and whether it holds; ``sentence`` tells what was found."""
+    """One property and whether it holds; ``sentence`` says what was found."""
 
     name: str
     ok: bool
@@ -74,11 +74,11 @@ class Report:
 
     checks: tuple[Check, ...]
     notes: tuple[str, ...]
-    latency_ms: tuple[float, float]  # median and worst answer, the first excluded
+    latency_ms: tuple[float, float]  # median and worst policy query, the first excluded
 
     @property
     def ok(self) -> bool:
-        """Tell whether every check passed."""
+        """Return whether every check passed."""
         return all(check.ok for check in self.checks)
 
     @property
@@ -89,12 +89,12 @@ class Report:
     def __str__(self) -> str:
         lines = [f"{'ok  ' if check.ok else 'FAIL'} {check.name}: {check.sentence}" for check in self.checks]
         lines += [f"note {note}" for note in self.notes]
-        return "\n".join([*lines, f"answers in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)"])
+        return "\n".join([*lines, f"plans in {self.latency_ms[0]:.1f} ms (median), {self.latency_ms[1]:.1f} ms (worst)"])
 
 
 @dataclass(frozen=True)
 class Situation:
-    """A stretch of road driven at a constant speed, the policy being asked every 0.1 s."""
+    """A stretch of road driven at a constant speed, with a policy query every 0.1 s."""
 
     name: str
     curvature_1pm: float = 0.0
@@ -135,12 +135,12 @@ def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scen
 def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency_limit_ms: float = 100.0) -> Report:
     """Drive a policy through the canned situations and report every breach of the contract.
 
-    A policy with ``controller = "perfect"`` replays a recording, so it is only asked what `canned_scenario` records.
+    A policy with ``controller = "perfect"`` replays a recording, so it is only queried where `canned_scenario` has a recording.
 
     Args:
         policy: A policy made for ``scenario``, or its name (see `make_policy`).
         scenario: Whose cameras the frames imitate; by default `canned_scenario`.
-        latency_limit_ms: Longest acceptable median answer.
+        latency_limit_ms: Longest acceptable median time of a policy query.
 
     Raises:
         InputError: The name is unknown, or what it names is not a policy.
@@ -159,12 +159,12 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
     durations: list[float] = []
     broken: list[Check] = []
     for situation in (STRAIGHT, OLD_FRAME) if replays else (STRAIGHT, OLD_FRAME, LEFT, RIGHT, STANDING):
-        answer = _drive(policy, situation, used, durations)
-        if isinstance(answer, str):
-            broken.append(Check("answers", False, answer))
+        made = _drive(policy, situation, used, durations)
+        if isinstance(made, str):
+            broken.append(Check("plans", False, made))
             continue
-        plans[situation.name] = answer
-        broken += _plan_faults(situation, answer)
+        plans[situation.name] = made
+        broken += _plan_faults(situation, made)
     checks += broken
     if not broken:
         checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
@@ -174,7 +174,7 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
         checks += _memory_checks(policy, used, plans["straight"], OLD_FRAME if replays else LEFT)
     median, worst = (float(np.median(durations)), max(durations)) if durations else (0.0, 0.0)
     if durations:
-        checks.append(Check("latency", median <= latency_limit_ms, f"answers in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
+        checks.append(Check("latency", median <= latency_limit_ms, f"plans in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
     return Report(tuple(checks), tuple(remarks(plans)), (median, worst))
 
 
@@ -203,7 +203,7 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
 
 
 def _drive(policy: Policy, situation: Situation, cameras: dict[str, CameraSpec], durations: list[float]) -> list[Plan] | str:
-    """Return the answers, or a sentence where the policy raised."""
+    """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
     where = f"in the situation {situation.name!r} the policy"
     plans: list[Plan] = []

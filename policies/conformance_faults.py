@@ -1,4 +1,4 @@
-"""Faults of plans, each found by one function that answers a readable sentence, or an empty one."""
+"""Faults of plans, each found by one function that returns a readable sentence, or an empty one."""
 
 from __future__ import annotations
 
@@ -112,13 +112,13 @@ def difference(a: Sequence[Plan], b: Sequence[Plan]) -> float:
 
 
 def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[str]:
-    """Tell what is legal but worth knowing."""
+    """List legal but unusual properties."""
     out = []
     if {"left", "right"} <= plans.keys() and difference(plans["left"], plans["right"]) == 0:
         out.append("the plan depends neither on the route nor on the frames: left and right give the same")
     if "standing" in plans:
         last = plans["standing"][-1]
         out.append(f"from standstill on a free road it moves {float(np.hypot(*(last.xy[-1] - last.xy[0]))):.1f} m within its horizon")
-    if not any(plan.samples for answers in plans.values() for plan in answers):
+    if not any(plan.samples for drive in plans.values() for plan in drive):
         out.append("it carries no sampled alternatives, so plan metrics see one trajectory")
     return out

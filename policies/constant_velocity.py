@@ -1,4 +1,4 @@
-"""Straight on at the present speed: the lower bound every policy should beat."""
+"""Constant velocity: the lower bound that every policy should exceed."""
 
 from __future__ import annotations
 

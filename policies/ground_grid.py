@@ -1,4 +1,4 @@
-"""The ground as seen by a camera: a fixed grid of ground points and where each falls in the image."""
+"""Inverse perspective mapping: a fixed grid of ground points and their pixels in the image."""
 
 from __future__ import annotations
 
@@ -42,10 +42,6 @@ class GroundGrid:
     def warp(self, image: U8) -> U8:
         """Return the image over the grid ``(R, C, 3)`` or ``(R, C)``; 0 outside the image."""
         return np.asarray(cv2.remap(image, self.map_u, self.map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
-
-    def row_of(self, x_m: F64) -> F64:
-        """Return fractional rows (K,) of distances (K,), clamped to the grid."""
-        return np.asarray(np.interp(x_m, self.x_m, np.arange(len(self.x_m))))
 
     def sight_column(self, y_m: F64, rows: npt.NDArray[np.intp]) -> F64:
         """Return the image columns ``(N, K)``, counted from the middle of `sight_index`, of lateral positions (N, K) on rows (N,)."""

@@ -1,4 +1,4 @@
-"""Drive by looking: lane paint and obstacles from the pixels of one front camera."""
+"""Drive from the pixels of one front camera: lane markings and obstacles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from policies.base import plan_times, seconds
 from policies.camera_frame import camera_frame
 from policies.ground_grid import GroundGrid, make_grid
 from policies.lane_filter import LaneState, predict, search, shift, update
-from policies.lane_plan import NOISE_SPEED, Blend, RouteGuess, blend, guess_from_route, progress_behind, sampled, spread_m, wander
+from policies.lane_plan import NOISE_SPEED, Blend, RoutePrior, blend, correlated_noise, idm_progress, route_prior, sample_sigma_m, sampled
 from policies.lane_vision import PaintPoints, RidgeFilter, find_paint
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
 from policies.paths import beside, curve_speeds, follow, smooth_line
@@ -25,13 +25,13 @@ from policies.pure_pursuit import has_route, route_points
 NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it
 MIN_CRUISE_MPS = 8.0
 MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
-DOUBTFUL_M, DOUBTFUL_PAINT_M = 1.2, 3.0
+UNCERTAIN_M, UNCERTAIN_PAINT_M = 1.2, 3.0
 LOST_SIGMA_M, LOST_BLIND_M = 0.9, 25.0
-OTHER_LANE = 0.55  # the route asks for the next lane when it lies this share of a width off the centre
+OTHER_LANE = 0.55  # the route is in the next lane when it lies this share of a width off the centre
 OTHER_LANE_FRAMES = 5
 SAME_HEADING_RAD, TURN_OFF_RAD = 0.25, 0.3
 CHOOSE_AT_M, CHOOSE_AT_S = 12.0, 1.2
-DOUBT_AT_M = 10.0
+SIGMA_AT_M = 10.0
 OBSTACLE_RANGE_M = 48.0
 
 
@@ -102,11 +102,11 @@ class LaneCamera(Policy):
         lane = None if self.lane is None else _moved(self.lane, self.seen_pose, pose_now)
         blended = blend(lane, route, speed)
         random = stream(self.scene_id, self.seed, "policy", self.step)
-        self.noise = wander(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
+        self.noise = correlated_noise(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
         self.step, self.acted_us = self.step + 1, observation.t_us
         wanted_mps = self.cruise_mps * (1.0 + NOISE_SPEED * float(self.noise[0, 1]))
         times = plan_times(observation.t_us)
-        progress = progress_behind(
+        progress = idm_progress(
             speed,
             curve_speeds(blended.path, wanted_mps),
             seconds(times),
@@ -114,8 +114,8 @@ class LaneCamera(Policy):
             self.bumper_m,
             wanted_mps,
         )
-        doubt_m = 0.0 if lane is None else float(lane.sigma(np.array([DOUBT_AT_M]))[0])
-        sigma_m = spread_m(doubt_m)
+        lane_sigma_m = 0.0 if lane is None else float(lane.sigma(np.array([SIGMA_AT_M]))[0])
+        sigma_m = sample_sigma_m(lane_sigma_m)
         xy, yaw = follow(beside(blended.path, sigma_m * float(self.noise[0, 0])), progress, max(speed, 0.0))
         others = sampled(xy, yaw, self.noise, sigma_m)[1:]
         debug = self._debug(lane, route, blended)
@@ -152,7 +152,7 @@ class LaneCamera(Policy):
 
     def _look_for_lane(self, points: PaintPoints, route: F64 | None, speed: float) -> None:
         row_m = np.interp(points.x_m, self.grid.x_m, self.grid.row_m)
-        guess = guess_from_route(np.array([[0.0, 0.0], [20.0, 0.0]]) if route is None else route)
+        guess = route_prior(np.array([[0.0, 0.0], [20.0, 0.0]]) if route is None else route)
         if self.lane is not None:
             self.lane = update(self.lane, points, row_m)
             if self._is_lost(self.lane, guess if route is not None else None):
@@ -186,7 +186,7 @@ class LaneCamera(Policy):
         lanes = round(beside_m / float(lane.mean[4]))
         return shift(lane, lanes) if abs(beside_m - lanes * lane.mean[4]) < 0.3 * lane.mean[4] else None
 
-    def _is_lost(self, lane: LaneState, route: RouteGuess | None) -> bool:
+    def _is_lost(self, lane: LaneState, route: RoutePrior | None) -> bool:
         if route is not None:
             at = 6.0
             turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(np.array([at]))[0])
@@ -194,7 +194,7 @@ class LaneCamera(Policy):
                 return True
             # Beside the route a lane must be well seen, on both sides: one line may be anything.
             beside_m = route.offset_m + at * route.heading_rad + at**2 / 2 * route.curvature_1pm - float(lane.centre(np.array([at]))[0])
-            if abs(beside_m) > DOUBTFUL_M and min(lane.left_m, lane.right_m) < DOUBTFUL_PAINT_M:
+            if abs(beside_m) > UNCERTAIN_M and min(lane.left_m, lane.right_m) < UNCERTAIN_PAINT_M:
                 return True
         sigma = float(lane.sigma(np.array([5.0]))[0])
         heading, width = float(lane.mean[1]), float(lane.mean[4])

@@ -40,11 +40,6 @@ class LaneState:
     seen_to_m: float = 0.0  # distance up to which paint supports the shape
     blind_m: float = 0.0  # metres driven since paint was last seen
 
-    @property
-    def paint_m(self) -> float:
-        """Give the metres of paint seen in the newest frame."""
-        return self.left_m + self.right_m
-
     def centre(self, x_m: F64) -> F64:
         """Return the lateral position (K,) of the lane's centre at distances (K,)."""
         return np.asarray(_basis(x_m) @ self.mean[:4])
@@ -92,7 +87,7 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     Args:
         lane: The predicted estimate.
         points: Paint in the rig frame.
-        row_m: (N,) length of road that each point stands for.
+        row_m: (N,) length of road that each point covers.
     """
     near = points.x_m < MAX_RANGE_M
     x, y = points.x_m[near], points.y_m[near]
@@ -152,7 +147,7 @@ def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float,
     histogram = np.bincount(flat, np.broadcast_to(paint, bins.shape)[valid], len(shapes) * n).reshape(len(shapes), n)
     padded = np.pad(histogram, ((0, 0), (1, 1)))
     histogram = histogram + 0.5 * (padded[:, :-2] + padded[:, 2:])
-    # Prefer the guess where the paint does not tell.
+    # Prefer the guess where the paint is ambiguous.
     doubt = ((shapes[:, 0] - heading_rad) / 0.15) ** 2 + ((shapes[:, 1] - curvature_1pm) / 0.03) ** 2
     best = int(np.argmax(np.sum(histogram**2, axis=1) / (1.0 + 0.1 * doubt)))
     pile = histogram[best]

@@ -1,4 +1,4 @@
-"""From what was seen to a plan: where to drive, how fast, and the sampled alternatives."""
+"""From the estimated lane, route and obstacle to a plan: path, speed, and sampled alternatives."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NOISE_RAMP_M = 12.0
 
 
 @dataclass(frozen=True)
-class RouteGuess:
+class RoutePrior:
     """The route near the ego, as a weak guess for the lane."""
 
     offset_m: float
@@ -36,15 +36,15 @@ class RouteGuess:
     curvature_1pm: float
 
 
-def guess_from_route(points: F64) -> RouteGuess:
+def route_prior(points: F64) -> RoutePrior:
     """Fit the next 20 m of route points ``(M, 2)`` by a parabola in the rig frame."""
     s = arc_lengths(points)
     near = resample(points, np.arange(0.0, min(20.0, max(float(s[-1]), 2.0)) + 0.5, 1.0))
     x, y = near[:, 0], near[:, 1]
     if x[-1] - x[0] < 5.0:
-        return RouteGuess(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
+        return RoutePrior(float(y[0]), float(np.arctan2(y[-1] - y[0], max(x[-1] - x[0], 0.1))), 0.0)
     half_curvature, heading, offset = np.polyfit(x, y, 2)
-    return RouteGuess(float(offset), float(heading), float(2 * half_curvature))
+    return RoutePrior(float(offset), float(heading), float(2 * half_curvature))
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Blend:
 def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     """Fuse the lane seen and the route ``(M, 2)``, each weighted by its inverse variance, distance by distance.
 
-    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route has no say in the
+    Near the car the paint's standard deviation is a few centimetres against `ROUTE_SIGMA_M` of the route, so the route does not affect the
     lateral position; it takes over beyond the paint that is seen, where it turns away from the lane (an intersection, an exit), and
     where the two are more than `SAME_LANE_M` apart.
     """
@@ -99,7 +99,7 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
     return Blend(make_path(fused, PATH_M, speed_mps), float(1.0 - lane_share[at_10]), leaves)
 
 
-def progress_behind(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float) -> F64:
+def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float) -> F64:
     """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance to what is ahead.
 
     Intelligent driver model (Treiber, Hennecke, Helbing 2000), the thing ahead continuing at its speed.
@@ -124,7 +124,7 @@ def progress_behind(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleT
     return np.array(progress)
 
 
-def wander(before: F64 | None, dt_s: float, random: np.random.Generator) -> F64:
+def correlated_noise(before: F64 | None, dt_s: float, random: np.random.Generator) -> F64:
     """Return the noise ``(N_SAMPLES, 2)`` of a step, lateral and speed in standard deviations, given that of the step before.
 
     A first-order Markov process with `NOISE_S` as its time: a policy that errs keeps erring for a while. White noise would be
@@ -137,13 +137,13 @@ def wander(before: F64 | None, dt_s: float, random: np.random.Generator) -> F64:
     return np.asarray(keep * before + np.sqrt(1 - keep**2) * fresh)
 
 
-def spread_m(doubt_m: float) -> float:
-    """Return the standard deviation of the samples to the side: what is seen badly is also driven badly.
+def sample_sigma_m(lane_sigma_m: float) -> float:
+    """Return the lateral standard deviation of the samples, which grows with that of the lane.
 
     Args:
-        doubt_m: Standard deviation of the lane's centre.
+        lane_sigma_m: Standard deviation of the lane's centre.
     """
-    return min(float(np.hypot(NOISE_LATERAL_M, doubt_m)), MAX_NOISE_M)
+    return min(float(np.hypot(NOISE_LATERAL_M, lane_sigma_m)), MAX_NOISE_M)
 
 
 def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
@@ -155,8 +155,8 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
     Args:
         xy: ``(T, 2)`` the plan.
         yaw: ``(T,)`` its headings.
-        noise: ``(N_SAMPLES, 2)`` from `wander`.
-        sigma_m: From `spread_m`.
+        noise: ``(N_SAMPLES, 2)`` from `correlated_noise`.
+        sigma_m: From `sample_sigma_m`.
     """
     s = arc_lengths(xy)
     ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
@@ -173,7 +173,7 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
 
 
 def _retimed(line: F64, s: F64, at: F64) -> F64:
-    """Return rows of ``line`` (T, 3) at progress ``at``, straight on beyond the end; a standing plan stays as it is."""
+    """Return rows of ``line`` (T, 3) at progress ``at``, straight on beyond the end; a standing plan is unchanged."""
     if s[-1] < 0.1:
         return line
     keep = np.concatenate([[True], np.diff(s) > 1e-9])

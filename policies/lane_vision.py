@@ -37,7 +37,7 @@ def brightness(ground: U8) -> F32:
 
 
 class RidgeFilter:
-    """Tells how much each cell of the ground outshines the road on *both* sides of it.
+    """Contrast of each ground cell against the road on *both* sides of it.
 
     The stroke's width and the distance of the two flanks grow with the pixel's size on the ground, so far paint, blurred over a
     pixel or two, still stands out. A step (kerb, shadow, the side of a car) outshines one side only and gives nothing.
@@ -109,7 +109,7 @@ def find_paint(ground: U8, grid: GroundGrid, ridges: RidgeFilter, not_road: U8 |
 
 
 def _is_bar(rows: npt.NDArray[np.intp], y: F64) -> Bool:
-    """Tell which ridge points ``(N,)`` are bars of a crosswalk: at least two others stand beside them, closer than any lane is wide."""
+    """Return which ridge points ``(N,)`` are bars of a crosswalk: at least two others lie beside them, closer than a lane width."""
     apart = np.abs(y[:, None] - y[None, :])
     beside = (rows[:, None] == rows[None, :]) & (apart > BAR_M[0]) & (apart < BAR_M[1])
     return np.asarray(beside.sum(axis=1) >= 2)

@@ -1,4 +1,4 @@
-"""Drive by a small network that was taught on clean frames: picture, speed and a navigation command in, trajectory out."""
+"""Drive by a small network trained on clean frames: image, speed and a navigation command in, trajectory out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from alpasim_plugin.types import F64, U8, Observation, Plan, Policy, Route, Scen
 from policies.base import plan_times, seconds
 from policies.camera_frame import camera_frame
 from policies.lane_camera import front_camera
-from policies.lane_plan import N_SAMPLES, NOISE_SPEED, sampled, wander
+from policies.lane_plan import N_SAMPLES, NOISE_SPEED, correlated_noise, sampled
 from policies.learned_command import COMMANDS, route_command
 from policies.learned_view import look, picture
 from policies.pure_pursuit import MIN_CRUISE_MPS
@@ -23,16 +23,16 @@ from policies.pure_pursuit import MIN_CRUISE_MPS
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
 EARLIER_US = 500_000  # the earlier frame shows how the others move
 EARLIEST_US = 700_000
-MAX_DOUBT_M, MAX_DOUBT_SPEED = 0.5, 0.15
+MAX_SIGMA_M, MAX_SIGMA_SPEED = 0.5, 0.15
 STANDS_MPS = 0.3
 
 
 class Learned(Policy):
-    """Ask a network for a path and a speed profile; drive a sample of its answer.
+    """Predict a path and a speed profile with a network; drive a sample of the prediction.
 
     It reads two frames of one camera, 0.5 s apart, the car's speed, the first speed of the drive as the wanted one, and one of five
     commands that are read off the route (`policies.learned_command`). Nothing else of the route reaches it: the place in the lane comes
-    from the pixels. It was taught on frames of the renderer ``clean`` alone.
+    from the pixels. It is trained on frames of the renderer ``clean`` alone.
 
     Args:
         scenario: Gives the camera, the scene's id for the random streams, and nothing else.
@@ -67,7 +67,7 @@ class Learned(Policy):
         self.views: deque[tuple[int, U8]] = deque()
 
     def act(self, observation: Observation) -> Plan:
-        """Return a plan drawn from the network's answer to the newest frame.
+        """Return a plan drawn from the network's prediction to the newest frame.
 
         Raises:
             PolicyError: The observation has no frame of the camera, or one of another size.
@@ -81,21 +81,21 @@ class Learned(Policy):
         if self.wanted_mps is None:
             self.wanted_mps = max(speed, MIN_CRUISE_MPS)
         command = route_command(observation.route_rig)
-        heading, faster, doubt = self._ask(speed, command)
+        heading, faster, sigma = self._predict(speed, command)
         times = plan_times(observation.t_us)
         xy, yaw = self._mean(heading, faster, speed, seconds(times))
         random = stream(self.scene_id, self.seed, "policy", self.step)
-        self.noise = wander(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
+        self.noise = correlated_noise(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
         self.step, self.acted_us = self.step + 1, observation.t_us
-        aside_m, share = self.temperature * np.minimum(doubt, [MAX_DOUBT_M, MAX_DOUBT_SPEED])
+        aside_m, share = self.temperature * np.minimum(sigma, [MAX_SIGMA_M, MAX_SIGMA_SPEED])
         drawn = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
         plans = sampled(xy, yaw, drawn, float(aside_m))[1:] if self.temperature else [np.column_stack([xy, yaw])] * N_SAMPLES
         debug: dict[str, Any] = {"command": command, "wanted_mps": self.wanted_mps}
-        debug.update(doubt_m=float(doubt[0]), doubt_speed=float(doubt[1]))
+        debug.update(sigma_m=float(sigma[0]), sigma_speed=float(sigma[1]))
         return Plan(observation.t_us, times, plans[0][:, :2].copy(), plans[0][:, 2].copy(), tuple(plans[1:]), debug)
 
-    def _ask(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
-        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the two doubts ``(2,)``."""
+    def _predict(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
+        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the two standard deviations ``(2,)``."""
         import torch
 
         from policies.learned_net import SPEED_UNIT_MPS
@@ -111,15 +111,15 @@ class Learned(Policy):
         try:
             with torch.inference_mode():
                 seen = torch.from_numpy(picture(now, earlier[1] if real else now))[None]
-                answer = self.net(seen, torch.tensor([state]), torch.tensor([COMMANDS.index(command)]))
+                prediction = self.net(seen, torch.tensor([state]), torch.tensor([COMMANDS.index(command)]))
         finally:
             if threads != 1:
                 torch.set_num_threads(threads)
-        heading, faster, doubt = (part[0].double().numpy() for part in (answer.heading, answer.speed, answer.doubt))
-        return heading, faster, doubt
+        heading, faster, sigma = (part[0].double().numpy() for part in (prediction.heading, prediction.speed, prediction.sigma))
+        return heading, faster, sigma
 
     def _mean(self, heading: F64, faster: F64, speed_mps: float, t_s: F64) -> tuple[F64, F64]:
-        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the network's own answer."""
+        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the network's own prediction."""
         from policies.learned_net import TIMES_S
 
         speeds = np.maximum(np.interp(t_s, [0.0, *TIMES_S], speed_mps + np.array([0.0, *faster])), 0.0)

@@ -1,4 +1,4 @@
-"""What the navigation says to the learned policy: one of five words, read off the shape of the route ahead."""
+"""Navigation command of the learned policy: one of five words, derived from the shape of the route ahead."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     """Return the command for a route ahead ``(20, 3)`` in the rig frame, NaN where it ends.
 
     A turn is a stretch of two route segments on which the route bends tighter than `TURN_RADIUS_M`. The nearest one within `AHEAD_M` is
-    announced, with "now" from `NOW_M` before it. Where in the lane the route lies cannot be read from the answer.
+    announced, with "now" from `NOW_M` before it. Where in the lane the route lies cannot be read from the command.
 
     Args:
         route_rig: As in `Observation`.

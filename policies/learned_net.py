@@ -1,4 +1,4 @@
-"""The learned policy's network: a picture, two speeds and a command to a path and a speed profile, each with its own doubt."""
+"""The learned policy's network: from an image, two speeds and a command to a path and a speed profile, each with a standard deviation."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ GRID_M = 1.0
 _KNOT_SCALE = [min(0.6, 0.05 + 0.02 * s) for s in KNOTS_M]  # radians: what an output of one means
 _SPEED_SCALE = [1.5 * t for t in TIMES_S]  # metres per second
 _PARTS = [len(KNOTS_M), len(TIMES_S), 2, 2]
-_MIN_DOUBT = 0.02
+_MIN_SIGMA = 0.02
 NEARNESS_M = 20.0
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What the network says of a batch of B observations."""
+class Prediction:
+    """The network's output for a batch of B observations."""
 
     heading: Tensor  # (B, 9) radians to the left of the rig's x axis at `KNOTS_M`
     speed: Tensor  # (B, 8) change of speed until `TIMES_S`, metres per second
-    doubt: Tensor  # (B, 2) standard deviations: to the side 16 m ahead, metres; of the mean speed over the plan, as a share
+    sigma: Tensor  # (B, 2) standard deviations: to the side 16 m ahead, metres; of the mean speed over the plan, as a share
     leader: Tensor  # (B, 2) nearness of who is ahead, exp(-gap / 20 m), and their speed, metres per second; no part of the plan
 
 
@@ -59,11 +59,11 @@ class LearnedNet(nn.Module):
         seen = 24 * (HEIGHT // 16) * (WIDTH // 16)
         self.plan = nn.Sequential(nn.Linear(seen + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU())
         self.out = nn.Linear(128, sum(_PARTS))
-        self._draw(torch.Generator().manual_seed(seed))
+        self._init_weights(torch.Generator().manual_seed(seed))
         self.register_buffer("knot_scale", torch.tensor(_KNOT_SCALE), persistent=False)
         self.register_buffer("speed_scale", torch.tensor(_SPEED_SCALE), persistent=False)
 
-    def _draw(self, random: torch.Generator) -> None:
+    def _init_weights(self, random: torch.Generator) -> None:
         """Draw the weights as torch does by default, but from a generator of their own; the last layer begins at zero."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):
@@ -75,13 +75,13 @@ class LearnedNet(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, picture: Tensor, state: Tensor, command: Tensor) -> Answer:
-        """Answer for pictures ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands ``(B,)``."""
+    def forward(self, picture: Tensor, state: Tensor, command: Tensor) -> Prediction:
+        """Predict for pictures ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands ``(B,)``."""
         seen = torch.cat([self.see(picture), self.state(state), self.word(command)], dim=1)
-        heading, speed, doubt, leader = self.out(self.plan(seen)).split(_PARTS, dim=1)
-        doubt = _MIN_DOUBT + 0.1 * torch.exp(doubt.clamp(-4.0, 3.0))
+        heading, speed, sigma, leader = self.out(self.plan(seen)).split(_PARTS, dim=1)
+        sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
         leader = torch.stack([torch.sigmoid(leader[:, 0]), SPEED_UNIT_MPS * leader[:, 1]], dim=1)
-        return Answer(heading * self.knot_scale, speed * self.speed_scale, doubt, leader)
+        return Prediction(heading * self.knot_scale, speed * self.speed_scale, sigma, leader)
 
 
 def path_grid() -> F64:
@@ -95,7 +95,7 @@ def knot_weights() -> F64:
     return np.stack([np.interp(path_grid(), knots, row) for row in np.eye(len(knots))[1:]], axis=1)
 
 
-def lay_out(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def path_from_headings(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return points ``(B, G, 2)`` and headings ``(B, G)`` of paths with headings ``(B, 9)`` at the knots, in metres and radians."""
     yaw = heading @ weights.T
     middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])

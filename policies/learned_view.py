@@ -1,4 +1,4 @@
-"""What the learned policy looks at: any camera's frame turned into one small level view."""
+"""Input view of the learned policy: any camera's frame warped into one small level view."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from policies.base import plan_times
 
 
 class LogReplay(Policy):
-    """Answer the recorded future in the rig frame. With the perfect controller the rollout is the log.
+    """Return the recorded future in the rig frame. With the perfect controller the rollout is the log.
 
     It knows the scenario's ego log, so it is a reference and not a policy under test. Where the log ends before the horizon the plan
     ends there as well.
@@ -25,7 +25,7 @@ class LogReplay(Policy):
         self.log = scenario.ego_log
 
     def reset(self, seed: int, route: Route) -> None:
-        """Do nothing: the answer depends on the time alone."""
+        """Do nothing: the plan depends on the time alone."""
 
     def act(self, observation: Observation) -> Plan:
         """Return the log from now on, seen from where the ego is.

@@ -19,7 +19,7 @@ from policies.ground_grid import CELL_M, GroundGrid
 STRIPS = 4
 CORRIDOR_HALF_M = 1.05  # half the ego's width: what stands outside can be passed
 TALL = 0.8  # how high to look, as a share of the camera's height
-LOW = 0.35  # the least that is asked where a curve ends the look
+LOW = 0.35  # the least share required where a curve ends the line of sight
 LEAVE_LANE_M = 2.6
 NARROW_M, WIDE_M = 0.35, 0.8  # thinner patches are paint: lines, and the bars of a crosswalk
 ROAD_NEAR_M, ROAD_FAR_M, ROAD_HALF_M = 5.5, 12.0, 0.9
@@ -82,7 +82,7 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
     camera's line of sight is filled, up to where a thing of `TALL` times the camera's height would hide the ground: a crosswalk does
     not reach that far, so the furthest quarter must be filled as well. In a curve the line of sight leaves the lane, and what is seen
     there says nothing; such a row must be filled by something wider than the bars of a crosswalk, and it is no candidate where even
-    a thing of `LOW` could not be told.
+    an object of `LOW` could not be detected.
 
     Args:
         value: `anomaly` of the frame.
@@ -155,7 +155,7 @@ class ObstacleTrack:
 
     @property
     def confirmed(self) -> bool:
-        """Tell whether it was seen often enough to act on."""
+        """Return whether it was seen often enough to act on."""
         return self.hits >= 3
 
 

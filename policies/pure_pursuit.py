@@ -1,4 +1,4 @@
-"""Drive along the route: what a policy could do with the route alone."""
+"""Pure pursuit along the route, without cameras."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PurePursuit(Policy):
 
 
 def has_route(route_rig: F64) -> bool:
-    """Tell whether at least half a metre of the route ``(20, 3)`` is left."""
+    """Return whether at least half a metre of the route ``(20, 3)`` is left."""
     points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
     return len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5
 

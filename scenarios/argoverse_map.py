@@ -160,7 +160,7 @@ def _optional_id(value: Any) -> str | None:
 
 
 def _same_way_neighbours(lane: Lane, lanes: dict[str, Lane]) -> Lane:
-    """Drop neighbours that are not in the map or run the other way: nobody changes into them."""
+    """Drop neighbours that are not in the map or run the other way."""
 
     def heading(line: F64) -> float:
         d = line[-1, :2] - line[0, :2]

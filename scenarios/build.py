@@ -9,10 +9,10 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import Actor, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.path import Path
-from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneChangeCount, Profile
+from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneTaper, Profile
 from alpasim_plugin.world.roads import build_road
 from scenarios.check import check_drive
-from scenarios.ego_path import Bump, EgoWay, LaneChange, ego_way
+from scenarios.ego_path import EgoPath, LaneChange, LateralShift, make_ego_path
 from scenarios.expert import Drive, ExpertStyle, drive
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_road import (
@@ -25,14 +25,14 @@ from scenarios.schema_road import (
     SplitSegment,
     StraightSegment,
 )
-from scenarios.traffic import Cast, Fail, cast_actors
+from scenarios.traffic import Fail, Traffic, place_actors
 
-TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's foresight does not see them freeze
+TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's lookahead does not see them stop
 DEFAULT_DURATION_US = 8_000_000
 
 
 @dataclass(frozen=True)
-class Built:
+class BuiltRoad:
     """A built road with its traffic."""
 
     lane_map: LaneMap
@@ -41,8 +41,8 @@ class Built:
     actors: tuple[Actor, ...]
 
 
-def build(spec: ScenarioSpec, vehicle: Vehicle, fail: Fail) -> Built:
-    """Build the road, cast the actors and let the expert drive.
+def build(spec: ScenarioSpec, vehicle: Vehicle, fail: Fail) -> BuiltRoad:
+    """Build the road, place the actors and let the expert drive.
 
     Args:
         spec: Validated and jittered file, with ``road``.
@@ -59,21 +59,21 @@ def build(spec: ScenarioSpec, vehicle: Vehicle, fail: Fail) -> Built:
         raise fail(("road", "segments"), e) from e
     try:
         changes = [LaneChange(spec.ego.start_m + c.at_m, c.to_lane, c.length_m) for c in spec.ego.lane_changes]
-        plain = ego_way(road, spec.ego.lane, changes)
-        way = ego_way(road, spec.ego.lane, changes, _bumps(spec.road, plain))
+        plain = make_ego_path(road, spec.ego.lane, changes)
+        ego_path = make_ego_path(road, spec.ego.lane, changes, _lateral_shifts(spec.road, plain))
     except InputError as e:
         raise fail(("ego",), e) from e
     end_us = last_us(spec)
-    if spec.ego.start_m >= way.path.length_m:
-        raise fail(("ego", "start_m"), _too_short(way.path.length_m, spec.ego.start_m))
-    cast = cast_actors(spec, road, way, vehicle, end_us + TAIL_US, fail)
-    run = _drive(spec, way, vehicle, cast, end_us, fail)
-    actors = cast.actors(run)
+    if spec.ego.start_m >= ego_path.path.length_m:
+        raise fail(("ego", "start_m"), _too_short(ego_path.path.length_m, spec.ego.start_m))
+    traffic = place_actors(spec, road, ego_path, vehicle, end_us + TAIL_US, fail)
+    run = _drive(spec, ego_path, vehicle, traffic, end_us, fail)
+    actors = traffic.actors(run)
     try:
         check_drive(road.lane_map, run.ego_log, vehicle, actors, end_us)
     except InputError as e:
         raise fail(_blame(spec, e.with_what), e) from e
-    return Built(road.lane_map, run.ego_log, Route(way.path.xyz[::4], way.lane_ids), actors)
+    return BuiltRoad(road.lane_map, run.ego_log, Route(ego_path.path.xyz[::4], ego_path.lane_ids), actors)
 
 
 def _blame(spec: ScenarioSpec, with_what: str) -> tuple[str | int, ...]:
@@ -103,7 +103,7 @@ def elements(spec: RoadSpec) -> list[Element]:
             case ClothoidSegment():
                 out.append(Curve(segment.length_m, segment.start_curvature_per_m, segment.end_curvature_per_m))
             case MergeSegment() | SplitSegment():
-                out.append(LaneChangeCount(segment.kind, segment.length_m))
+                out.append(LaneTaper(segment.kind, segment.length_m))
             case IntersectionSegment():
                 out.append(
                     Intersection(segment.turn, segment.arms, segment.cross_lanes, segment.arm_length_m, segment.corner_radius_m,
@@ -120,22 +120,22 @@ def profile(spec: RoadSpec) -> Profile:
     )  # fmt: skip
 
 
-def _bumps(spec: RoadSpec, way: EgoWay) -> list[Bump]:
+def _lateral_shifts(spec: RoadSpec, ego_path: EgoPath) -> list[LateralShift]:
     out = []
     for i, segment in enumerate(spec.segments):
         if isinstance(segment, NarrowGapSegment) and segment.shift_m:
-            begin, end = way.stretch_s[i], way.stretch_s[i + 1]
+            begin, end = ego_path.stretch_s[i], ego_path.stretch_s[i + 1]
             quarter = (end - begin) / 4
-            out.append(Bump(begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m))
+            out.append(LateralShift(begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m))
     return out
 
 
-def _drive(spec: ScenarioSpec, way: EgoWay, vehicle: Vehicle, cast: Cast, end_us: int, fail: Fail) -> Drive:
+def _drive(spec: ScenarioSpec, ego_path: EgoPath, vehicle: Vehicle, traffic: Traffic, end_us: int, fail: Fail) -> Drive:
     style = ExpertStyle(spec.ego.speed_mps, spec.ego.cruise_mps, spec.ego.max_lateral_accel_mps2, spec.ego.headway_s)
-    run = drive(way.path, spec.ego.start_m, vehicle, style, cast.scripts(), cast.followers, end_us)
+    run = drive(ego_path.path, spec.ego.start_m, vehicle, style, traffic.scripts(), traffic.followers, end_us)
     reached = int(run.ego_log.t_us[-1])
     if reached < end_us:
-        raise fail(("road", "segments"), _too_short(way.path.length_m, _driven(way.path, run.ego_log), reached, end_us))
+        raise fail(("road", "segments"), _too_short(ego_path.path.length_m, _driven(ego_path.path, run.ego_log), reached, end_us))
     return run
 
 

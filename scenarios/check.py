@@ -1,4 +1,4 @@
-"""Proof that the expert's drive is clean: on the road and clear of everybody, checked when a built scenario is loaded."""
+"""Check that the expert's drive stays on the road and clear of all actors; runs when a built scenario is loaded."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def _bound(files: SourceFiles, where: str, element: Element, side: str, origin: 
 
 
 def _is_left_of(one: F64, other: F64) -> bool:
-    """Say whether ``one`` runs on the left of ``other``: the ring one + reversed other is clockwise."""
+    """Return whether ``one`` runs on the left of ``other``: the ring one + reversed other is clockwise."""
     x, y = np.concatenate([one[:, :2], other[::-1, :2]]).T
     return bool(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
 

@@ -96,23 +96,6 @@ def _fit(x: F64, y: F64) -> F64:
     return np.concatenate([[0.0], coefficients / scale ** np.arange(1, 6)])
 
 
-def project_ftheta(camera: RecordedLens, points: F64) -> F64:
-    """Project camera-frame points ``(N, 3)`` to pixels ``(N, 2)`` of the recorded image; NaN beyond the lens's largest angle.
-
-    The radius comes from the forward polynomial, refined by Newton steps on the backward one where that is the calibrated side.
-    """
-    across = np.hypot(points[:, 0], points[:, 1])
-    theta = np.arctan2(across, points[:, 2])
-    radius = _polynomial(theta, np.array(camera.lens.angle_to_pixel))
-    if camera.backward_given:
-        poly = np.polynomial.Polynomial(camera.lens.pixel_to_angle)
-        for _ in range(4):
-            radius = radius - (poly(radius) - theta) / poly.deriv()(radius)
-    unit = points[:, :2] / np.maximum(across, 1e-12)[:, None]
-    pixels = unit * radius[:, None] + (camera.cx, camera.cy)
-    return np.asarray(np.where((theta <= camera.lens.max_angle_rad)[:, None], pixels, np.nan))
-
-
 def front_camera(lens: RecordedLens, T_rig_camera: F64 = T_RIG_FRONT_WIDE) -> CameraSpec:
     """Return the pinhole of 90 degrees width inside the front wide lens.
 

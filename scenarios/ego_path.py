@@ -25,8 +25,8 @@ class LaneChange:
 
 
 @dataclass(frozen=True)
-class Bump:
-    """A sideways shift of the ego's line, in and out again: full from ``begin_m`` to ``end_m``, ``ramp_m`` on either side."""
+class LateralShift:
+    """A lateral shift of the ego's line and back: full from ``begin_m`` to ``end_m``, ``ramp_m`` on either side."""
 
     begin_m: float
     end_m: float
@@ -35,7 +35,7 @@ class Bump:
 
 
 @dataclass(frozen=True)
-class EgoWay:
+class EgoPath:
     """The ego's line and where it runs."""
 
     path: Path
@@ -43,7 +43,7 @@ class EgoWay:
     stretch_s: tuple[float, ...]  # arc length at which each stretch begins, one more at the end
 
 
-def ego_way(road: Road, lane: int, changes: Sequence[LaneChange] = (), bumps: Sequence[Bump] = ()) -> EgoWay:
+def make_ego_path(road: Road, lane: int, changes: Sequence[LaneChange] = (), shifts: Sequence[LateralShift] = ()) -> EgoPath:
     """Return the rear axle's line from forward lane ``lane`` at the road's beginning.
 
     Raises:
@@ -65,9 +65,9 @@ def ego_way(road: Road, lane: int, changes: Sequence[LaneChange] = (), bumps: Se
     line = np.concatenate([parts[0]] + [p[1:] for p in parts[1:]])
     s = arc_lengths(line)
     begins = np.cumsum([0] + [len(p) - 1 for p in parts])
-    for bump in bumps:
-        line = _shift(line, s, bump)
-    return EgoWay(smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins))
+    for shift in shifts:
+        line = _shift(line, s, shift)
+    return EgoPath(smooth_path(line), tuple(i for i, _ in chain), tuple(float(s[i]) for i in begins))
 
 
 def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: LaneChange) -> tuple[list[F64], list[tuple[str, int]]]:
@@ -80,14 +80,16 @@ def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: 
     stretch = road.stretches[first]
     if change.to_lane >= len(stretch.forward) or stretch.forward[change.to_lane] is None:
         raise InputError("placing the ego", where, f"element {first} has no such lane", "choose a lane that exists there")
-    target = _way_from(road, first, change.to_lane)
+    target = _lanes_from(road, first, change.to_lane)
     out, new_chain = parts[:first], chain[:first]
     for n, (lane_id, k) in enumerate(target):
         i = first + n
         goal = road.lane_map.lanes[lane_id].centre
         if begin[min(i, len(begin) - 1)] < change.at_m + change.length_m:
             if i >= len(parts) or len(parts[i]) != len(goal):
-                raise InputError("placing the ego", where, f"the lanes part at element {i}", "change lanes earlier or on a shorter way")
+                raise InputError(
+                    "placing the ego", where, f"the lanes part at element {i}", "change lanes earlier or within a shorter length"
+                )
             share = smoothstep((begin[i] + arc_lengths(parts[i]) - change.at_m) / change.length_m)[:, None]
             goal = (1 - share) * parts[i] + share * goal
         out.append(goal)
@@ -95,7 +97,7 @@ def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: 
     return out, new_chain
 
 
-def _way_from(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
+def _lanes_from(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
     out: list[tuple[str, int]] = []
     at: int | None = lane
     for part in road.stretches[stretch:]:
@@ -106,17 +108,17 @@ def _way_from(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
     return out
 
 
-def _shift(line: F64, s: F64, bump: Bump) -> F64:
-    share = smoothstep((s - bump.begin_m + bump.ramp_m) / bump.ramp_m) * smoothstep((bump.end_m + bump.ramp_m - s) / bump.ramp_m)
+def _shift(line: F64, s: F64, shift: LateralShift) -> F64:
+    share = smoothstep((s - shift.begin_m + shift.ramp_m) / shift.ramp_m) * smoothstep((shift.end_m + shift.ramp_m - s) / shift.ramp_m)
     d = np.gradient(line[:, :2], s, axis=0)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     out = line.copy()
-    out[:, 0] -= bump.shift_m * share * d[:, 1]
-    out[:, 1] += bump.shift_m * share * d[:, 0]
+    out[:, 0] -= shift.shift_m * share * d[:, 1]
+    out[:, 1] += shift.shift_m * share * d[:, 0]
     return out
 
 
-def lane_path(road: Road, way: EgoWay, lane: int | str, at_s_m: float) -> Path:
+def lane_path(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> Path:
     """Return the line of a lane of the main road that is present where the ego's line is at ``at_s_m``, or of a lane given by its id.
 
     A forward lane (``>= 0``) is followed back to where it begins and on to where it ends; an oncoming lane (``< 0``, -1 is next to
@@ -127,11 +129,11 @@ def lane_path(road: Road, way: EgoWay, lane: int | str, at_s_m: float) -> Path:
     """
     if isinstance(lane, str):
         return polyline_path(polyline(road.lane_map, _follow(road, lane)))
-    i = int(np.clip(np.searchsorted(way.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
+    i = int(np.clip(np.searchsorted(ego_path.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
     stretch = road.stretches[i]
     ids: list[str] = []
     if lane >= 0 and lane < len(stretch.forward) and stretch.forward[lane] is not None:
-        ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [lane_id for lane_id, _ in _way_from(road, i, lane)]
+        ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [lane_id for lane_id, _ in _lanes_from(road, i, lane)]
     elif lane < 0 and -lane - 1 < len(stretch.backward) and stretch.backward[-lane - 1] is not None:
         ids = road.backward_chain(-lane - 1)
     if not ids:

@@ -1,7 +1,7 @@
 """The expert that writes the ego's log on a built road, driven together with the reactive traffic.
 
-Whoever is in the expert's corridor is followed with the Intelligent Driver Model. Whoever will come into it within the next seconds is
-foreseen (`scenarios.foresight`), so that the log yields early and smoothly. Bends limit the speed; acceleration and jerk are bounded.
+The expert follows whoever is in its corridor with the Intelligent Driver Model. It predicts who will enter the corridor within the next
+seconds (`scenarios.lookahead`) and yields early and smoothly. Bends limit the speed; acceleration and jerk are bounded.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceler
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.scripted import track_on_path
 from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
-from scenarios.foresight import TIMES_S, Ahead, Script, ScriptTable, foresee
+from scenarios.lookahead import TIMES_S, PredictedBodies, ScriptedTrack, ScriptedTracks, yielding_acceleration
 
 LOG_STEP_US = 10_000  # 100 Hz
 DECISION_US = 50_000
-FORESIGHT_US = 100_000
+LOOKAHEAD_US = 100_000
 MAX_ACCEL_MPS2, MAX_BRAKE_MPS2, MAX_JERK_MPS3 = 2.0, 7.0, 10.0
 STOP_JERK_MPS3 = 5.0
 COMFORT_BRAKE_MPS2 = 1.5
@@ -59,7 +59,13 @@ class Drive:
 
 
 def drive(
-    path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, scripts: Sequence[Script], followers: Sequence[Follower], end_us: int
+    path: Path,
+    s0_m: float,
+    vehicle: Vehicle,
+    style: ExpertStyle,
+    scripts: Sequence[ScriptedTrack],
+    followers: Sequence[Follower],
+    end_us: int,
 ) -> Drive:
     """Drive from time 0 to ``end_us``, or to the end of the path.
 
@@ -72,7 +78,7 @@ def drive(
         followers: Drivers that react to the ego and to each other.
         end_us: Last time.
     """
-    table = ScriptTable(scripts, end_us, DECISION_US)
+    table = ScriptedTracks(scripts, end_us, DECISION_US)
     expert = _Expert(path, s0_m, vehicle, style, table)
     cars = [_Car(f, table.standing) for f in followers]
     log_s, log_t = [expert.s], [0]
@@ -111,7 +117,7 @@ def speed_limits(path: Path, style: ExpertStyle) -> F64:
 class _Expert:
     """The ego while it drives."""
 
-    def __init__(self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptTable) -> None:
+    def __init__(self, path: Path, s0_m: float, vehicle: Vehicle, style: ExpertStyle, table: ScriptedTracks) -> None:
         self.path, self.vehicle, self.table = path, vehicle, table
         self.lookup = path.coarser(4)  # projections search every station; 1 m apart is enough for them
         self.limit = speed_limits(path, style)
@@ -139,13 +145,15 @@ class _Expert:
         for leader in (moving, nearest_ahead(self.standing, self.front_s, half)):
             if leader.index >= 0:
                 wanted = min(wanted, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.params))
-        if t_us % FORESIGHT_US == 0:
-            self.cap = foresee(self.lookup, self.front_s, self.v, self.vehicle.box, _ahead(self.table, cars, t_us), MIN_GAP_M)
+        if t_us % LOOKAHEAD_US == 0:
+            self.cap = yielding_acceleration(
+                self.lookup, self.front_s, self.v, self.vehicle.box, _predicted(self.table, cars, t_us), MIN_GAP_M
+            )
         return max(min(wanted, self.cap), -MAX_BRAKE_MPS2)
 
     def advance(self, wanted: float, dt_s: float) -> None:
         step = MAX_JERK_MPS3 * dt_s
-        # The brake is released on the way to standstill: v = a^2 / 2 j leaves no jolt at the end.
+        # The brake is released while stopping: v = a^2 / 2 j leaves no jolt at standstill.
         wanted = max(wanted, -float(np.sqrt(2.0 * STOP_JERK_MPS3 * self.v)))
         self.a = float(np.clip(wanted, self.a - step, self.a + step))
         if self.v + self.a * dt_s < 0:
@@ -187,7 +195,7 @@ class _Car:
         return track_on_path(self.f.path, times, np.array(self.log_s[: len(times)]), self.f.box, self.f.offset_m)
 
 
-def _ahead(table: ScriptTable, cars: Sequence[_Car], t_us: int) -> Ahead:
+def _predicted(table: ScriptedTracks, cars: Sequence[_Car], t_us: int) -> PredictedBodies:
     """Return scripted tracks as they are written, and reactive cars at their present speed on their own lines."""
     rows = table.rows(t_us)
     xy, yaw = [table.xy[rows]], [table.yaw[rows]]
@@ -199,7 +207,7 @@ def _ahead(table: ScriptTable, cars: Sequence[_Car], t_us: int) -> Ahead:
         yaw.append(heading[:, None])
         velocity.append(car.v * np.stack([np.cos(heading), np.sin(heading)], axis=-1)[:, None])
         present.append((s <= car.f.path.length_m)[:, None])
-    return Ahead(
+    return PredictedBodies(
         np.concatenate(xy, axis=1), np.concatenate(yaw, axis=1), np.concatenate(velocity, axis=1), np.concatenate(present, axis=1),
         (*table.boxes, *(car.f.box for car in cars)), np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
     )  # fmt: skip

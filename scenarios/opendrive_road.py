@@ -206,5 +206,5 @@ def lane_key(road: Road, section: int, lane_id: int) -> str:
 
 
 def curved(records: Sequence[Geometry]) -> bool:
-    """Tell whether any record bends."""
+    """Return whether any record is curved."""
     return any(one.kind != "line" for one in records)

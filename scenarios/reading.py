@@ -149,7 +149,7 @@ class SourceFiles:
                         members[info.name] = content
         except (tarfile.TarError, EOFError, OSError) as error:
             raise self.fail(path, f"a damaged tar: {error}", "fetch the file again; it may be truncated") from error
-        # A cut between two members leaves a readable tar: only the two empty blocks at its end tell that it is whole.
+        # A cut between two members leaves a readable tar: only the two empty blocks at its end show that it is complete.
         if any(data[-2 * tarfile.BLOCKSIZE :]):
             raise self.fail(path, "a damaged tar: no end-of-archive blocks", "fetch the file again; it may be truncated")
         if not members:

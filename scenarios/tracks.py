@@ -1,4 +1,4 @@
-"""From recorded states to trajectories and actors: checks, gaps, and who stands still."""
+"""From recorded states to trajectories and actors: checks, gaps, and static actors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenarios.reading import SourceFiles
 
 MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors
 STATIC_REACH_M = {"pedestrian": 0.5, "cyclist": 0.5, "motorcycle": 0.75}  # largest distance from the median position
-STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars wander by up to 0.8 m in 15 s
+STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars drift by up to 0.8 m in 15 s
 STATIC_SPEED_MPS = 0.3
 
 
@@ -58,7 +58,7 @@ def split_at_gaps(t_us: I64, max_gap_us: int = MAX_GAP_US) -> list[slice]:
 
 
 def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool = False) -> bool:
-    """Say whether a track is that of a standing object, given the noise of annotated boxes.
+    """Return whether a track is that of a standing object, given the noise of annotated boxes.
 
     It stands if it never leaves its median position by more than its class's reach and that reach, over its duration, is slower than
     `STATIC_SPEED_MPS`; a glimpse too short to tell counts as moving. ``fixed`` classes (bollards, signs) stand whatever their duration.
@@ -73,7 +73,7 @@ def stands_still(t_us: I64, xyz: F64, label: str, fixed: bool = False) -> bool:
 def actors_of_track(actor_id: str, label: str, box: Box, track: Trajectory, fixed: bool = False) -> list[Actor]:
     """Make the actors of one recorded track: one, or one a run where the track has holes longer than `MAX_GAP_US`.
 
-    Runs after the first are called ``ID~2``, ``ID~3``, ... so that nobody glides through a hole in the recording.
+    Runs after the first are called ``ID~2``, ``ID~3``, ... so that no actor is interpolated across a gap in the recording.
     """
     actors: list[Actor] = []
     for run, part in enumerate(split_at_gaps(track.t_us), start=1):

@@ -1,4 +1,4 @@
-"""The actors of a built road: places in lanes, scripts, followers."""
+"""Traffic of a built road: actors placed in lanes, scripted tracks, IDM followers."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from alpasim_plugin.world.scripted import (
     track_on_path,
     walk_track,
 )  # fmt: skip
-from scenarios.ego_path import EgoWay, lane_path
+from scenarios.ego_path import EgoPath, lane_path
 from scenarios.expert import Drive, ExpertStyle, Follower, drive
-from scenarios.foresight import Script
+from scenarios.lookahead import ScriptedTrack
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_actors import (
     ActorSpec,
@@ -54,16 +54,16 @@ SIZES = {
 
 
 @dataclass
-class Cast:
-    """Everyone on the road except the ego."""
+class Traffic:
+    """All actors on the road except the ego."""
 
     scripted: list[Actor] = field(default_factory=list)
     reactive: list[tuple[str, str, dict[str, float]]] = field(default_factory=list)  # id, label, behaviour parameters
     followers: list[Follower] = field(default_factory=list)
 
-    def scripts(self) -> list[Script]:
+    def scripts(self) -> list[ScriptedTrack]:
         """Return the scripted tracks for the expert."""
-        return [Script(a.track, a.box) for a in self.scripted]
+        return [ScriptedTrack(a.track, a.box) for a in self.scripted]
 
     def actors(self, run: Drive) -> tuple[Actor, ...]:
         """Return all actors, with the tracks that the followers drove beside the expert."""
@@ -74,58 +74,58 @@ class Cast:
         return (*self.scripted, *idm)
 
 
-def cast_actors(spec: ScenarioSpec, road: Road, way: EgoWay, vehicle: Vehicle, end_us: int, fail: Fail) -> Cast:
+def place_actors(spec: ScenarioSpec, road: Road, ego_path: EgoPath, vehicle: Vehicle, end_us: int, fail: Fail) -> Traffic:
     """Place every actor; those who are timed against the ego come last, after a drive without them.
 
     Raises:
         InputError: An actor outside its lane or in a lane that does not exist, with the position of its key.
     """
-    cast, t_us = Cast(), grid(0, end_us)
-    stage = _Stage(spec, road, way, vehicle, t_us)
-    cast.scripted += _gap_cars(stage)
+    traffic, t_us = Traffic(), grid(0, end_us)
+    placer = _Placer(spec, road, ego_path, vehicle, t_us)
+    traffic.scripted += _gap_cars(placer)
     late: list[tuple[int, CrossingActor]] = []
     for i, actor in enumerate(spec.actors):
         try:
             if isinstance(actor, CrossingActor):
                 late.append((i, actor))
             elif isinstance(actor, IdmActor):
-                _add_follower(stage, cast, actor)
+                _add_follower(placer, traffic, actor)
             else:
-                cast.scripted += _scripted(stage, actor)
+                traffic.scripted += _scripted(placer, actor)
         except InputError as e:
             raise fail(("actors", i), e) from e
     if late:
         style = ExpertStyle(spec.ego.speed_mps, spec.ego.cruise_mps, spec.ego.max_lateral_accel_mps2, spec.ego.headway_s)
-        run = drive(way.path, spec.ego.start_m, vehicle, style, cast.scripts(), cast.followers, end_us)
+        run = drive(ego_path.path, spec.ego.start_m, vehicle, style, traffic.scripts(), traffic.followers, end_us)
         for i, crossing in late:
             try:
-                cast.scripted.append(_crossing(stage, crossing, run.ego_log))
+                traffic.scripted.append(_crossing(placer, crossing, run.ego_log))
             except InputError as e:
                 raise fail(("actors", i), e) from e
-    return cast
+    return traffic
 
 
 @dataclass(frozen=True)
-class _Stage:
+class _Placer:
     spec: ScenarioSpec
     road: Road
-    way: EgoWay
+    ego_path: EgoPath
     vehicle: Vehicle
     t_us: I64
 
     def place(self, lane: int | str, s_m: float, actor_id: str) -> tuple[Path, float]:
         """Return a lane's line and the arc length on it abreast of the ego's line at ``s_m`` from the ego's start."""
         at = self.spec.ego.start_m + s_m
-        path = lane_path(self.road, self.way, lane, at)
+        path = lane_path(self.road, self.ego_path, lane, at)
         if isinstance(lane, str):
             s = s_m
         else:
-            xyz, _ = self.way.path.at(at)
+            xyz, _ = self.ego_path.path.at(at)
             s = float(path.project(xyz[None, :2])[0][0])
-            if not 0 <= at <= self.way.path.length_m:
+            if not 0 <= at <= self.ego_path.path.length_m:
                 s = -1.0
         if not 0 <= s <= path.length_m:
-            room = f"its lane has room from {-self.spec.ego.start_m:.0f} to {self.way.path.length_m - self.spec.ego.start_m:.0f} m"
+            room = f"its lane has room from {-self.spec.ego.start_m:.0f} to {self.ego_path.path.length_m - self.spec.ego.start_m:.0f} m"
             raise InputError("placing an actor", actor_id, f"s_m = {s_m:.1f} is not on the road: {room}", "choose s_m inside")
         return path, s
 
@@ -135,38 +135,38 @@ def box_of(actor: ActorSpec) -> Box:
     return Box(*actor.size_m) if actor.size_m is not None else SIZES[actor.label]
 
 
-def _scripted(stage: _Stage, actor: ActorSpec) -> list[Actor]:
-    box, t = box_of(actor), stage.t_us
+def _scripted(placer: _Placer, actor: ActorSpec) -> list[Actor]:
+    box, t = box_of(actor), placer.t_us
     match actor:
         case ParkedActor():
-            return _parked(stage, actor, box)
+            return _parked(placer, actor, box)
         case LoggedActor():
             return [_logged(actor, box)]
         case DriveActor():
-            path, s0 = stage.place(actor.lane, actor.s_m, actor.id)
+            path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
             track = track_on_path(path, t, integrate(t, speed_profile(t, actor.speeds), s0), box, actor.offset_m)
         case OncomingActor():
-            path, s0 = stage.place(-1 - actor.lane, actor.s_m, actor.id)
+            path, s0 = placer.place(-1 - actor.lane, actor.s_m, actor.id)
             track = track_on_path(path, t, integrate(t, np.full(len(t), actor.speed_mps), s0), box, actor.offset_m)
         case HardBrakeActor():
-            path, s0 = stage.place(actor.lane, actor.s_m, actor.id)
+            path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
             rows = brake_rows(actor.speed_mps, actor.brake_at_us, actor.decel_mps2, actor.end_speed_mps, actor.resume_at_us)
             track = track_on_path(path, t, integrate(t, speed_profile(t, rows), s0), box, actor.offset_m)
         case CutInActor():
-            track = _cut_in(stage, actor, box)
+            track = _cut_in(placer, actor, box)
         case _:
-            raise AssertionError(f"{actor.kind} is cast elsewhere")
+            raise AssertionError(f"{actor.kind} is placed elsewhere")
     return [Actor(actor.id, actor.label, box, track)]
 
 
-def _cut_in(stage: _Stage, actor: CutInActor, box: Box) -> Trajectory:
-    path, s0 = stage.place(actor.from_lane, actor.s_m, actor.id)
-    target, _ = stage.place(actor.to_lane, actor.s_m, actor.id)
+def _cut_in(placer: _Placer, actor: CutInActor, box: Box) -> Trajectory:
+    path, s0 = placer.place(actor.from_lane, actor.s_m, actor.id)
+    target, _ = placer.place(actor.to_lane, actor.s_m, actor.id)
     end = actor.speed_mps if actor.end_speed_mps is None else actor.end_speed_mps
     begin_s = actor.at_us * 1e-6
     rows = [(begin_s, actor.speed_mps), (begin_s + max(abs(end - actor.speed_mps) / actor.decel_mps2, 1e-3), end)]
-    s = integrate(stage.t_us, speed_profile(stage.t_us, rows), s0)
-    return cut_in_track(path, target, stage.t_us, s, box, actor.at_us, actor.change_us)
+    s = integrate(placer.t_us, speed_profile(placer.t_us, rows), s0)
+    return cut_in_track(path, target, placer.t_us, s, box, actor.at_us, actor.change_us)
 
 
 def _logged(actor: LoggedActor, box: Box) -> Actor:
@@ -176,32 +176,32 @@ def _logged(actor: LoggedActor, box: Box) -> Actor:
     return Actor(actor.id, actor.label, box, Trajectory(t_us, xyz, quat_from_yaw(rows[:, 3])), is_static=False)
 
 
-def _parked(stage: _Stage, actor: ParkedActor, box: Box) -> list[Actor]:
+def _parked(placer: _Placer, actor: ParkedActor, box: Box) -> list[Actor]:
     out = []
     for n in range(actor.count):
-        at = stage.spec.ego.start_m + actor.s_m + n * actor.spacing_m
-        if not 0 <= at <= stage.way.path.length_m:
+        at = placer.spec.ego.start_m + actor.s_m + n * actor.spacing_m
+        if not 0 <= at <= placer.ego_path.path.length_m:
             raise InputError("placing an actor", actor.id, f"vehicle {n + 1} of {actor.count} at {at:.0f} m is beyond the road", "move it")
         name = actor.id if actor.count == 1 else f"{actor.id}-{n}"
-        out.append(_stand(stage, name, actor.label, box, at, actor.side, actor.clearance_m, np.deg2rad(actor.yaw_deg)))
+        out.append(_stand(placer, name, actor.label, box, at, actor.side, actor.clearance_m, np.deg2rad(actor.yaw_deg)))
     return out
 
 
-def _stand(stage: _Stage, name: str, label: str, box: Box, at: float, side: str, clearance_m: float, yaw_rad: float) -> Actor:
+def _stand(placer: _Placer, name: str, label: str, box: Box, at: float, side: str, clearance_m: float, yaw_rad: float) -> Actor:
     """Put a vehicle beside the outer lane of one side; the clearance counts from the lane's edge to the nearest side of the body."""
-    path, d, turned = outer_edge(stage.road, stage.way, at, side)
+    path, d, turned = outer_edge(placer.road, placer.ego_path, at, side)
     reach = 0.5 * (abs(np.cos(yaw_rad)) * box.width_m + abs(np.sin(yaw_rad)) * box.length_m)
     sign = 1.0 if side == "left" else -1.0
     xyz, yaw = path.at(at, d + sign * (clearance_m + reach))
     heading = float(yaw) + (np.pi if turned else 0.0) + yaw_rad
-    return Actor(name, label, box, standing_track(xyz[0], xyz[1], xyz[2], heading, stage.t_us, box), is_static=True)
+    return Actor(name, label, box, standing_track(xyz[0], xyz[1], xyz[2], heading, placer.t_us, box), is_static=True)
 
 
-def outer_edge(road: Road, way: EgoWay, at_s_m: float, side: str) -> tuple[Path, float, bool]:
+def outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tuple[Path, float, bool]:
     """Return the ego's line, the signed distance from it to the outer lane's outer edge, and whether that lane is an oncoming one."""
-    i = int(np.clip(np.searchsorted(way.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
+    i = int(np.clip(np.searchsorted(ego_path.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
     stretch = road.stretches[i]
-    xyz, yaw = way.path.at(at_s_m)
+    xyz, yaw = ego_path.path.at(at_s_m)
     oncoming = [b for b in stretch.backward if b is not None]
     forward = [f for f in stretch.forward if f is not None]
     lane = road.lane_map.lanes[forward[-1] if side == "right" else (oncoming[-1] if oncoming else forward[0])]
@@ -212,58 +212,58 @@ def outer_edge(road: Road, way: EgoWay, at_s_m: float, side: str) -> tuple[Path,
     rest = edge[:, :2] - xyz[:2]
     # The edge's vertex most nearly abreast; edges are sampled every metre and nearly parallel to the line.
     k = int(np.argmin(np.abs(rest @ np.array([np.cos(float(yaw)), np.sin(float(yaw))])) + 0.1 * np.abs(rest @ normal)))
-    return way.path, float(rest[k] @ normal), turned
+    return ego_path.path, float(rest[k] @ normal), turned
 
 
-def _gap_cars(stage: _Stage) -> list[Actor]:
+def _gap_cars(placer: _Placer) -> list[Actor]:
     """Return the parked cars of every narrow gap."""
     out: list[Actor] = []
-    assert stage.spec.road is not None
-    for i, segment in enumerate(stage.spec.road.segments):
+    assert placer.spec.road is not None
+    for i, segment in enumerate(placer.spec.road.segments):
         if not isinstance(segment, NarrowGapSegment):
             continue
-        begin, end = stage.way.stretch_s[i], stage.way.stretch_s[i + 1]
+        begin, end = placer.ego_path.stretch_s[i], placer.ego_path.stretch_s[i + 1]
         for side, count in (("left", segment.cars_left), ("right", segment.cars_right)):
             sign = 1.0 if side == "left" else -1.0
             for n in range(count):
                 at = begin + (end - begin) * (0.25 + 0.5 * (n + 0.5) / count)
                 box = SIZES["car"]
-                xyz, yaw = stage.way.path.at(at, sign * (segment.gap_m / 2 + box.width_m / 2))
-                track = standing_track(xyz[0], xyz[1], xyz[2], float(yaw) + (np.pi if side == "left" else 0.0), stage.t_us, box)
+                xyz, yaw = placer.ego_path.path.at(at, sign * (segment.gap_m / 2 + box.width_m / 2))
+                track = standing_track(xyz[0], xyz[1], xyz[2], float(yaw) + (np.pi if side == "left" else 0.0), placer.t_us, box)
                 out.append(Actor(f"gap{i}-{side}-{n}", "car", box, track, is_static=True))
     return out
 
 
-def _add_follower(stage: _Stage, cast: Cast, actor: IdmActor) -> None:
-    path, s0 = stage.place(actor.lane, actor.s_m, actor.id)
+def _add_follower(placer: _Placer, traffic: Traffic, actor: IdmActor) -> None:
+    path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
     desired = actor.desired_speed_mps if actor.desired_speed_mps is not None else max(actor.speed_mps, 1.0)
     params = {
         "desired_speed_mps": desired, "headway_s": actor.headway_s, "min_gap_m": actor.min_gap_m, "accel_mps2": actor.accel_mps2,
         "brake_mps2": actor.brake_mps2,
     }  # fmt: skip
-    cast.reactive.append((actor.id, actor.label, params))
-    cast.followers.append(Follower(path, s0, actor.speed_mps, box_of(actor), IdmParams.from_mapping(params), actor.offset_m))
+    traffic.reactive.append((actor.id, actor.label, params))
+    traffic.followers.append(Follower(path, s0, actor.speed_mps, box_of(actor), IdmParams.from_mapping(params), actor.offset_m))
 
 
-def _crossing(stage: _Stage, actor: CrossingActor, ego_log: Trajectory) -> Actor:
+def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Actor:
     """Time a crossing: the walker reaches the middle of the ego's line ``before_ego_s`` before the undisturbed ego's front does."""
-    at = stage.spec.ego.start_m + actor.s_m
+    at = placer.spec.ego.start_m + actor.s_m
     box = box_of(actor)
-    front_m = stage.vehicle.rear_axle_to_centre_m + stage.vehicle.box.length_m / 2
-    s_log, _ = stage.way.path.project(ego_log.xyz[:, :2])
+    front_m = placer.vehicle.rear_axle_to_centre_m + placer.vehicle.box.length_m / 2
+    s_log, _ = placer.ego_path.path.project(ego_log.xyz[:, :2])
     if not s_log[0] + front_m < at < s_log[-1] + front_m:
         raise InputError(
-            "timing a crossing", actor.id, f"the ego's front drives from {s_log[0] + front_m - stage.spec.ego.start_m:.0f} to "
-            f"{s_log[-1] + front_m - stage.spec.ego.start_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}", "choose s_m inside",
+            "timing a crossing", actor.id, f"the ego's front drives from {s_log[0] + front_m - placer.spec.ego.start_m:.0f} to "
+            f"{s_log[-1] + front_m - placer.spec.ego.start_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}", "choose s_m inside",
         )  # fmt: skip
     arrival_us = float(np.interp(at - front_m, s_log, ego_log.t_us.astype(np.float64)))
-    right, left = (_road_edge(stage.road, stage.way.path, at, side) for side in ("right", "left"))
+    right, left = (_road_edge(placer.road, placer.ego_path.path, at, side) for side in ("right", "left"))
     ends = {"right": right - actor.margin_m, "left": left + actor.margin_m}
-    start, _ = stage.way.path.at(at, ends[actor.side])
-    goal, _ = stage.way.path.at(at, ends["left" if actor.side == "right" else "right"])
+    start, _ = placer.ego_path.path.at(at, ends[actor.side])
+    goal, _ = placer.ego_path.path.at(at, ends["left" if actor.side == "right" else "right"])
     walk_us = round(abs(ends[actor.side]) / actor.speed_mps * 1e6)
     begin_us = round(arrival_us - actor.before_ego_s * 1e6) - walk_us
-    track = walk_track(start, goal, stage.t_us, begin_us, actor.speed_mps, box)
+    track = walk_track(start, goal, placer.t_us, begin_us, actor.speed_mps, box)
     return Actor(actor.id, actor.label, box, track)
 
 

@@ -152,7 +152,7 @@ def _planning_check(repeats: int) -> str:
 
 
 def _advice(correlation: float, runs: int = 400) -> F64:
-    """Return what `more_scenes` answers after 60 scenes, over undecided runs; infinite where it answers none."""
+    """Return `more_scenes` after 60 scenes ``(runs,)``, over undecided runs; infinite where it is None."""
     design = Design(rate=RATES[0], correlation=correlation)
     worse, base = pairs(design, RATES[1], SHARED_NOISE, runs, np.random.Generator(np.random.Philox(int(10 * correlation))))
     delta = (worse - base).mean(axis=2)

@@ -1,6 +1,6 @@
 """Time and correctness of the evaluators: against a search step by step, and against an exact reference implementation.
 
-The search step by step is how AlpaSim does it: at every step polygons of everybody, one tree over them and one query; for lane keeping the
+The search step by step is how AlpaSim does it: at every step polygons of all actors, one tree over them and one query; for lane keeping the
 nearby lanes and their union. The reference implementation (`bench.evaluators_reference`) decides contact in rational arithmetic and uses
 no index at all.
 

@@ -61,10 +61,10 @@ def _print(result: Comparison, only: Sequence[str] | None) -> None:
     for note in result.notes:
         print(f"note: {note}")
     rows = [row for row in pair_rows({"paired": result.paired}) if only is None or row.metric in only]
-    for arm, entries in result.paired.items():
-        mine = [row for row in rows if row.arm == arm]
+    for variant, entries in result.paired.items():
+        mine = [row for row in rows if row.variant == variant]
         baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
-        print(f"\n{arm} minus {baseline}")
+        print(f"\n{variant} minus {baseline}")
         for line in [*_table(mine, entries), *_missing(entries)]:
             print(line)
 

@@ -31,7 +31,7 @@ def check_plan(plan: Trajectory) -> None:
             "following a plan",
             f"a plan of {len(plan)} poses",
             found,
-            "make the policy answer at least one finite pose and strictly increasing times; `check_policy` finds such faults",
+            "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults",
         )
 
 
@@ -63,7 +63,7 @@ def spatial(now: BicycleState, t_us: int, z_m: float, accel_mps2: float, vehicle
 
 
 def coast_to_stop(state: EgoState, to_us: int, vehicle: Vehicle) -> EgoState:
-    """Return the state at ``to_us`` when nobody steers: gentle brake, wheel held."""
+    """Return the state at ``to_us`` without a plan: gentle braking, steering held."""
     dt_s = check_interval(state, to_us)
     before = planar(state)
     after = step(before, Command(before.steer_rad, 0.0, GENTLE_BRAKE_MPS2), dt_s, vehicle)

@@ -120,25 +120,6 @@ def _rk4(s: BicycleState, steer_rate: float, accel: float, h: float, wheelbase: 
     return BicycleState(x, y, s.yaw_rad + h / 6 * (w0 + 4 * w1 + w2), v2, s.steer_rad + h * steer_rate)
 
 
-def exact_arc(state: BicycleState, accel_mps2: float, dt_s: float, wheelbase_m: float) -> BicycleState:
-    """Return the closed solution for a held wheel and a constant acceleration: an arc of a circle. The slow twin of `step`.
-
-    The heading depends on the path length alone, ``yaw = yaw0 + s tan(steer) / L``, and the chord of an arc of length s and turn
-    ``2 b`` is ``s sin(b) / b`` at the mean heading.
-    """
-    s = state.speed_mps * dt_s + 0.5 * accel_mps2 * dt_s**2
-    turn = s * math.tan(state.steer_rad) / wheelbase_m
-    half = turn / 2
-    chord = s * (math.sin(half) / half if abs(half) > 1e-8 else 1.0 - half * half / 6)
-    return BicycleState(
-        state.x_m + chord * math.cos(state.yaw_rad + half),
-        state.y_m + chord * math.sin(state.yaw_rad + half),
-        state.yaw_rad + turn,
-        state.speed_mps + accel_mps2 * dt_s,
-        state.steer_rad,
-    )
-
-
 def _as_tuple(command: Command) -> tuple[float, float, float]:
     return command.steer_rad, command.drive_mps2, command.brake_mps2
 

@@ -10,7 +10,7 @@ from alpasim_plugin.types import Controller, EgoState, Trajectory, Vehicle
 
 
 class PerfectController(Controller):
-    """Put the ego onto the plan's pose at the asked time, interpolated; before the first and after the last pose those are held."""
+    """Put the ego on the plan's interpolated pose at the given time; before the first and after the last pose, hold that pose."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle

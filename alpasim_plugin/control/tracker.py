@@ -16,7 +16,7 @@ import numpy as np
 
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop, planar, spatial
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
-from alpasim_plugin.control.reference import Reference, build_reference
+from alpasim_plugin.control.reference_path import ReferencePath, build_reference_path
 from alpasim_plugin.types import F64, Controller, EgoState, Trajectory, Vehicle
 
 MAX_LATERAL_MPS2 = 8.0  # beyond it tyres slip and a kinematic bicycle is no model of a car
@@ -28,7 +28,7 @@ MIN_PREVIEW_MPS = 5.0  # below it the nodes stay this speed's distance apart: 10
 GAUSS_NEWTON_STEPS = 2
 PREVIEW_S = np.linspace(0.2, 0.8, 4)
 HOLD_SPEED_MPS = 0.5
-HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S asks to stand
+HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S is a stop
 HOLD_S = 2.0
 
 _BEFORE = np.tril(np.ones((NODES, NODES)), -1)  # d steer at the start of step k / d change in step j
@@ -53,7 +53,7 @@ class PlanTracker(Controller):
         dt_s = check_interval(state, to_us)
         check_plan(plan)
         origin = state.T_world_rig[:2, 3]
-        reference = build_reference(plan, state.t_us, origin)
+        reference = build_reference_path(plan, state.t_us, origin)
         before = planar(state)
         now = BicycleState(0.0, 0.0, before.yaw_rad, before.speed_mps, before.steer_rad)
         n = max(1, math.ceil(dt_s / CONTROL_S - 1e-9))
@@ -63,7 +63,7 @@ class PlanTracker(Controller):
         world = BicycleState(now.x_m + float(origin[0]), now.y_m + float(origin[1]), now.yaw_rad, now.speed_mps, now.steer_rad)
         return spatial(world, to_us, float(state.T_world_rig[2, 3]), accel, self.vehicle)
 
-    def command(self, now: BicycleState, reference: Reference, t_s: float) -> Command:
+    def command(self, now: BicycleState, reference: ReferencePath, t_s: float) -> Command:
         """Return the command at ``t_s`` seconds after the reference's time for a vehicle in the reference's coordinates."""
         planned = reference.progress(np.concatenate([[t_s], t_s + PREVIEW_S, [t_s + HOLD_S]]))
         xy = np.array([now.x_m, now.y_m])
@@ -82,7 +82,7 @@ class PlanTracker(Controller):
             return Command(target, 0.0, accel)
         return Command(target, accel, 0.0)
 
-    def steer_target(self, now: BicycleState, reference: Reference, s_now: float, direction: float) -> float:
+    def steer_target(self, now: BicycleState, reference: ReferencePath, s_now: float, direction: float) -> float:
         """Return the wheel angle to be reached ``CONTROL_S`` later: the first move of the optimal sequence."""
         wheelbase = self.vehicle.wheelbase_m
         speed = max(abs(now.speed_mps), MIN_PREVIEW_MPS)

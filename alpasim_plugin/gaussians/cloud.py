@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.constants import ALPHA_MIN, LOG_SCALE_LIMIT
+from alpasim_plugin.gaussians.constants import LOG_SCALE_LIMIT
 from alpasim_plugin.gaussians.sh import SH_SIZES, rotate_sh
 from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix
 from alpasim_plugin.types import F64
@@ -185,10 +185,6 @@ class GaussianCloud:
         """Return the Gaussians chosen by an index or mask array, in that order."""
         i = np.asarray(index)
         return GaussianCloud(self.means[i], self.quats[i], self.scales[i], self.opacities[i], self.sh[i])
-
-    def drawable_opacity(self) -> npt.NDArray[np.bool_]:
-        """Return which Gaussians can reach the alpha cut 1/255; the others draw nothing."""
-        return np.asarray(self.opacities >= ALPHA_MIN)
 
     def transformed(self, T: F64, rotate_colour: bool = True) -> GaussianCloud:
         """Return the cloud moved by a rigid transform, colours turning with the object.

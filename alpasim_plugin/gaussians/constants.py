@@ -6,8 +6,6 @@ code: whether a second saturated layer is drawn hangs on ``(1 - 0.99)**2 <= 1e-4
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 NEAR_M = 0.1  # a 5 cm splat closer than this smears over the whole frame
@@ -19,8 +17,3 @@ TRANSMITTANCE_STOP = float(np.float32(1.0e-4))
 EXTENT_MAX_SIGMA = 3.33  # sqrt(2 ln 255) = 3.3290: outside, even an opaque splat is below ALPHA_MIN
 SLOPE_MARGIN = 0.3  # the Jacobian's slopes are clamped at this share of the half view beyond the image edge
 LOG_SCALE_LIMIT = 20.0
-
-
-def extent_sigma(opacity: float) -> float:
-    """Return the radius, in standard deviations, beyond which a splat's alpha is below ``ALPHA_MIN``; 0 where it never reaches it."""
-    return min(EXTENT_MAX_SIGMA, math.sqrt(2.0 * math.log(opacity / ALPHA_MIN))) if opacity > ALPHA_MIN else 0.0

@@ -1,4 +1,4 @@
-"""Read an ASL log, whoever wrote it, into a `RolloutLog`.
+"""Read an ASL log of any writer into a `RolloutLog`.
 
 Reads what AlpaSim's evaluation reads and ignores the rest. Nothing is ever unpickled: the driver's unstructured debug bytes stay unread.
 """
@@ -25,7 +25,7 @@ class _Collected:
 
     metadata: logging_pb2.RolloutMetadata | None = None
     poses: dict[str, list[tuple[int, common_pb2.Pose]]] = field(default_factory=dict)
-    questions: list[egodriver_pb2.DriveRequest] = field(default_factory=list)
+    requests: list[egodriver_pb2.DriveRequest] = field(default_factory=list)
     plans: list[LoggedPlan] = field(default_factory=list)
     images: list[LoggedImage] = field(default_factory=list)
     static_ids: set[str] = field(default_factory=set)
@@ -43,8 +43,8 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         images: Keep the encoded camera images; False saves their memory.
 
     Returns:
-        The rollout. ``warnings`` tells of a cut last entry and of entries of unknown kind; ``info`` holds ``entries`` (count by kind),
-        ``n_steps``, ``empty_plans`` and ``unanswered`` (drive requests without a usable answer), ``terminated`` (the driver ended the
+        The rollout. ``warnings`` lists a truncated last entry and entries of unknown kind; ``info`` holds ``entries`` (count by kind),
+        ``n_steps``, ``empty_plans`` and ``unanswered`` (drive requests without a plan), ``terminated`` (the driver ended the
         rollout), ``cameras`` (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``, and
         ``undefined_actors`` (poses of ids that the header does not define are left out).
 
@@ -83,22 +83,22 @@ def _actor_poses(got: _Collected, message: logging_pb2.ActorPoses, where: str) -
 
 
 def _driver_request(got: _Collected, message: egodriver_pb2.DriveRequest, where: str) -> None:
-    got.questions.append(message)
+    got.requests.append(message)
 
 
 def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse, where: str) -> None:
-    """Pair first in, first out; an empty answer is a driver that is not ready yet."""
-    if not got.questions:
+    """Pair first in, first out; a response without poses is a driver that is not ready yet."""
+    if not got.requests:
         raise InputError("reading a rollout log", where, "a driver_return without a driver_request", "give a whole log")
-    question = got.questions.pop(0)
+    request = got.requests.pop(0)
     if message.terminate_session:
         got.info["terminated"] = True
     if not message.trajectory.poses:
         got.info["empty_plans"] += 1
         return
-    what = f"{where}, plan at {question.time_now_us} us"
+    what = f"{where}, plan at {request.time_now_us} us"
     samples = tuple(read_trajectory(sample, f"{what}, sample {i}") for i, sample in enumerate(message.debug_info.sampled_trajectories))
-    got.plans.append(LoggedPlan(question.time_now_us, question.time_query_us, read_trajectory(message.trajectory, what), samples))
+    got.plans.append(LoggedPlan(request.time_now_us, request.time_query_us, read_trajectory(message.trajectory, what), samples))
 
 
 def _driver_session(got: _Collected, message: egodriver_pb2.DriveSessionRequest, where: str) -> None:
@@ -149,7 +149,7 @@ def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> Rollout
     info = {
         "entries": dict(got.counts),
         "n_steps": session.n_sim_steps,
-        "unanswered": len(got.questions),
+        "unanswered": len(got.requests),
         "undefined_actors": tuple(sorted(set(got.poses) - defined)),
         "versions": {f.name.removesuffix("_version"): v.version_id for f, v in metadata.version_ids.ListFields()},
         **got.info,

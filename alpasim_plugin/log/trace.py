@@ -1,4 +1,4 @@
-"""What a rollout did, component by component, as digests: two rollouts are compared and the first difference is named."""
+"""Digests of a rollout by component: compare two rollouts and name the first difference."""
 
 from __future__ import annotations
 

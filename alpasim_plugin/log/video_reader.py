@@ -32,7 +32,7 @@ class TimedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class VideoFormat:
-    """What a video states about itself; pictures are upright, so width and height are those after the rotation it asks for.
+    """What a video states about itself; pictures are upright, so width and height are those after the rotation in its metadata.
 
     Attributes:
         width, height: Pixels.

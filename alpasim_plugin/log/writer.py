@@ -101,7 +101,7 @@ class AslWriter:
     # --- each step --------------------------------------------------------------------------------------------------
 
     def actor_poses(self, t_us: int, T_world_rig: F64, actors: Mapping[str, F64]) -> None:
-        """Write true poses at one instant: the ego's rig pose, and ``T_world_box`` of the actors present.
+        """Write ground-truth poses at one instant: the ego's rig pose, and ``T_world_box`` of the actors present.
 
         Raises:
             InputError: An actor that the header does not define, or a pose that is not finite.
@@ -122,7 +122,7 @@ class AslWriter:
         self._write(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=entries))
 
     def render_request(self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png") -> None:
-        """Write the frames asked for at one instant, bundled as AlpaSim sends them by default."""
+        """Write the render requests of one instant, bundled as AlpaSim sends them by default."""
         items = [
             sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=r.camera.name, request=self._render_request(r, encoding)) for r in requests
         ]
@@ -158,11 +158,11 @@ class AslWriter:
         self._write(route_request=egodriver_pb2.RouteRequest(session_uuid=self._uuid, route=route))
 
     def driver_request(self, now_us: int, query_us: int) -> None:
-        """Write that the driver is asked at ``now_us`` for a plan through ``query_us`` (one control step later)."""
+        """Write the query to the driver at ``now_us`` for a plan through ``query_us`` (one control step later)."""
         self._write(driver_request=egodriver_pb2.DriveRequest(session_uuid=self._uuid, time_now_us=now_us, time_query_us=query_us))
 
     def driver_return(self, plan: Trajectory, samples: Sequence[Trajectory] = (), terminate: bool = False) -> None:
-        """Write the driver's answer.
+        """Write the driver's plan.
 
         Args:
             plan: Absolute rig poses in the world, the first at the time of the request; empty where the driver gave none.
@@ -177,13 +177,13 @@ class AslWriter:
         )
 
     def controller_request(self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False) -> None:
-        """Write what the vehicle model is asked: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
+        """Write the request to the vehicle model: from `state`, along `plan` (absolute rig poses, world), to ``to_us``.
 
         Args:
             state: True state now.
             plan: Active plan; stored in the rig frame of its first pose, or empty.
             to_us: Time to reach.
-            forced: The recording is forced, so the answer will be ignored.
+            forced: The recording is forced, so the result is ignored.
         """
         if len(plan):
             poses = se3(plan.xyz, plan.quat)

@@ -1,7 +1,7 @@
-"""Renderers with one deliberate fault each: known-bad input with which metrics, guards and gates prove that they notice.
+"""Renderers with one deliberate fault each: known-bad input that metrics, guards and gates must detect.
 
-Each renders the clean scene and spoils the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays as
-a fault in a real pipeline would leave it.
+Each renders the clean scene and corrupts the frame, or renders it from a wrong place; what else a frame carries (time, alpha, depth) stays
+as a fault in a real pipeline would leave it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ SHIFT_M = 0.5
 BLUR_SHARE = 0.02  # of the image's width
 LATE_US = 1_000_000
 
-Spoil = Callable[[U8], U8]
+Corruption = Callable[[U8], U8]
 
 
 class BrokenRenderer(Renderer):
-    """Render the clean scene and spoil every frame on its own."""
+    """Render the clean scene and corrupt every frame on its own."""
 
-    def __init__(self, clean: CleanRenderer, spoil: Spoil) -> None:
-        self.clean, self.spoil = clean, spoil
+    def __init__(self, clean: CleanRenderer, corrupt: Corruption) -> None:
+        self.clean, self.corrupt = clean, corrupt
 
     def render(self, request: RenderRequest) -> Frame:
-        """Render one frame and spoil it."""
+        """Render one frame and corrupt it."""
         frame = self.clean.render(request)
-        return replace(frame, rgb=self.spoil(frame.rgb))
+        return replace(frame, rgb=self.corrupt(frame.rgb))
 
 
 class ShiftedRenderer(Renderer):
@@ -50,7 +50,7 @@ class ShiftedRenderer(Renderer):
 
 
 class StaleRenderer(Renderer):
-    """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or the first one for ever."""
+    """Show an earlier picture of the same camera under the new time: the newest one that is ``age_us`` old, or always the first one."""
 
     def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
         self.clean, self.age_us = clean, age_us
@@ -82,8 +82,8 @@ def blurred(rgb: U8) -> U8:
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_SHARE * rgb.shape[1]), dtype=np.uint8)
 
 
-def _spoiled(scenario: Scenario, seed: int, device: str, threads: int | None, *, spoil: Spoil) -> Renderer:
-    return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), spoil)
+def _corrupted(scenario: Scenario, seed: int, device: str, threads: int | None, *, corrupt: Corruption) -> Renderer:
+    return BrokenRenderer(CleanRenderer(scenario, seed, device, threads), corrupt)
 
 
 def _stale(scenario: Scenario, seed: int, device: str, threads: int | None, *, age_us: int | None) -> Renderer:
@@ -95,8 +95,8 @@ def shifted_renderer(scenario: Scenario, seed: int, device: str, threads: int | 
     return ShiftedRenderer(CleanRenderer(scenario, seed, device, threads), SHIFT_M)
 
 
-black_renderer = partial(_spoiled, spoil=black)
-mirrored_renderer = partial(_spoiled, spoil=mirrored)
-blurred_renderer = partial(_spoiled, spoil=blurred)
+black_renderer = partial(_corrupted, corrupt=black)
+mirrored_renderer = partial(_corrupted, corrupt=mirrored)
+blurred_renderer = partial(_corrupted, corrupt=blurred)
 frozen_renderer = partial(_stale, age_us=None)
 late_renderer = partial(_stale, age_us=LATE_US)

@@ -1,4 +1,4 @@
-"""Keep what is costly to make in folders named by content: made once, whichever process asks first, and whole or not there.
+"""Content-addressed cache of folders: each entry is made once, by the first process that needs it, and appears atomically.
 
 $SIMRUN_CACHE or ~/.cache/simrun / KIND / KEY/        what was made
                                        / KEY.lock     held by the process that makes it

@@ -34,7 +34,7 @@ class Model:
 
 
 class ReconstructionRenderer(Renderer):
-    """Render a reconstruction of the scenario's logged drive; it is fitted now if nobody has yet.
+    """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in the cache.
 
     Attributes:
         stats: Counts of the last frame: ``visible`` Gaussians, ``nodes`` drawn and ``nodes_total``.

@@ -1,4 +1,4 @@
-"""What the degradations that are fitted ask of the fit."""
+"""Recipes of the degradations that are fitted."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ReconstructionRecipe:
 
 
 def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
-    """Return the recipe that a scenario's degradation stands for.
+    """Return the recipe of a scenario's degradation.
 
     Few points, small views, no densification: a model that some seconds of one core can fit. Rates are higher than those of a whole fit,
     as a schedule of hundreds of steps needs.

@@ -1,4 +1,4 @@
-"""Teach the learned policy: batches of lessons, what an answer should have been, and how far off it is."""
+"""Teach the learned policy: batches of lessons, what a prediction should have been, and how far off it is."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from alpasim_plugin.training.demonstrations import Lessons, lessons_digest
 from alpasim_plugin.training.policy_expert import SIGHT_M
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import U8
-from policies.learned_net import KNOTS_M, NEARNESS_M, SPEED_UNIT_MPS, LearnedNet, knot_weights, lay_out
+from policies.learned_net import KNOTS_M, NEARNESS_M, SPEED_UNIT_MPS, LearnedNet, knot_weights, path_from_headings
 from policies.learned_view import look, picture
 
-DOUBT_AT = KNOTS_M.index(16.0)
+SIGMA_AT = KNOTS_M.index(16.0)
 
 
 @dataclass(frozen=True)
@@ -90,28 +90,28 @@ class PolicyTask:
     def loss(self, batch: PolicyBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         pictures = batch.picture.contiguous(memory_format=torch.channels_last)  # a third faster with the net in the same order
-        answer = self.net(pictures, batch.state, batch.command)
-        aside, turned, faster = self.errors(answer.heading, answer.speed, batch)
+        prediction = self.net(pictures, batch.state, batch.command)
+        aside, turned, faster = self.errors(prediction.heading, prediction.speed, batch)
         path = F.smooth_l1_loss(aside / self.unit_m, torch.zeros_like(aside), beta=1.0)
         heading = F.smooth_l1_loss(turned / 0.03, torch.zeros_like(turned), beta=1.0)
         speed = F.smooth_l1_loss(faster, torch.zeros_like(faster), beta=0.5)
-        # The doubt learns from the errors, never the other way round: errors are constants to it.
+        # Sigma is fitted to detached errors, so that it does not change the path or the speed.
         mean_speed = batch.speed + batch.speeds.mean(1)
-        off = torch.stack([aside[:, DOUBT_AT], faster.mean(1) / mean_speed.clamp_min(3.0)], dim=1).detach()
-        doubt = (torch.log(answer.doubt) + 0.5 * (off / answer.doubt).clamp(-6.0, 6.0) ** 2).mean()
-        nearness, pace = answer.leader.T
+        off = torch.stack([aside[:, SIGMA_AT], faster.mean(1) / mean_speed.clamp_min(3.0)], dim=1).detach()
+        sigma = (torch.log(prediction.sigma) + 0.5 * (off / prediction.sigma).clamp(-6.0, 6.0) ** 2).mean()
+        nearness, pace = prediction.leader.T
         near, their_pace = batch.leader.T
         # Naming who is ahead helps to see them; the plan is not made from it.
         ahead = F.smooth_l1_loss(nearness, near, beta=0.05) + 0.02 * (near * (pace - their_pace).abs()).mean()
-        parts = {"leader": ahead, "path": path, "heading": 0.3 * heading, "speed": speed, "doubt": 0.05 * doubt}
+        parts = {"leader": ahead, "path": path, "heading": 0.3 * heading, "speed": speed, "sigma": 0.05 * sigma}
         numbers = {name: float(value.detach()) for name, value in parts.items()}
-        numbers["aside_m"] = float(aside[:, DOUBT_AT].detach().abs().mean())
+        numbers["aside_m"] = float(aside[:, SIGMA_AT].detach().abs().mean())
         numbers["speed_mps"] = float(faster.detach().abs().mean())
         return torch.stack(list(parts.values())).sum(), numbers
 
     def errors(self, heading: Tensor, speed: Tensor, batch: PolicyBatch) -> tuple[Tensor, Tensor, Tensor]:
         """Return errors to the side ``(B, 9)`` in metres, of the heading ``(B, 9)`` in radians and of the speed ``(B, 8)``."""
-        points, yaw = lay_out(heading, self.weights)
+        points, yaw = path_from_headings(heading, self.weights)
         away = points[:, self.rows] - batch.points
         aside = torch.cos(batch.headings) * away[..., 1] - torch.sin(batch.headings) * away[..., 0]
         return aside, yaw[:, self.rows] - batch.headings, speed - batch.speeds
@@ -148,8 +148,8 @@ def measure(task: PolicyTask, every: int = 1, batch: int = 64) -> dict[str, floa
     with torch.inference_mode():
         for begin in range(0, len(chosen), batch):
             lessons = task.collect(chosen[begin : begin + batch])
-            answer = task.net(lessons.picture, lessons.state, lessons.command)
-            aside, turned, faster = task.errors(answer.heading, answer.speed, lessons)
-            off = (aside[:, DOUBT_AT], turned[:, DOUBT_AT], faster.abs().mean(1))
+            prediction = task.net(lessons.picture, lessons.state, lessons.command)
+            aside, turned, faster = task.errors(prediction.heading, prediction.speed, lessons)
+            off = (aside[:, SIGMA_AT], turned[:, SIGMA_AT], faster.abs().mean(1))
             sums += [*(float(x.abs().sum()) for x in off), len(aside)]
     return {"aside_16m_m": sums[0] / sums[3], "heading_16m_rad": sums[1] / sums[3], "speed_mps": sums[2] / sums[3], "lessons": sums[3]}

@@ -102,7 +102,7 @@ class Actors:
 
 @dataclass(frozen=True)
 class Outlook:
-    """Where road users will be, as far as one can tell at one instant.
+    """Predicted poses of road users, from what is known at one instant.
 
     Replayed ones follow their track, reactive ones keep their speed along their line.
     """
@@ -143,7 +143,7 @@ def _ego_bodies(ego: EgoState, vehicle: Vehicle) -> Bodies:
 
 
 class _Replay:
-    """Tracks that nobody disturbs, advanced together: one cursor per actor, one batch of interpolations a step."""
+    """Tracks that do not react, advanced together: one cursor per actor, one batch of interpolations a step."""
 
     def __init__(self, actors: Sequence[Actor]) -> None:
         self.actors = list(actors)

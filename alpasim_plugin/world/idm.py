@@ -111,7 +111,7 @@ class Spans:
 def spans(path: Path, from_s_m: float, bodies: Bodies, horizon_m: float = 120.0, window: bool = True) -> Spans | None:
     """Return where bodies lie on a path, from 15 m behind ``from_s_m`` to ``horizon_m`` ahead; None where there is none.
 
-    Without ``window`` the whole path is searched, for bodies that never move and are asked for again and again.
+    Without ``window`` the whole path is searched, for static bodies that are queried repeatedly.
     """
     if len(bodies.xy) == 0:
         return None

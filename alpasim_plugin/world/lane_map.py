@@ -1,4 +1,4 @@
-"""Fast questions to a lane map: which lanes are here, how do they run, what comes next."""
+"""Spatial queries on a lane map: lanes at a point, their headings, their successors."""
 
 from __future__ import annotations
 

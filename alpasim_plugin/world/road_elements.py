@@ -55,7 +55,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class LaneChangeCount:
+class LaneTaper:
     """A straight stretch in which the rightmost forward lane ends (``merge``) or a new one opens (``split``)."""
 
     kind: Literal["merge", "split"]
@@ -75,7 +75,7 @@ class Intersection:
     guide_lines: bool = True  # dashed lines through the junction along the main road
 
 
-Element = Curve | LaneChangeCount | Intersection
+Element = Curve | LaneTaper | Intersection
 
 
 @dataclass(frozen=True)

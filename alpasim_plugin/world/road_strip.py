@@ -53,7 +53,7 @@ class MapDraft:
 
 @dataclass(frozen=True)
 class Strip:
-    """What a built strip offers to its neighbours: lane ids from the centre outwards, and the named lines in reference order."""
+    """A built strip: lane ids from the centre outwards, and the named lines in reference order."""
 
     forward: tuple[str, ...]
     backward: tuple[str, ...]

@@ -10,7 +10,7 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, LaneMap
 from alpasim_plugin.world.curves import sample_clothoid
-from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneChangeCount, Profile, Stretch
+from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneTaper, Profile, Stretch
 from alpasim_plugin.world.road_intersection import Junction, build_intersection
 from alpasim_plugin.world.road_strip import Joint, MapDraft, Strip, build_strip
 from alpasim_plugin.world.road_taper import build_taper
@@ -82,7 +82,7 @@ def build_road(
         name = f"s{i}"
         if isinstance(element, Curve):
             stretches.append(_grow_curve(draft, name, tip, element, step_m))
-        elif isinstance(element, LaneChangeCount):
+        elif isinstance(element, LaneTaper):
             stretches.append(_grow_taper(draft, name, tip, element, step_m))
         else:
             stretches.append(_grow_intersection(draft, name, tip, element))
@@ -100,7 +100,7 @@ def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve, step_m: f
     return Stretch(strip.forward, indices, strip.backward)
 
 
-def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneChangeCount, step_m: float) -> Stretch:
+def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneTaper, step_m: float) -> Stretch:
     before = tip.profile.forward
     narrow = replace(tip.profile, forward=before - 1 if element.kind == "merge" else before)
     if narrow.forward < 1 or tip.junction is not None:

@@ -1,4 +1,4 @@
-"""The censoring ledger: what every rule removed, per renderer, and what the removed part could have made of each rate."""
+"""Censoring: what each rule removed, per renderer, and the bounds on each rate that the removed part allows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.types import F64
-from evaluators.aggregate.rows import Row, Side, failure_of, metric_names, reason_of, sides
+from evaluators.aggregate.rows import RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
 from evaluators.metrics import info
 
 STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")
@@ -33,10 +33,10 @@ def censoring(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         before the event was seen).
     """
     names = metric_names(rows)
-    return {name: _of_renderer(side, names) for name, side in sides(rows).items()}
+    return {name: _of_renderer(side, names) for name, side in by_renderer(rows).items()}
 
 
-def _of_renderer(side: Side, names: Sequence[str]) -> dict[str, Any]:
+def _of_renderer(side: RendererRows, names: Sequence[str]) -> dict[str, Any]:
     done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
     ledgers = [row["censored"] for row in done if row.get("censored")]
     events: Counter[str] = Counter()

@@ -163,7 +163,7 @@ def wilson_rate(k: int, n: int) -> tuple[float, float]:
     scale = 1 + Z95**2 / n
     centre = (p + Z95**2 / (2 * n)) / scale
     half = Z95 * float(np.sqrt(p * (1 - p) / n + Z95**2 / (4 * n * n))) / scale
-    # Where k is 0 or n the bound is the edge itself; rounding would leave it a hair inside.
+    # Where k is 0 or n the bound is the edge itself; rounding would leave it slightly inside.
     return 0.0 if k == 0 else max(0.0, centre - half), 1.0 if k == n else min(1.0, centre + half)
 
 

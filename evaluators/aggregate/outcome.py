@@ -1,4 +1,4 @@
-"""What a run or a gate came to: one object from which the printed verdict and the process exit code are both read."""
+"""Outcome of a run or a gate: one object that gives the printed verdict and the process exit code."""
 
 from __future__ import annotations
 

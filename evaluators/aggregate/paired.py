@@ -15,7 +15,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, I64, Bool
 from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, t_bounds, t_interval
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
-from evaluators.aggregate.rows import Cell, Row, Side, failure_of, metric_names, reason_of, sides
+from evaluators.aggregate.rows import Cell, RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
 from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
 from evaluators.metrics import info
 
@@ -45,7 +45,7 @@ def paired(
     Raises:
         InputError: No row has the baseline.
     """
-    split = sides(rows)
+    split = by_renderer(rows)
     if baseline not in split:
         raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(split)}")
     names = list(metrics) if metrics is not None else metric_names(rows)
@@ -57,13 +57,13 @@ def paired(
     }
 
 
-def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, listed: int = LISTED) -> dict[str, Any]:
-    """Compare one metric of two sides on their shared cells.
+def compare(here: RendererRows, there: RendererRows, metric: str, baseline: str, margin: float, listed: int = LISTED) -> dict[str, Any]:
+    """Compare one metric of two renderers on their shared cells.
 
     Returns:
         ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
         and its ``method``; ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior, worse, undecided); ``difference`` (better,
-        worse, none shown: whatever the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
+        worse, none shown; independent of the margin); ``more_scenes`` (about how many would decide an undecided verdict, else None);
         ``spread`` (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``, ``same``, and ``p_value`` of their
         exact sign test); for flags ``cells`` (``only_here``, ``only_baseline``, and the exact McNemar ``p_value``, as if cells were
         independent);
@@ -161,7 +161,7 @@ def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
 class _Pairs:
     """Cells with a value on both sides, and those without."""
 
-    def __init__(self, here: Side, there: Side, metric: str) -> None:
+    def __init__(self, here: RendererRows, there: RendererRows, metric: str) -> None:
         self.sides = (here, here.values(metric)), (there, there.values(metric))
         mine, base = self.sides[0][1], self.sides[1][1]
         index = here.place_in(there)
@@ -176,7 +176,7 @@ class _Pairs:
         return [_lost(cell, *self.sides, metric) for cell in self.lone[:listed]]
 
 
-def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str) -> dict[str, Any]:
+def _lost(cell: Cell, here: tuple[RendererRows, F64], there: tuple[RendererRows, F64], metric: str) -> dict[str, Any]:
     why = {"here": _why(cell, *here, metric), "baseline": _why(cell, *there, metric)}
     gone = {side: text for side, text in why.items() if text}
     policy, scene, seed = cell
@@ -189,7 +189,7 @@ def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: s
     }
 
 
-def _why(cell: Cell, side: Side, values: F64, metric: str) -> str:
+def _why(cell: Cell, side: RendererRows, values: F64, metric: str) -> str:
     """Return why a side has no value for a cell, or ""."""
     found = side.rows_of.get(cell)
     if found is None:

@@ -9,7 +9,7 @@ import scipy
 from evaluators.aggregate.intervals import TAIL
 
 POWER = 0.8
-MOST_SCENES = 100_000  # beyond, the honest answer is that this suite will not decide it
+MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 LEAST_DECIDED_FLAGS = 6  # fewer changed scenes cannot reach p < 0.05 in the two-sided sign test
 
 

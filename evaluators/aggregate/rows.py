@@ -62,7 +62,7 @@ def metric_names(rows: Iterable[Row]) -> list[str]:
 
 
 def is_ok(row: Row) -> bool:
-    """Tell whether a rollout ran to its end."""
+    """Return whether a rollout ran to its end."""
     return bool(row.get("status", "ok") == "ok")
 
 
@@ -77,7 +77,7 @@ def cell_of(row: Row) -> Cell:
 
 
 @dataclass(frozen=True)
-class Side:
+class RendererRows:
     """The rollouts of one renderer, sorted into cells."""
 
     rows: tuple[Row, ...]
@@ -87,7 +87,7 @@ class Side:
     scene: I64  # (C,) number of the cell's scene, in the order of names
 
     @classmethod
-    def of(cls, rows: Sequence[Row]) -> Side:
+    def of(cls, rows: Sequence[Row]) -> RendererRows:
         """Sort rows of one renderer."""
         keys = [cell_of(row) for row in rows]
         cells = tuple(sorted(set(keys)))
@@ -118,7 +118,7 @@ class Side:
         total = np.bincount(self.cell[known], weights=found[known], minlength=len(self.cells))
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
-    def place_in(self, other: Side) -> I64:
+    def place_in(self, other: RendererRows) -> I64:
         """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
         if id(other) not in self._places:
             place = {cell: i for i, cell in enumerate(other.cells)}
@@ -142,9 +142,9 @@ class Side:
         return not any(isinstance(row.get("metrics"), Mapping) for row in self.rows)
 
 
-def sides(rows: Sequence[Row]) -> dict[str, Side]:
+def by_renderer(rows: Sequence[Row]) -> dict[str, RendererRows]:
     """Return each renderer's rollouts, in order of appearance."""
     split: dict[str, list[Row]] = {}
     for row in rows:
         split.setdefault(str(row["renderer"]), []).append(row)
-    return {name: Side.of(mine) for name, mine in split.items()}
+    return {name: RendererRows.of(mine) for name, mine in split.items()}

@@ -11,7 +11,7 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
 from evaluators.aggregate.bootstrap import cluster_bootstrap
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, normal_half_width, wilson_rate
-from evaluators.aggregate.rows import Row, Side, metric_names, sides
+from evaluators.aggregate.rows import RendererRows, Row, by_renderer, metric_names
 from evaluators.metrics import info
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
@@ -33,10 +33,10 @@ def aggregate(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> dict
         ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
     """
     names = list(metrics) if metrics is not None else metric_names(rows)
-    return {renderer: {name: _entry(side, name) for name in names} for renderer, side in sides(rows).items()}
+    return {renderer: {name: _entry(side, name) for name in names} for renderer, side in by_renderer(rows).items()}
 
 
-def _entry(side: Side, metric: str) -> dict[str, Any]:
+def _entry(side: RendererRows, metric: str) -> dict[str, Any]:
     facts = info(metric)
     by_cell = side.values(metric)
     known = np.isfinite(by_cell)

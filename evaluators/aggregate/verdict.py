@@ -69,7 +69,7 @@ def _distance_from_zero(low: float, high: float) -> tuple[float, float]:
 
 
 def difference(bounds: list[float] | None, p: float | None, direction: Direction) -> Difference:
-    """Say whether any difference is shown, whatever the margin: the interval leaves out 0 and the test rejects."""
+    """Return whether a difference is shown, independent of the margin: the interval excludes 0 and the test rejects."""
     if bounds is None or direction == "none" or p is None or p >= ALPHA or bounds[0] <= 0.0 <= bounds[1]:
         return "none shown"
     return "worse" if harm(bounds, direction)[0] > 0.0 else "better"

@@ -23,7 +23,7 @@ class SceneScore:
 
     @property
     def passed(self) -> bool:
-        """Tell whether no fault happened, whatever the progress."""
+        """Return whether no fault happened, whatever the progress."""
         return self.failure_reason is None
 
 

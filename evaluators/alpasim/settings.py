@@ -58,7 +58,7 @@ class Scorers(_Part):
 
 
 class VehicleShape(_Part):
-    """Footprint of everybody."""
+    """Footprint of the ego and all actors."""
 
     vehicle_shrink_factor: float = Field(default=0.02, ge=0, lt=1)
     vehicle_corner_roundness: float = Field(default=0.5, ge=0, lt=1)

@@ -1,4 +1,4 @@
-"""The gate: what a run must reach, against what, and what it came to."""
+"""The gate: criteria, baseline and verdict of a run."""
 
 from evaluators.gate.baseline import Baseline, baseline_of, check_matches, read_baseline, write_baseline
 from evaluators.gate.judge import Check, GateVerdict, judge

@@ -8,7 +8,7 @@ from typing import Any
 
 from alpasim_plugin.errors import InputError
 from evaluators.aggregate.paired import LISTED, compare
-from evaluators.aggregate.rows import Row, metric_names, sides
+from evaluators.aggregate.rows import Row, by_renderer, metric_names
 from evaluators.aggregate.verdict import default_margin
 from evaluators.gate.baseline import check_scenes, scene_hashes
 from evaluators.gate.rows import of_policy, policies_of, rows_of_run
@@ -22,8 +22,8 @@ class Comparison:
     """Paired differences.
 
     Attributes:
-        paired: ARM -> METRIC -> what `evaluators.aggregate.paired.compare` gives; an arm is RENDERER, or RENDERER/POLICY with several
-            policies.
+        paired: VARIANT -> METRIC -> what `evaluators.aggregate.paired.compare` gives; a variant is RENDERER, or RENDERER/POLICY where there
+            are several policies.
         notes: What a reader must know, such as policies that were paired although their names differ.
     """
 
@@ -38,7 +38,7 @@ def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, 
         InputError: Only one renderer, or an unknown baseline.
     """
     rows = rows_of_run(run)
-    known = list(sides(rows))
+    known = list(by_renderer(rows))
     name = baseline or (run.info.get("config") or {}).get("baseline") or (known[0] if known else "")
     if name not in known:
         raise InputError(DOING, f"baseline {name!r}", f"{run.folder} does not have it", f"choose one of {', '.join(known) or 'none'}")
@@ -64,7 +64,7 @@ def compare_runs(
     check_scenes(scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files")
     rows = rows_of_run(second)
     base_rows, notes = _align_policies(rows_of_run(first), rows)
-    there, here = list(sides(base_rows)), list(sides(rows))
+    there, here = list(by_renderer(base_rows)), list(by_renderer(rows))
     if baseline is not None and baseline not in there:
         raise InputError(DOING, f"baseline {baseline!r}", f"{first.folder} does not have it", f"choose one of {', '.join(there)}")
     alone = there[0] if len(there) == 1 else None
@@ -88,11 +88,11 @@ def _pairs(
     out: dict[str, dict[str, Any]] = {}
     policies = policies_of(rows)
     for policy in policies:
-        here, there = sides(of_policy(rows, policy)), sides(of_policy(base_rows, policy))
+        here, there = by_renderer(of_policy(rows, policy)), by_renderer(of_policy(base_rows, policy))
         for renderer, other in partner.items():
             if renderer in here and other in there:
-                arm = renderer if len(policies) == 1 else f"{renderer}/{policy}"
-                out[arm] = {
+                variant = renderer if len(policies) == 1 else f"{renderer}/{policy}"
+                out[variant] = {
                     name: compare(
                         here[renderer], there[other], name, prefix + other, (margins or {}).get(name, default_margin(name)), listed
                     )

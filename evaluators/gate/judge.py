@@ -11,7 +11,7 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.rows import Row, Side, failure_of, is_ok, sides
+from evaluators.aggregate.rows import RendererRows, Row, by_renderer, failure_of, is_ok
 from evaluators.gate.rows import of_policy, policies_of
 from evaluators.gate.spec import GateSpec, MetricRule
 from evaluators.metrics import info
@@ -67,8 +67,8 @@ def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = No
     """
     checks: list[Check] = []
     for policy in policies_of(rows):
-        here = sides(of_policy(rows, policy))
-        there = here if stored is None else sides(of_policy(stored, policy))
+        here = by_renderer(of_policy(rows, policy))
+        there = here if stored is None else by_renderer(of_policy(stored, policy))
         for renderer in _judged(here, spec, stored is not None):
             base = _baseline_name(renderer, here, there, spec, stored is not None)
             for metric, rule in spec.metrics.items():
@@ -80,7 +80,7 @@ def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = No
     failures = failures_of(rows)
     found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
     outcome = worst([outcome_of_failures(failures, spec.max_failed), *found])
-    name = stored_name if stored is not None else f"renderer {spec.baseline or next(iter(sides(rows)))} of the same run"
+    name = stored_name if stored is not None else f"renderer {spec.baseline or next(iter(by_renderer(rows)))} of the same run"
     return GateVerdict(outcome, tuple(checks), failures, name)
 
 
@@ -93,7 +93,7 @@ def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
     return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
 
 
-def _judged(here: Mapping[str, Side], spec: GateSpec, has_stored: bool) -> list[str]:
+def _judged(here: Mapping[str, RendererRows], spec: GateSpec, has_stored: bool) -> list[str]:
     absent = [name for name in spec.renderers if name not in here]
     if absent:
         raise InputError("judging a run", f"renderers {absent}", "the run has none of these", f"it has {', '.join(here)}")
@@ -111,7 +111,9 @@ def _nothing(base: str) -> list[str]:
     raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", "run two renderers, or give --baseline-file")
 
 
-def _baseline_name(renderer: str, here: Mapping[str, Side], there: Mapping[str, Side], spec: GateSpec, has_stored: bool) -> str:
+def _baseline_name(
+    renderer: str, here: Mapping[str, RendererRows], there: Mapping[str, RendererRows], spec: GateSpec, has_stored: bool
+) -> str:
     name = spec.baseline or (renderer if has_stored else next(iter(here)))
     needs = any(rule.margin is not None for rule in spec.metrics.values())
     if needs and name not in there:
@@ -121,33 +123,35 @@ def _baseline_name(renderer: str, here: Mapping[str, Side], there: Mapping[str, 
     return name
 
 
-def _margin(side: Side, base: Side, arm: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec) -> Check:
+def _margin(
+    side: RendererRows, base: RendererRows, variant: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec
+) -> Check:
     entry = compare(side, base, metric, name, rule.margin or 0.0)
     planned = entry["n_cells"] + entry["n_missing"]
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
-    said = _paired_text(entry, metric, arm[0])
+    said = _paired_text(entry, metric, variant[0])
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
         said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
     elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
         cause = "undecided"
         said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
-    return Check(*arm, metric, "margin", cause, said, entry, rule.must_decide)
+    return Check(*variant, metric, "margin", cause, said, entry, rule.must_decide)
 
 
-def _limit(side: Side, arm: tuple[str, str], metric: str, rule: MetricRule) -> Check:
+def _limit(side: RendererRows, variant: tuple[str, str], metric: str, rule: MetricRule) -> Check:
     values = side.values(metric)
     known = values[np.isfinite(values)]
     unit = info(metric).unit
     bounds = {"max": rule.max, "min": rule.min}
     limits = " and ".join(f"{kind} {value:g}" for kind, value in bounds.items() if value is not None)
     if not len(known):
-        text = f"{arm[0]}: {metric} has no valid value, its limit is {limits}"
-        return Check(*arm, metric, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
+        text = f"{variant[0]}: {metric} has no valid value, its limit is {limits}"
+        return Check(*variant, metric, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
     mean = float(known.mean())
     broken = (rule.max is not None and mean > rule.max) or (rule.min is not None and mean < rule.min)
-    text = f"{arm[0]}: {metric} {_number(mean, unit)}, limit {limits}"
-    return Check(*arm, metric, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)})
+    text = f"{variant[0]}: {metric} {_number(mean, unit)}, limit {limits}"
+    return Check(*variant, metric, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)})
 
 
 def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str) -> str:

@@ -1,4 +1,4 @@
-"""A run folder as rollout rows, the form in which runs, stored baselines and gates meet."""
+"""A run folder as rollout rows, the common form of runs, stored baselines and gates."""
 
 from __future__ import annotations
 

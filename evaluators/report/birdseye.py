@@ -20,7 +20,7 @@ from evaluators.report.numbers import fixed
 from evaluators.report.run_folder import Rollout, Series
 
 F64 = npt.NDArray[np.float64]
-Arms = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
+Variants = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)
 UNITS_ACROSS = 4000  # width of the drawing in integer units
 MARGIN_M = 10.0
 MAX_OFFSET_M = 5.0  # one rollout that is far away must not flatten the others; the map shows where it went
@@ -32,7 +32,7 @@ MIN_ASPECT = 0.12  # height / width
 class Track:
     """One rollout's path: SVG path data and what to say on hover."""
 
-    arm: int
+    variant: int
     dash: int
     label: str
     d: str
@@ -42,7 +42,7 @@ class Track:
 class Mark:
     """One event on the map, in drawing units."""
 
-    arm: int
+    variant: int
     kind: str
     text: str
     x: int | None
@@ -82,7 +82,7 @@ class SceneView:
 
     @property
     def is_wide(self) -> bool:
-        """Tell whether the drawing should take the full width of the page."""
+        """Return whether the drawing should take the full width of the page."""
         return self.height < 0.45 * self.width
 
 
@@ -117,7 +117,7 @@ class _Frame:
         return np.stack([(metres[:, 0] - self.low[0]) * self.scale, (self.high[1] - metres[:, 1]) * self.scale], 1)
 
     def sees(self, units: F64) -> bool:
-        """Tell whether the bounds of a line touch the drawing."""
+        """Return whether the bounds of a line touch the drawing."""
         (x0, y0), (x1, y1) = units.min(0), units.max(0)
         return bool(x1 >= 0 and y1 >= 0 and x0 <= UNITS_ACROSS and y0 <= self.height)
 
@@ -145,7 +145,7 @@ def scene_view(
     content: Mapping[str, Any],
     rollouts: Sequence[Rollout],
     series: Series,
-    arm_of: Arms,
+    variant_of: Variants,
 ) -> SceneView | None:
     """Lay out one scene.
 
@@ -153,7 +153,7 @@ def scene_view(
         content: ``scenes/SCENE.json``.
         rollouts: The scene's rollouts.
         series: Pose and event series, by cell.
-        arm_of: (renderer, policy) -> (colour index, dash index).
+        variant_of: (renderer, policy) -> (colour index, dash index).
 
     Returns:
         The drawing; None where the scene has no logged drive of at least two points.
@@ -169,12 +169,12 @@ def scene_view(
         return " \u00b7 ".join([rollout.renderer, *([rollout.policy] if names_policy else []), f"seed {rollout.seed}"])
 
     tracks = [
-        Track(*arm_of[r.renderer, r.policy], label(r), path_data(frame.units(driven[r.cell])))
+        Track(*variant_of[r.renderer, r.policy], label(r), path_data(frame.units(driven[r.cell])))
         for r in rollouts
-        if r.cell in driven and (r.renderer, r.policy) in arm_of
+        if r.cell in driven and (r.renderer, r.policy) in variant_of
     ]
     vehicle = content.get("vehicle") or {}
-    marks = [_mark(e, frame, vehicle, arm_of, label(e.rollout)) for r in rollouts for e in events_of(r, series)]
+    marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout)) for r in rollouts for e in events_of(r, series)]
     bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
     lanes = content.get("lanes") or []
     return SceneView(
@@ -193,7 +193,7 @@ def scene_view(
         bar_units=round(bar_m * frame.scale),
         bar_label=f"{bar_m:.0f}\u00a0m",
         north_deg=round(frame.north_deg, 1),
-        offset=_offset_chart(rollouts, series, arm_of, label),
+        offset=_offset_chart(rollouts, series, variant_of, label),
     )
 
 
@@ -239,11 +239,11 @@ def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
     return "".join(drawn)
 
 
-def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], arm_of: Arms, label: str) -> Mark:
-    arm = arm_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
+def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: Variants, label: str) -> Mark:
+    variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
     when = f"at {fixed(event.t_s, 1)}\u00a0s" if event.t_s is not None else "at a time that no step shows"
     if event.x_m is None or event.y_m is None:
-        return Mark(arm, event.kind, f"{label}: {event.what} {when}", None, None)
+        return Mark(variant, event.kind, f"{label}: {event.what} {when}", None, None)
     yaw = event.yaw_rad or 0.0
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     ahead = float(vehicle.get("rear_axle_to_centre_m") or 0.0) if event.yaw_rad is not None else 0.0
@@ -255,10 +255,10 @@ def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], arm_of: Arms,
         corners = np.array([[-half, -wide], [half, -wide], [half, wide], [-half, wide]])
         footprint = path_data(frame.units(corners @ turn + centre), closed=True, tolerance=0.0)
     where = f"x {fixed(centre[0, 0], 1)}, y {fixed(centre[0, 1], 1)}\u00a0m"
-    return Mark(arm, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint)
+    return Mark(variant, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint)
 
 
-def _offset_chart(rollouts: Sequence[Rollout], series: Series, arm_of: Arms, label: Any) -> OffsetChart | None:
+def _offset_chart(rollouts: Sequence[Rollout], series: Series, variant_of: Variants, label: Any) -> OffsetChart | None:
     own = {r.cell: series[r.cell]["lateral_offset_m"] for r in rollouts if "lateral_offset_m" in series.get(r.cell, {})}
     if not own:
         return None
@@ -267,8 +267,8 @@ def _offset_chart(rollouts: Sequence[Rollout], series: Series, arm_of: Arms, lab
     end_us = max(1, *(int(t[-1] - t[0]) for t, _ in own.values()))
     tracks = []
     for rollout in rollouts:
-        if rollout.cell in own and (rollout.renderer, rollout.policy) in arm_of:
+        if rollout.cell in own and (rollout.renderer, rollout.policy) in variant_of:
             t_us, offset = own[rollout.cell]
             units = np.stack([(t_us - t_us[0]) / end_us * 1000.0, 100.0 - offset / shown * 100.0], 1)
-            tracks.append(Track(*arm_of[rollout.renderer, rollout.policy], label(rollout), path_data(units, tolerance=0.7)))
+            tracks.append(Track(*variant_of[rollout.renderer, rollout.policy], label(rollout), path_data(units, tolerance=0.7)))
     return OffsetChart(tuple(tracks), f"{shown:g}\u00a0m" + (" and more" if reach > shown else ""), f"{end_us * 1e-6:.1f}")

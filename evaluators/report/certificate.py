@@ -1,4 +1,4 @@
-"""The determinism certificate as a reader meets it: was one rollout, made again, the same to the bit?"""
+"""The determinism certificate: whether a repeated rollout is bit-identical."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What the page says of the repeat."""
+    """Result of the repeated rollout as the page shows it."""
 
     word: str  # badge
     tone: str

@@ -24,9 +24,10 @@ from evaluators.report.run_folder import Rollout, Series
 N_COLOURS = 8
 SIZE_IN = (4.6, 2.7)  # about 440 x 260 CSS pixels: legible at its own size on a phone
 DASHES: tuple[tuple[int, tuple[float, ...]], ...] = ((0, ()), (0, (5.0, 2.0)), (0, (1.5, 1.5)), (0, (6.0, 2.0, 1.5, 2.0)))
-ARM = [f"#01{i:02x}a1" for i in range(N_COLOURS)]  # stand-ins, found again in the SVG
+VARIANT = [f"#01{i:02x}a1" for i in range(N_COLOURS)]  # stand-ins, found again in the SVG
 INK, MUTED, GRID = "#0201a1", "#0202a1", "#0203a1"
-VARIABLES = {**{colour: f"var(--arm-{i})" for i, colour in enumerate(ARM)}, INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
+VARIABLES = {colour: f"var(--variant-{i})" for i, colour in enumerate(VARIANT)}
+VARIABLES |= {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
 N_BINS = 60
 
 RC = {
@@ -61,7 +62,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Curve:
-    """One arm's line with an optional band; all ``(N,)``."""
+    """One variant's line with an optional band; all ``(N,)``."""
 
     label: str
     colour: int
@@ -78,7 +79,7 @@ def line_chart(curves: Sequence[Curve], x_label: str, y_label: str, y_top: float
         figure = Figure(figsize=SIZE_IN, layout="constrained")
         axes = figure.add_subplot()
         for curve in curves:
-            colour = ARM[curve.colour % N_COLOURS]
+            colour = VARIANT[curve.colour % N_COLOURS]
             if curve.low is not None and curve.high is not None:
                 axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.16, linewidth=0)
             axes.plot(curve.x, curve.y, color=colour, linestyle=DASHES[curve.dash % len(DASHES)], label=curve.label)
@@ -108,20 +109,21 @@ def themed_svg(figure: Figure) -> str:
     return re.sub(r'<svg [^>]*?(viewBox="[^"]+")[^>]*>', r'<svg \1 role="img" class="chart">', svg, count=1)
 
 
-def drift_charts(rollouts: Sequence[Rollout], series: Series, arm_of: dict[tuple[str, str], tuple[int, int]]) -> list[Chart]:
+def drift_charts(rollouts: Sequence[Rollout], series: Series, variant_of: dict[tuple[str, str], tuple[int, int]]) -> list[Chart]:
     """Draw how far from the logged path the ego is over time, and how many rollouts are still without an event."""
     charts = []
-    by_arm: dict[tuple[str, str], list[Rollout]] = {}
+    by_variant: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
         if rollout.ok and "lateral_offset_m" in series.get(rollout.cell, {}):
-            by_arm.setdefault((rollout.renderer, rollout.policy), []).append(rollout)
-    by_arm = {arm: by_arm[arm] for arm in arm_of if arm in by_arm}
-    if not by_arm:
+            by_variant.setdefault((rollout.renderer, rollout.policy), []).append(rollout)
+    by_variant = {variant: by_variant[variant] for variant in variant_of if variant in by_variant}
+    if not by_variant:
         return []
-    several = len({policy for _, policy in by_arm}) > 1
+    several = len({policy for _, policy in by_variant}) > 1
 
     def curves(make: Callable[[list[Rollout]], tuple[npt.NDArray[np.float64], ...]]) -> list[Curve]:
-        return [Curve(" \u00b7 ".join(arm) if several else arm[0], *arm_of[arm], *make(members)) for arm, members in by_arm.items()]
+        names = {key: " \u00b7 ".join(key) if several else key[0] for key in by_variant}
+        return [Curve(names[key], *variant_of[key], *make(members)) for key, members in by_variant.items()]
 
     charts.append(
         Chart(

@@ -1,4 +1,4 @@
-"""What did not make it into the numbers: rollouts that failed, and what the rules of scoring removed."""
+"""Excluded data: rollouts that failed, and steps that the scoring rules removed."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from evaluators.report.charts import ARM, GRID, INK, MUTED, N_COLOURS, RC, Chart, themed_svg
+from evaluators.report.charts import GRID, INK, MUTED, N_COLOURS, RC, VARIANT, Chart, themed_svg
 from evaluators.report.headline import WORDS
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
 from evaluators.report.numbers import finite, interval
@@ -28,30 +28,30 @@ class _Line:
     """One difference turned so that positive is worse, in printed units."""
 
     metric: str
-    arm: int
+    variant: int
     centre: float
     low: float
     high: float
     margin: float
 
 
-def forest(run: Run, arms: Mapping[str, int]) -> list[Chart]:
+def forest(run: Run, variants: Mapping[str, int]) -> list[Chart]:
     """Draw the paired differences with their intervals, one chart a unit; metrics without a better side are left out.
 
     Args:
         run: The run.
-        arms: Key of ``summary.json`` -> colour.
+        variants: Key of ``summary.json`` -> colour.
     """
     lines: dict[str, list[_Line]] = {}
-    for arm, pairs in (run.summary.get("paired") or {}).items():
+    for variant, pairs in (run.summary.get("paired") or {}).items():
         for metric in ordered(pairs):
-            found = _line(metric, arms.get(arm, 0), pairs[metric] or {})
+            found = _line(metric, variants.get(variant, 0), pairs[metric] or {})
             if found is not None and metric in HEADLINE:
                 lines.setdefault(found[0], []).append(found[1])
     return [_forest_chart(unit, some) for unit, some in lines.items()]
 
 
-def _line(metric: str, arm: int, entry: Mapping[str, Any]) -> tuple[str, _Line] | None:
+def _line(metric: str, variant: int, entry: Mapping[str, Any]) -> tuple[str, _Line] | None:
     centre, direction = finite(entry.get("diff")), entry.get("direction")
     bounds = interval(entry.get("ci95"), centre)
     if centre is None or bounds is None or direction not in ("lower", "higher"):
@@ -60,22 +60,22 @@ def _line(metric: str, arm: int, entry: Mapping[str, Any]) -> tuple[str, _Line] 
     scale = 100.0 if in_percent(metric, unit) else 1.0
     turned = [v * scale if direction == "lower" else -v * scale for v in (centre, *bounds)]
     margin = (finite(entry.get("margin")) or 0.0) * scale
-    return ("points" if scale == 100.0 else unit), _Line(metric, arm, turned[0], min(turned[1:]), max(turned[1:]), margin)
+    return ("points" if scale == 100.0 else unit), _Line(metric, variant, turned[0], min(turned[1:]), max(turned[1:]), margin)
 
 
 def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
     metrics = list(dict.fromkeys(line.metric for line in lines))
-    arms = sorted({line.arm for line in lines})
-    gap = 1.0 / (len(arms) + 1)
+    variants = sorted({line.variant for line in lines})
+    gap = 1.0 / (len(variants) + 1)
     with mpl.rc_context(RC | {"axes.grid.axis": "x"}):
-        figure = Figure(figsize=(WIDTH_IN, 0.75 + 0.42 * len(metrics) * max(1.0, 0.6 * len(arms))), layout="constrained")
+        figure = Figure(figsize=(WIDTH_IN, 0.75 + 0.42 * len(metrics) * max(1.0, 0.6 * len(variants))), layout="constrained")
         axes = figure.add_subplot()
         axes.axvline(0.0, color=INK, linewidth=1.0)
         for line in lines:
-            y = metrics.index(line.metric) + (arms.index(line.arm) + 1) * gap - 0.5
-            colour = ARM[line.arm % N_COLOURS]
+            y = metrics.index(line.metric) + (variants.index(line.variant) + 1) * gap - 0.5
+            colour = VARIANT[line.variant % N_COLOURS]
             axes.plot([line.low, line.high], [y, y], color=colour, linewidth=1.8, solid_capstyle="butt")
-            axes.plot([line.centre], [y], MARKERS[line.arm % len(MARKERS)], color=colour, markersize=5.5)
+            axes.plot([line.centre], [y], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=5.5)
         for row, metric in enumerate(metrics):
             margin = max(line.margin for line in lines if line.metric == metric)
             if margin > 0.0:
@@ -90,20 +90,20 @@ def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
     return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
 
 
-def speed_against_error(run: Run, arms: Mapping[str, int]) -> list[Chart]:
+def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
     """Draw milliseconds per frame against what the renderer does to the driving, for each of a few metrics."""
     speed = run.summary.get("speed") or {}
-    times = {arm: ms for arm, entry in speed.items() if (ms := finite(entry.get("ms_per_frame_p50"))) is not None and ms > 0}
+    times = {variant: ms for variant, entry in speed.items() if (ms := finite(entry.get("ms_per_frame_p50"))) is not None and ms > 0}
     paired = run.summary.get("paired") or {}
     charts = []
     for metric in ERRORS:
         points = []
-        for arm, ms in times.items():
-            entry = (paired.get(arm) or {}).get(metric)
-            if entry is None and arm not in paired:
-                points.append((arm, ms, _Line(metric, arms.get(arm, 0), 0.0, 0.0, 0.0, 0.0)))
-            elif entry is not None and (found := _line(metric, arms.get(arm, 0), entry)) is not None:
-                points.append((arm, ms, found[1]))
+        for variant, ms in times.items():
+            entry = (paired.get(variant) or {}).get(metric)
+            if entry is None and variant not in paired:
+                points.append((variant, ms, _Line(metric, variants.get(variant, 0), 0.0, 0.0, 0.0, 0.0)))
+            elif entry is not None and (found := _line(metric, variants.get(variant, 0), entry)) is not None:
+                points.append((variant, ms, found[1]))
         if len(points) >= 2 and any(line.low < line.high or line.centre for _, _, line in points):
             unit = "points" if in_percent(metric, "") else "m"
             charts.append(_speed_chart(metric, unit, points))
@@ -115,13 +115,13 @@ def _speed_chart(metric: str, unit: str, points: Sequence[tuple[str, float, _Lin
         figure = Figure(figsize=(WIDTH_IN, 2.7), layout="constrained")
         axes = figure.add_subplot()
         axes.axhline(0.0, color=INK, linewidth=0.9, alpha=0.7)
-        for arm, ms, line in points:
-            colour = ARM[line.arm % N_COLOURS]
+        for variant, ms, line in points:
+            colour = VARIANT[line.variant % N_COLOURS]
             axes.plot([ms, ms], [line.low, line.high], color=colour, linewidth=1.8)
-            axes.plot([ms], [line.centre], MARKERS[line.arm % len(MARKERS)], color=colour, markersize=7, label=arm)
+            axes.plot([ms], [line.centre], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=7, label=variant)
             left = ms <= min(t for _, t, _ in points)  # the intervals of the slower ones lie to its right
             axes.annotate(
-                arm, (ms, line.centre), (-7 if left else 7, 5), textcoords="offset points", ha="right" if left else "left", color=colour
+                variant, (ms, line.centre), (-7 if left else 7, 5), textcoords="offset points", ha="right" if left else "left", color=colour
             )
         _time_axis(axes, [ms for _, ms, _ in points])
         axes.set_xlabel("ms per camera frame, median")
@@ -151,7 +151,7 @@ def strata_chart(one: Strata) -> Chart | None:
     known = [s for s in one.strata if s.label != NOT_BESIDE and any(name in b.means for b in s.bins)]
     if len(known) < 2:
         return None
-    arms = sorted({b.arm for s in known for b in s.bins})
+    variants = sorted({b.variant for s in known for b in s.bins})
     with mpl.rc_context(RC | {"axes.grid.axis": "y"}):
         figure = Figure(figsize=(WIDTH_IN, 2.7), layout="constrained")
         axes = figure.add_subplot()
@@ -159,12 +159,12 @@ def strata_chart(one: Strata) -> Chart | None:
             for b in stratum.bins:
                 if name not in b.means:
                     continue
-                x = k + (arms.index(b.arm) + 1) / (len(arms) + 1) - 0.5
+                x = k + (variants.index(b.variant) + 1) / (len(variants) + 1) - 0.5
                 mean, low, high = b.means[name]
-                colour = ARM[b.arm % N_COLOURS]
+                colour = VARIANT[b.variant % N_COLOURS]
                 if low is not None and high is not None:
                     axes.plot([x, x], [max(low, 0.0), high], color=colour, linewidth=1.8)
-                axes.plot([x], [mean], MARKERS[b.arm % len(MARKERS)], color=colour, markersize=6)
+                axes.plot([x], [mean], MARKERS[b.variant % len(MARKERS)], color=colour, markersize=6)
         for k in range(1, len(known)):
             axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
         axes.set_xticks(range(len(known)), [_tick(s.label, one.unit) for s in known], fontsize=8.5)

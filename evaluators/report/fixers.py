@@ -1,4 +1,4 @@
-"""What fixers were at work, how often their drafts held, and what their guard refused."""
+"""Fixers of a run: label, mode, hit rate of drafts, and frames that the guard rejected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells whose outcome changed between the baseline and another renderer: what one looks at first."""
+"""Cells whose outcome differs between the baseline and another renderer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaluators.report.numbers import Cell, fixed, missing, short
 from evaluators.report.run_folder import Rollout, Run, read_json
 
 FLIPS_NAME = "flips.json"
-OUTCOMES = {  # metric -> word, the gravest first
+OUTCOMES = {  # metric -> word, most severe first
     "collision_at_fault": "at-fault collision",
     "collision_any": "collision",
     "offroad": "off-road",
@@ -89,11 +89,11 @@ class FlipRow:
     """One flip as the report shows it.
 
     Attributes:
-        time: When the plans parted, since the first frame.
+        time: When the plans diverged, since the first frame.
         gap: How far apart they were then.
-        pictures: (renderer, arm, data address, width, height) at that time.
+        pictures: (renderer, variant, data address, width, height) at that time.
         why_not: Why there are no pictures.
-        links: (renderer, arm, clip, folder).
+        links: (renderer, variant, clip, folder).
     """
 
     flip: Flip
@@ -109,7 +109,7 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
     """Lay out the flips with their pictures, as far as a budget goes.
 
     Args:
-        run: The run; ``flips.json`` beside its tables tells when plans parted and where the frames of that time are.
+        run: The run; ``flips.json`` holds when plans diverged and where the frames of that time are.
         budget_bytes: Most bytes of pictures to inline.
 
     Returns:
@@ -138,7 +138,7 @@ def _row(run: Run, flip: Flip, entry: Mapping[str, Any] | None, room: bool) -> F
         why = "not looked for: there are too many flips" if looked else "the run folder has no logs to look for it in"
         return FlipRow(flip, missing(why), missing(why), "", (), why, links)
     if entry.get("t_us") is None:
-        why = str(entry.get("reason") or "the plans never part by more than the threshold")
+        why = str(entry.get("reason") or "the plans never diverge by more than the threshold")
         return FlipRow(flip, missing(why), missing(why), "", (), why, links)
     seconds = float(entry["after_us"]) * 1e-6
     time, gap = Cell(f"{fixed(seconds, 1)}\u00a0s", sort=seconds), Cell(short(float(entry["gap_m"]), "m"), sort=float(entry["gap_m"]))

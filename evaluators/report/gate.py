@@ -28,7 +28,7 @@ def gate_md(verdict: GateVerdict, gate: str, run: str) -> str:
     head += f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. Exit code {verdict.exit_code}.\n\n"
     reasons = "".join(f"- {escape(reason)}\n" for reason in verdict.outcome.reasons) if verdict.outcome.cause != "pass" else ""
     rows = [
-        [check.metric, _arm(check), MARKS[check.cause] + ("" if check.binding else " (not binding)"), check.kind, check.text]
+        [check.metric, _variant(check), MARKS[check.cause] + ("" if check.binding else " (not binding)"), check.kind, check.text]
         for check in verdict.checks
     ]
     checks = "\n" + table(["metric", "renderer", "result", "rule", "numbers"], rows) if rows else ""
@@ -78,7 +78,8 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     suite = ET.Element("testsuite", {"name": clean(f"gate {gate}")})
     n_failures = n_skipped = 0
     for check in verdict.checks:
-        case = ET.SubElement(suite, "testcase", {"classname": clean(f"gate.{_arm(check)}"), "name": clean(f"{check.metric} {check.kind}")})
+        names = {"classname": clean(f"gate.{_variant(check)}"), "name": clean(f"{check.metric} {check.kind}")}
+        case = ET.SubElement(suite, "testcase", names)
         values = {key: check.entry[key] for key in ("diff", "ci95", "margin", "mean", "max", "min", "n_scenes") if key in check.entry}
         holder = ET.SubElement(case, "properties")
         for key, value in values.items():
@@ -99,5 +100,5 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     return root
 
 
-def _arm(check: Check) -> str:
+def _variant(check: Check) -> str:
     return f"{check.renderer}/{check.policy}"

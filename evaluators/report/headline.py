@@ -1,4 +1,4 @@
-"""Say in one sentence what the run found, from the numbers of ``summary.json`` alone.
+"""Summarise a run in one sentence, from the numbers of ``summary.json`` alone.
 
 The verdict words come from the paired comparison; this module never tests anything itself, so that the sentence and the table
 below it cannot disagree.
@@ -42,7 +42,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Finding:
-    """The head of a report: a title, one point per renderer, and what a reader must know before using the numbers."""
+    """The head of a report: a title, one point per renderer, and caveats."""
 
     title: str
     tone: Tone
@@ -57,8 +57,8 @@ def find(run: Run) -> Finding:
         return Finding("Nothing was run: the run folder holds no rollouts", "broken")
     if done == 0:
         return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run))
-    paired = {arm: pairs for arm, pairs in (run.summary.get("paired") or {}).items() if pairs}
-    points = tuple(_paired_point(run, arm, pairs) for arm, pairs in paired.items())
+    paired = {variant: pairs for variant, pairs in (run.summary.get("paired") or {}).items() if pairs}
+    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired.items())
     if points:
         title = "; ".join(_clause(point, _baseline(paired[point.name])) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
@@ -66,7 +66,7 @@ def find(run: Run) -> Finding:
         order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
         tone = next(t for t in order if t in tones)
         return Finding(title[0].upper() + title[1:] if points[0].tone == "unclear" else title, tone, points, _cautions(run))
-    alone = tuple(Point(arm, "neutral", _alone(run, arm)) for arm in run.arms)
+    alone = tuple(Point(variant, "neutral", _alone(run, variant)) for variant in run.variants)
     title = (
         f"{alone[0].name} \u2013 {alone[0].text}"
         if len(alone) == 1
@@ -121,8 +121,8 @@ def _baseline(pairs: Mapping[str, Any]) -> str:
     return str(next((p.get("baseline") for p in pairs.values() if p.get("baseline")), "the baseline"))
 
 
-def _paired_point(run: Run, arm: str, pairs: Mapping[str, Any]) -> Point:
-    stats = run.summary.get("metrics", {}).get(arm, {})
+def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
+    stats = run.summary.get("metrics", {}).get(variant, {})
     lead = [m for m in HEADLINE if m in pairs and finite(pairs[m].get("diff")) is not None]
     if "collision_at_fault" in lead and "collision_any" in lead:
         lead.remove("collision_any")
@@ -135,18 +135,18 @@ def _paired_point(run: Run, arm: str, pairs: Mapping[str, Any]) -> Point:
         tone = "neutral"
     moved = [*said, *(m for m in lead if m not in said and m != "progress" and finite(pairs[m].get("diff")) != 0.0)]
     same = [m for m in lead if m not in moved and m != "progress"]
-    parts = [_difference(run, arm, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
+    parts = [_difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
     parts += [f"no difference at all in {_listing(same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    return Point(arm, tone, text or "no metric is valid in both members of any pair", worse, better)
+    return Point(variant, tone, text or "no metric is valid in both members of any pair", worse, better)
 
 
-def _difference(run: Run, arm: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
-    here, there = (_level(run, name, metric) for name in (arm, str(entry.get("baseline"))))
+def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
+    here, there = (_level(run, name, metric) for name in (variant, str(entry.get("baseline"))))
     if brief:
         return f"{WORDS.get(metric, metric)}: {here} against {there}, undecided"
-    stats = run.summary.get("metrics", {}).get(arm, {}).get(metric, {})
+    stats = run.summary.get("metrics", {}).get(variant, {}).get(metric, {})
     unit = str(stats.get("unit", ""))
     scale, unit = (100.0, "points") if in_percent(metric, unit) else (1.0, unit)
     difference = float(entry["diff"]) * scale
@@ -173,8 +173,8 @@ def more_scenes_text(more: Any) -> str:
     return f"about {plural(more, 'more scene')} would decide"
 
 
-def _level(run: Run, arm: str, metric: str) -> str:
-    stats = run.summary.get("metrics", {}).get(arm, {}).get(metric, {})
+def _level(run: Run, variant: str, metric: str) -> str:
+    stats = run.summary.get("metrics", {}).get(variant, {}).get(metric, {})
     mean, unit = finite(stats.get("mean")), str(stats.get("unit", ""))
     if mean is None:
         return "no valid value"
@@ -184,12 +184,12 @@ def _level(run: Run, arm: str, metric: str) -> str:
     return f"{short(100 * mean)}\u00a0%" if in_percent(metric, unit) else short(mean, unit)
 
 
-def _alone(run: Run, arm: str) -> str:
-    stats = run.summary.get("metrics", {}).get(arm, {})
+def _alone(run: Run, variant: str) -> str:
+    stats = run.summary.get("metrics", {}).get(variant, {})
     names = [m for m in HEADLINE if m in stats and m != "progress"]
     if "collision_at_fault" in names and "collision_any" in names:
         names.remove("collision_at_fault")
-    return "; ".join(f"{WORDS.get(m, m)}: {_level(run, arm, m)}" for m in names) or "no metric"
+    return "; ".join(f"{WORDS.get(m, m)}: {_level(run, variant, m)}" for m in names) or "no metric"
 
 
 def _cautions(run: Run) -> tuple[str, ...]:

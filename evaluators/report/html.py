@@ -74,15 +74,15 @@ def context(run: Run) -> dict[str, Any]:
     """Collect everything that the template prints."""
     series = read_series(run)
     interesting = by_interest(run, series)
-    arm_of = {(r, p): (i, j) for i, r in enumerate(run.renderers) for j, p in enumerate(run.policies)}
-    views, no_view = scene_views(run, series, interesting, arm_of)
+    variant_of = {(r, p): (i, j) for i, r in enumerate(run.renderers) for j, p in enumerate(run.policies)}
+    views, no_view = scene_views(run, series, interesting, variant_of)
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     pairs = tables.pair_rows(run.summary)
     by_scene, more_scene_rows = scene_rows(run)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
-    colours = _arm_colours(run)
+    colours = _variant_colours(run)
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
     split = strata(run)
     return {
@@ -92,7 +92,7 @@ def context(run: Run) -> dict[str, Any]:
         "finding": find(run),
         "facts": _facts(run),
         "columns": tables.columns(run),
-        "arm_colour": colours,
+        "variant_colour": colours,
         "forest": forest(run, colours),
         "flips": flips,
         "more_flips": more_flips,
@@ -109,7 +109,7 @@ def context(run: Run) -> dict[str, Any]:
         "other_pairs": [p for p in pairs if headline and p.metric not in {row.name for row in headline}],
         "renderers": run.renderers,
         "policies": run.policies,
-        "charts": drift_charts(run.rollouts, series, arm_of),
+        "charts": drift_charts(run.rollouts, series, variant_of),
         "views": views,
         "open_views": OPEN_SCENE_PLOTS,
         "views_left_out": no_view,
@@ -143,7 +143,7 @@ def by_interest(run: Run, series: Series) -> list[str]:
 
 
 def scene_views(
-    run: Run, series: Series, interesting: list[str], arm_of: Mapping[tuple[str, str], tuple[int, int]]
+    run: Run, series: Series, interesting: list[str], variant_of: Mapping[tuple[str, str], tuple[int, int]]
 ) -> tuple[list[SceneView], list[str]]:
     """Lay out the most telling scenes within the limits of count and size.
 
@@ -157,7 +157,7 @@ def scene_views(
         rollouts = [r for r in run.rollouts if r.scene == scene]
         if content is None or not rollouts or len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
             continue
-        view = scene_view(scene, content, rollouts, series, arm_of)
+        view = scene_view(scene, content, rollouts, series, variant_of)
         if view is not None:
             drawn[scene] = view
             spent += len(view.lanes) + len(view.lines) + len(view.edges) + sum(len(t.d) for t in view.tracks)
@@ -178,10 +178,10 @@ def _when(text: Any) -> str:
         return str(text or "")
 
 
-def _arm_colours(run: Run) -> dict[str, int]:
+def _variant_colours(run: Run) -> dict[str, int]:
     """Give every column its renderer's colour."""
     index = {name: i for i, name in enumerate(run.renderers)}
-    return {arm: index.get(next((r.renderer for r in run.rollouts_of(arm)), arm), i) for i, arm in enumerate(run.arms)}
+    return {variant: index.get(next((r.renderer for r in run.rollouts_of(variant)), variant), i) for i, variant in enumerate(run.variants)}
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:

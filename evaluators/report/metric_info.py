@@ -1,4 +1,4 @@
-"""How a metric is shown. What it means stands in `evaluators.metrics` alone.
+"""Display of a metric; its definition is in `evaluators.metrics`.
 
 Unit and direction come with the numbers in ``summary.json``; a metric of a third party that this process has not loaded is shown all
 the same, without a line of meaning.
@@ -26,10 +26,10 @@ def meaning(name: str) -> str:
 
 
 def is_rate(name: str, unit: str) -> bool:
-    """Tell whether a metric counts rollouts, so that its mean is a fraction with "k of n" behind it."""
+    """Return whether a metric counts rollouts, so that its mean is a fraction with "k of n" behind it."""
     return not unit and name in METRICS and METRICS[name].is_flag
 
 
 def in_percent(name: str, unit: str) -> bool:
-    """Tell whether a metric is printed in percent: rates, and shares without a unit."""
+    """Return whether a metric is printed in percent: rates, and shares without a unit."""
     return is_rate(name, unit) or (not unit and name in METRICS and METRICS[name].is_share)

@@ -1,4 +1,4 @@
-"""Write numbers for people: percent with counts, matching decimals, a true minus sign, and a dash with a reason for what is missing."""
+"""Format numbers for display: percent with counts, matching decimals, a minus sign (U+2212), and a dash with a reason where missing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Cell:
 
     @property
     def missing(self) -> bool:
-        """Tell whether there is no number."""
+        """Return whether there is no number."""
         return self.text == DASH
 
 

@@ -53,7 +53,7 @@ class Rollout:
 
     @property
     def ok(self) -> bool:
-        """Tell whether the rollout ran to its end."""
+        """Return whether the rollout ran to its end."""
         return self.status == "ok"
 
     @property
@@ -62,13 +62,13 @@ class Rollout:
         return (self.renderer, self.policy, self.scene, self.seed)
 
     def flag(self, *names: str) -> bool:
-        """Tell whether any of the named 0/1 metrics is 1."""
+        """Return whether any of the named 0/1 metrics is 1."""
         return any((self.metrics.get(name) or 0.0) >= 0.5 for name in names)
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder in memory, except steps and scenes, which are read when asked for.
+    """A run folder in memory, except steps and scenes, which are read on demand.
 
     Attributes:
         info: ``run.json``.
@@ -98,18 +98,18 @@ class Run:
         return _ordered(self.info.get("scenes"), (r.scene for r in self.rollouts))
 
     @property
-    def arms(self) -> list[str]:
+    def variants(self) -> list[str]:
         """List the columns of the result tables: the keys under which ``summary.json`` holds metrics."""
         return list(self.summary.get("metrics") or {}) or self.renderers
 
-    def rollouts_of(self, arm: str) -> list[Rollout]:
-        """List the rollouts that a summary key stands for.
+    def rollouts_of(self, variant: str) -> list[Rollout]:
+        """List the rollouts of a summary key.
 
         Args:
-            arm: A renderer's name, or renderer and policy joined by one of `SEPARATORS`.
+            variant: A renderer's name, or renderer and policy joined by one of `SEPARATORS`.
         """
-        exact = [r for r in self.rollouts if any(arm == f"{r.renderer}{s}{r.policy}" for s in SEPARATORS)]
-        return exact or [r for r in self.rollouts if r.renderer == arm]
+        exact = [r for r in self.rollouts if any(variant == f"{r.renderer}{s}{r.policy}" for s in SEPARATORS)]
+        return exact or [r for r in self.rollouts if r.renderer == variant]
 
     @cached_property
     def _scene_files(self) -> dict[str, Path]:
@@ -121,7 +121,7 @@ class Run:
         return found
 
     def scene_path(self, scene: str) -> Path | None:
-        """Find the file of a scene's map, whatever the writer did to slashes in its name; None where there is none."""
+        """Find the file of a scene's map, independent of how slashes in its name were encoded; None where there is none."""
         return self._scene_files.get(scene)
 
     def scene_data(self, scene: str) -> Mapping[str, Any] | None:

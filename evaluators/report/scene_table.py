@@ -33,7 +33,7 @@ class SceneRow:
     scene: str
     renderer: str
     policy: str
-    arm: int
+    variant: int
     chips: tuple[Chip, ...]
     collisions: Cell
     offroad: Cell
@@ -41,7 +41,7 @@ class SceneRow:
 
 
 def scene_rows(run: Run) -> tuple[list[SceneRow], int]:
-    """Lay out scenes x arms.
+    """Lay out scenes x variants.
 
     Returns:
         The rows, and how many more there are than are shown.
@@ -56,12 +56,12 @@ def scene_rows(run: Run) -> tuple[list[SceneRow], int]:
     return rows, len(keys) - len(rows)
 
 
-def _scene_row(run: Run, key: tuple[str, str, str], rollouts: list[Rollout], arm: int) -> SceneRow:
+def _scene_row(run: Run, key: tuple[str, str, str], rollouts: list[Rollout], variant: int) -> SceneRow:
     done = [r for r in rollouts if r.ok]
     chips = tuple(_chip(run, r) for r in sorted(rollouts, key=lambda r: r.seed))
     return SceneRow(
         *key,
-        arm=arm,
+        variant=variant,
         chips=chips,
         collisions=_count(done, COLLISION),
         offroad=_count(done, ("offroad",)),

@@ -25,7 +25,7 @@ class SpeedRow:
     """One renderer's speed."""
 
     renderer: str
-    arm: int
+    variant: int
     cells: tuple[Cell, ...]  # p50, p95, frames per second, first frame
     stages: tuple[Cell, ...]
     bar: tuple[Segment, ...]

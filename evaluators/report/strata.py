@@ -40,7 +40,7 @@ class Bin:
             unknown.
     """
 
-    arm: int
+    variant: int
     renderer: str
     seconds: float
     rollouts: int
@@ -74,7 +74,7 @@ class StratumRow:
     label: str
     order: int
     renderer: str
-    arm: int
+    variant: int
     cells: tuple[Cell, ...]  # time, events, values
 
 
@@ -108,7 +108,7 @@ def stratum_rows(one: Strata) -> list[StratumRow]:
             counts = [Cell(str(b.events[name]), _rate(b.events[name], b.seconds), sort=b.events[name]) for name, _ in EVENTS]
             values = [_mean(b, name) for name in VALUES]
             time = Cell(f"{fixed(b.seconds, 1)}\u00a0s", plural(b.rollouts, "rollout"), sort=b.seconds)
-            rows.append(StratumRow(stratum.label, order, b.renderer, b.arm, (time, *counts, *values)))
+            rows.append(StratumRow(stratum.label, order, b.renderer, b.variant, (time, *counts, *values)))
     return rows
 
 
@@ -169,16 +169,16 @@ def _split(title: str, note: str, axis: str, unit: str, labels: Sequence[str], s
     strata_found = []
     for k, label in enumerate(labels):
         bins = []
-        for arm, renderer in enumerate(run.renderers):
+        for variant, renderer in enumerate(run.renderers):
             mine = [(s, g) for s, g in zip(steps, groups, strict=True) if s.rollout.renderer == renderer and bool((g == k).any())]
             if mine:
-                bins.append(_bin(arm, renderer, mine, k))
+                bins.append(_bin(variant, renderer, mine, k))
         if bins:
             strata_found.append(Stratum(label, tuple(bins)))
     return Strata(title, note, axis, unit, tuple(strata_found))
 
 
-def _bin(arm: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) -> Bin:
+def _bin(variant: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) -> Bin:
     seconds = sum(float(np.count_nonzero(g == k)) * s.step_s for s, g in mine)
     events = {}
     for name, _ in EVENTS:
@@ -194,7 +194,7 @@ def _bin(arm: int, renderer: str, mine: list[tuple[_Steps, I64]], k: int) -> Bin
             enough = len(set(scenes)) >= LEAST_SCENES and interval.low is not None
             # Neither metric can be negative; a t interval over few scenes does not know that.
             means[name] = (interval.centre, max(interval.low or 0.0, 0.0) if enough else None, interval.high if enough else None)
-    return Bin(arm, renderer, seconds, len(mine), events, means)
+    return Bin(variant, renderer, seconds, len(mine), events, means)
 
 
 def _mean(b: Bin, name: str) -> Cell:

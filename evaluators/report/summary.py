@@ -42,13 +42,13 @@ def summary_md(run: Run) -> str:
     parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     if rows:
-        head = ["metric", *(f"{c.arm} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
+        head = ["metric", *(f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
         body = [[_label(r.name, r.unit, r.arrow), *(_cell(c) for c in r.cells)] for r in rows]
         parts.append(f"\n### Results, preset {escape(str(run.summary.get('preset')))}\n\n{table(head, body)}\n{INTERVAL_NOTE}\n")
     pairs = tables.pair_rows(run.summary)
     if pairs:
         head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
-        body = [[p.arm, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs]
+        body = [[p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs]
         parts.append(f"\n### Paired differences from {escape(pairs[0].baseline)}\n\n{table(head, body)}")
     fixed = fixer_rows(run.summary)
     if fixed:

@@ -1,4 +1,4 @@
-"""Turn a run into table rows: what is printed, in which order, with which hover text. No markup is made here."""
+"""Turn a run into table rows: text, order and hover text, without markup."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Span:
 
 @dataclass(frozen=True)
 class MetricRow:
-    """One metric, one cell per arm."""
+    """One metric, one cell per variant."""
 
     name: str
     meaning: str
@@ -55,7 +55,7 @@ class MetricRow:
 class PairRow:
     """One paired difference."""
 
-    arm: str
+    variant: str
     baseline: str
     metric: str
     meaning: str
@@ -69,20 +69,20 @@ class PairRow:
 
 
 def metric_rows(summary: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None) -> list[MetricRow]:
-    """Lay out metrics x arms from ``summary.json``.
+    """Lay out metrics x variants from ``summary.json``.
 
     Args:
         summary: Content of ``summary.json``.
         reasons: (renderer, metric) -> why it is invalid, for cells without a number.
     """
-    arms = summary.get("metrics") or {}
+    variants = summary.get("metrics") or {}
     rows = []
-    for name in ordered(m for metrics in arms.values() for m in metrics):
-        entries = [metrics.get(name) or {} for metrics in arms.values()]
+    for name in ordered(m for metrics in variants.values() for m in metrics):
+        entries = [metrics.get(name) or {} for metrics in variants.values()]
         unit = next((str(e["unit"]) for e in entries if e.get("unit")), "")
         direction = next((str(e["direction"]) for e in entries if e.get("direction")), "none")
         percent = in_percent(name, unit)
-        reason_of = [(reasons or {}).get((arm, name), "") for arm in arms]
+        reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
         places = 1 if percent else _places(entries)
         cells = tuple(metric_cell(name, e, unit, places, why) for e, why in zip(entries, reason_of, strict=True))
         spans, scale_text = _spans(entries, 100.0 if percent else 1.0, is_rate(name, unit), "%" if percent else unit)
@@ -178,17 +178,17 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
 
 
 def pair_rows(summary: Mapping[str, Any]) -> list[PairRow]:
-    """Lay out the paired differences, headline metrics first within each arm."""
+    """Lay out the paired differences, headline metrics first within each variant."""
     rows = []
-    for arm, pairs in (summary.get("paired") or {}).items():
+    for variant, pairs in (summary.get("paired") or {}).items():
         for name in ordered(pairs):
             entry = pairs[name] or {}
-            stats = {**((summary.get("metrics") or {}).get(arm, {}).get(name) or {}), **entry}  # an older summary has them in metrics only
-            rows.append(_pair_row(arm, name, entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
+            stats = {**((summary.get("metrics") or {}).get(variant, {}).get(name) or {}), **entry}  # older summaries: in metrics only
+            rows.append(_pair_row(variant, name, entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
     return rows
 
 
-def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, direction: str) -> PairRow:
+def _pair_row(variant: str, name: str, entry: Mapping[str, Any], unit: str, direction: str) -> PairRow:
     diff = finite(entry.get("diff"))
     bounds = interval(entry.get("ci95"), diff)
     scale, unit = (100.0, "points") if in_percent(name, unit) else (1.0, unit)
@@ -218,7 +218,7 @@ def _pair_row(arm: str, name: str, entry: Mapping[str, Any], unit: str, directio
         ("non-inferior", "better"): "better",
     }.get((verdict, str(entry.get("difference"))), verdict)
     base, hint = str(entry.get("baseline") or "\u2014"), _hint(entry, scale, unit)
-    return PairRow(arm, base, name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
+    return PairRow(variant, base, name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
 
 
 def _hint(entry: Mapping[str, Any], scale: float, unit: str) -> str:
@@ -246,17 +246,17 @@ def _p_text(p: float) -> str:
 class Column:
     """Head of a result column."""
 
-    arm: str
+    variant: str
     n_rollouts: int
     n_failed: int
     n_scenes: int
 
 
 def columns(run: Run) -> list[Column]:
-    """Describe each arm: how many rollouts and scenes stand behind its column."""
+    """Describe each variant: how many rollouts and scenes stand behind its column."""
     heads = []
-    for arm in run.arms:
-        rollouts = run.rollouts_of(arm)
+    for variant in run.variants:
+        rollouts = run.rollouts_of(variant)
         done = [r for r in rollouts if r.ok]
-        heads.append(Column(arm, len(done), len(rollouts) - len(done), len({r.scene for r in done})))
+        heads.append(Column(variant, len(done), len(rollouts) - len(done), len({r.scene for r in done})))
     return heads

@@ -33,10 +33,10 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Tab
     note = MARGIN_NOTE + (GAP_NOTE if gaps else "") if rows else None
     table = Table(box=box.SIMPLE_HEAD, caption=note, caption_justify="left", pad_edge=False)
     table.add_column(Text(f"preset {summary.get('preset', '?')}", style="dim"), overflow="fold")
-    for arm, entries in (summary.get("metrics") or {}).items():
+    for variant, entries in (summary.get("metrics") or {}).items():
         counts = [(int(e.get("n_rollouts") or 0), int(e.get("n_scenes") or 0)) for e in entries.values()]
         n_rollouts, n_scenes = max(counts, default=(0, 0))
-        head = Text(arm, style="bold") + Text(f"\n{plural(n_rollouts, 'rollout')}\n{plural(n_scenes, 'scene')}", style="dim")
+        head = Text(variant, style="bold") + Text(f"\n{plural(n_rollouts, 'rollout')}\n{plural(n_scenes, 'scene')}", style="dim")
         table.add_column(head, justify="right", overflow="fold")
     for row in rows:
         label = Text(row.name, style="bold" if row.is_headline else "")

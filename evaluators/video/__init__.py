@@ -1,4 +1,4 @@
-"""Quality of video against the frames that there were to see: per frame, per clip, and over clips."""
+"""Quality of video against ground-truth frames: per frame, per clip, and over clips."""
 
 from evaluators.video.clip import ClipQuality, clip_quality
 from evaluators.video.frames import psnr_db, ssim

@@ -1,4 +1,4 @@
-"""Everything that is measured of one clip: values per frame, and their means."""
+"""Metrics of one clip: values per frame, and their means."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, PictureDista
 
     Args:
         made: ``(T, H, W, 3)``, at least two frames.
-        truth: The same frames as they should be; None measures what needs no truth.
+        truth: The ground-truth frames; None computes only the metrics without a reference.
         networks: Perceptual distances by name.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What the numbers of the quality tables mean; known to `evaluators.metrics` once this package is loaded."""
+"""Metrics of the quality tables; importing this module declares them to `evaluators.metrics`."""
 
 from __future__ import annotations
 

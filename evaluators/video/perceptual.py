@@ -19,7 +19,7 @@ BATCH = 8  # frames at a time
 
 
 class PictureDistance(Protocol):
-    """A frozen network that says how far apart pictures look."""
+    """A frozen network that measures the perceptual distance of images."""
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return ``(B,)`` for pictures ``(B, 3, H, W)`` in [-1, 1]."""

@@ -1,4 +1,4 @@
-"""Pictures side by side: what went in, what each fixer made of it, what there was to see."""
+"""Images side by side: input, output of each fixer, ground truth."""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ import numpy as np
 from alpasim_plugin.errors import EvaluatorError
 from evaluators.aggregate.intervals import t_interval
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.rows import sides
+from evaluators.aggregate.rows import by_renderer
 from evaluators.video.facts import FACTS, MS, WARP
 
 Row = Mapping[str, Any]
-TRUTH = "truth"  # the arm of the frames that there were to see: what needs no truth is measured of it
+TRUTH = "truth"  # the arm of the ground-truth frames: only metrics without a reference are measured on it
 BINS = 20  # windows of frames
 LEAST_BIN = 5  # frames
 
@@ -85,7 +85,7 @@ def _paired(rows: Sequence[Row], baseline: str) -> dict[str, dict[str, Any]]:
         for row in rows
         if row["arm"] != TRUTH
     ]
-    split = sides(flat)
+    split = by_renderer(flat)
     out: dict[str, dict[str, Any]] = {}
     for name, side in split.items():
         shared = [m for m in FACTS if all(any(m in row for row in s.rows) for s in (side, split[baseline]))]

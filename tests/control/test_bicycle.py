@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.control.bicycle import BicycleState, Command, exact_arc, step
+from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import Vehicle
 from tests.examples import examples
@@ -17,6 +17,25 @@ from tests.examples import examples
 VEHICLE = Vehicle()
 # No limits: the wheel follows at once, so that a manoeuvre can be anything.
 FREE = Vehicle(max_steer_rad=1.2, max_steer_rate_radps=1e6, max_accel_mps2=100.0, max_brake_mps2=100.0)
+
+
+def exact_arc(state: BicycleState, accel_mps2: float, dt_s: float, wheelbase_m: float) -> BicycleState:
+    """Return the closed solution for a held wheel and a constant acceleration: an arc of a circle.
+
+    The heading depends on the path length alone, ``yaw = yaw0 + s tan(steer) / L``, and the chord of an arc of length s and turn
+    ``2 b`` is ``s sin(b) / b`` at the mean heading.
+    """
+    s = state.speed_mps * dt_s + 0.5 * accel_mps2 * dt_s**2
+    turn = s * math.tan(state.steer_rad) / wheelbase_m
+    half = turn / 2
+    chord = s * (math.sin(half) / half if abs(half) > 1e-8 else 1.0 - half * half / 6)
+    return BicycleState(
+        state.x_m + chord * math.cos(state.yaw_rad + half),
+        state.y_m + chord * math.sin(state.yaw_rad + half),
+        state.yaw_rad + turn,
+        state.speed_mps + accel_mps2 * dt_s,
+        state.steer_rad,
+    )
 
 
 def error_m(a: BicycleState, b: BicycleState) -> float:

@@ -18,6 +18,20 @@ from alpasim_plugin.gaussians.raster.rasterize_reference import composite_refere
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from alpasim_plugin.seeding import stream
 
+
+def cloud_of(splats: Splats) -> GaussianCloud:
+    """Return splats as a cloud: float64 means, other fields float32, quaternions normalised; all must be drawable."""
+    means, log_scales, quaternions, logits, sh = (
+        t.detach().cpu().double().numpy() for t in (splats.means, splats.log_scales, splats.quaternions, splats.logit_opacities, splats.sh)
+    )
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+        arrays = (unit, np.exp(log_scales), sigmoid(logits), sh)
+    cloud = GaussianCloud(means, *(a.astype(np.float32) for a in arrays))
+    cloud.require_drawable("turning trained splats into a cloud")
+    return cloud
+
+
 FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
 Gradients = dict[str, np.ndarray]
 _DEPTH_SHARE = 0.05  # weight of depths, which are metres, beside colours

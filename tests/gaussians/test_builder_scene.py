@@ -104,7 +104,7 @@ def test_houses_leave_road_actors_and_each_other_alone() -> None:
     walls = [n for n in graph.background if n.name.startswith("house")]
     assert len(walls) > 8
     for node in walls:
-        plan = site.frame.to_plan(node.levels[0].cloud.means.astype(np.float64))
+        plan = site.frame.to_ground(node.levels[0].cloud.means.astype(np.float64))
         assert site.look_up(site.off_road_m, plan).min() > 1.5
         assert not site.look_up(site.taken, plan).any()
 
@@ -155,7 +155,7 @@ def test_map_without_edges_gets_a_road_around_its_centres() -> None:
     lanes = {k: replace(v, left=None, right=None) for k, v in road_lanes(line((-20, 0), (120, 0)), "r", 1).items()}
     scenario = make_scenario(LaneMap(lanes), line((0, -1.8), (60, -1.8)))
     site = make_site(scenario, partial(height_at, scenario.ground))
-    on = site.look_up(site.road, site.frame.to_plan(np.array([[20.0, -1.8], [20.0, 1.8], [20.0, 12.0]])))
+    on = site.look_up(site.road, site.frame.to_ground(np.array([[20.0, -1.8], [20.0, 1.8], [20.0, 12.0]])))
     assert on.tolist() == [True, True, False]
     assert built(scenario).render(view(scenario, 3), {}).alpha[100:].min() > 0.8
 

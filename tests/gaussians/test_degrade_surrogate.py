@@ -20,7 +20,7 @@ from alpasim_plugin.gaussians.scene.degrade import (
     flattened,
     log_actors,
     log_times,
-    wander,
+    temporal_noise,
 )
 from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
 from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
@@ -214,7 +214,7 @@ def test_exposure_wanders_smoothly_and_depends_on_time_and_rollout_seed_only() -
 
 def test_wander_is_continuous_across_a_knot_even_at_epoch_times() -> None:
     knot = 1_600_000_000_000_000 // KNOT_US * KNOT_US
-    a, b = wander("s", 0, "c", knot - 1, 3), wander("s", 0, "c", knot, 3)
+    a, b = temporal_noise("s", 0, "c", knot - 1, 3), temporal_noise("s", 0, "c", knot, 3)
     np.testing.assert_allclose(a, b, atol=1e-4)
 
 

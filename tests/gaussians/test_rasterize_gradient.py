@@ -20,6 +20,7 @@ from tests.gaussians.gradient_scenes import (
     Scene,
     assert_close,
     central_differences,
+    cloud_of,
     kernel_gradients,
     numeric_gradients,
     scene,
@@ -165,12 +166,12 @@ def test_image_equals_the_reference_without_its_clamp():
     cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh * 3)
     splats = Splats.from_cloud(cloud)
     out = rasterize_gradient(splats, cam, background=torch.tensor([0.3, 0.2, 0.1]))
-    projected = project_gaussians(splats.to_cloud(), cam)
+    projected = project_gaussians(cloud_of(splats), cam)
     colour, alpha, depth = composite_reference(projected, cam, np.array([[[0.3, 0.2, 0.1]]]))
     assert colour.max() > 1.2
     for found, wanted, atol in ((out.rgb, colour, 1e-4), (out.alpha, alpha, 2e-5), (out.depth * out.alpha, depth * alpha, 1e-3)):
         assert np.mean(np.abs(found.numpy() - wanted) > atol) < 1e-3
-    on_screen = project_gaussians(splats.to_cloud(), cam, on_screen_only=True)
+    on_screen = project_gaussians(cloud_of(splats), cam, on_screen_only=True)
     radii = np.zeros(len(cloud))
     radii[on_screen.index] = on_screen.radii().max(axis=1)
     assert np.abs(out.screen.radii.numpy() - np.ceil(radii)).max() <= 1
@@ -189,7 +190,7 @@ def test_many_random_splats_agree_with_the_torch_twin():
 def test_gradient_on_the_screen_is_that_of_the_projected_mean():
     s = overlapping()
     _, out = kernel_gradients(s)
-    cloud = Splats(*(torch.tensor(a, dtype=torch.float32) for a in s.arrays().values())).to_cloud()
+    cloud = cloud_of(Splats(*(torch.tensor(a, dtype=torch.float32) for a in s.arrays().values())))
     projected = project_gaussians(cloud, s.camera)
 
     def loss() -> float:
@@ -263,7 +264,7 @@ def test_a_second_backward_pass_through_a_kept_graph_repeats_the_first():
 
 def test_cloud_survives_the_way_through_the_optimiser_s_form():
     cloud = random_cloud(50, 3)
-    back = Splats.from_cloud(cloud).to_cloud()
+    back = cloud_of(Splats.from_cloud(cloud))
     found, wanted = rasterize_reference(back, camera()), rasterize_reference(cloud, camera())
     assert np.mean(np.abs(found.rgb - wanted.rgb) > 1e-4) < 1e-3
 

@@ -16,7 +16,7 @@ from policies import check_policy, make_policy
 from policies.conformance import STRAIGHT, observations
 from policies.learned import WEIGHTS, Learned
 from policies.learned_command import route_command
-from policies.learned_net import KNOTS_M, LearnedNet, knot_weights, lay_out, load_net, path_grid, save_net
+from policies.learned_net import KNOTS_M, LearnedNet, knot_weights, load_net, path_from_headings, path_grid, save_net
 from policies.learned_view import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, look, view_map
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from tests.policies.policy_world import CAMERA, observe, scenario_with
@@ -94,7 +94,7 @@ def test_route_that_is_over_or_absent_gives_keep() -> None:
 
 def test_headings_of_a_circle_lay_out_the_circle() -> None:
     heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
-    points, yaw = lay_out(heading, torch.from_numpy(knot_weights()))
+    points, yaw = path_from_headings(heading, torch.from_numpy(knot_weights()))
     s = path_grid()
     np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
     np.testing.assert_allclose(points[0].numpy(), 40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1), atol=2e-3)

@@ -15,7 +15,7 @@ from evaluators.report.events import events_of, read_series
 from evaluators.report.run_folder import Rollout, Run, read_run
 from tests.report.make_run import Plan, make_run
 
-ARMS = {("a", "p"): (0, 0)}
+VARIANTS = {("a", "p"): (0, 0)}
 
 
 def decode(d: str) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_log_runs_from_left_to_right_and_left_of_it_is_up(yaw: float) -> None:
     x, y = np.cos(yaw) * s, np.sin(yaw) * s
     left = (x - 2.0 * np.sin(yaw), y + 2.0 * np.cos(yaw))
     rollout = Rollout("a", "p", "s", 0, "ok")
-    view = scene_view("s", scene(x.tolist(), y.tolist()), [rollout], {rollout.cell: series_of(*(v.tolist() for v in left))}, ARMS)
+    view = scene_view("s", scene(x.tolist(), y.tolist()), [rollout], {rollout.cell: series_of(*(v.tolist() for v in left))}, VARIANTS)
     assert view is not None
     log, track = decode(view.log), decode(view.tracks[0].d)
     assert log[-1, 0] > log[0, 0]
@@ -82,26 +82,26 @@ def test_far_from_the_origin_costs_no_precision() -> None:
     views = []
     for offset in (0.0, 5_412_345.25):
         x, y = (s + offset).tolist(), (0.05 * s + offset).tolist()
-        views.append(scene_view("s", scene(x, y), [rollout], {rollout.cell: series_of(x, y)}, ARMS))
+        views.append(scene_view("s", scene(x, y), [rollout], {rollout.cell: series_of(x, y)}, VARIANTS))
     assert views[0] == views[1]
 
 
 def test_standstill_log_is_drawn() -> None:
-    view = scene_view("s", scene([5.0] * 10, [7.0] * 10), [], {}, ARMS)
+    view = scene_view("s", scene([5.0] * 10, [7.0] * 10), [], {}, VARIANTS)
     assert view is not None
     assert view.height > 0
     assert view.log == ""
 
 
 def test_log_of_one_pose_is_not_drawn() -> None:
-    assert scene_view("s", scene([5.0], [7.0]), [], {}, ARMS) is None
+    assert scene_view("s", scene([5.0], [7.0]), [], {}, VARIANTS) is None
 
 
 def test_rollout_that_drives_away_does_not_shrink_the_scene() -> None:
     x = np.linspace(0, 100, 50).tolist()
     rollout = Rollout("a", "p", "s", 0, "ok")
     stray = series_of(x, np.linspace(0, 5000, 50).tolist())
-    view = scene_view("s", scene(x, [0.0] * 50), [rollout], {rollout.cell: stray}, ARMS)
+    view = scene_view("s", scene(x, [0.0] * 50), [rollout], {rollout.cell: stray}, VARIANTS)
     assert view is not None
     assert view.height / view.unit_per_m < 70.0
 
@@ -109,7 +109,7 @@ def test_rollout_that_drives_away_does_not_shrink_the_scene() -> None:
 def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
     there = {"left": [[0, 2], [100, 2]], "right": [[0, -2], [100, -2]]}
     back = {"left": [[100, -3], [0, -3]], "right": [[100, 1], [0, 1]]}
-    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[there, back]), [], {}, ARMS)
+    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[there, back]), [], {}, VARIANTS)
     assert view is not None
     areas = [np.sign(shapely.LinearRing(decode(part)).is_ccw - 0.5) for part in view.lanes.split("z") if part]
     assert len(areas) == 2
@@ -117,7 +117,7 @@ def test_overlapping_lanes_of_both_directions_do_not_cut_holes() -> None:
 
 
 def test_lane_without_an_edge_gives_its_line_and_no_area() -> None:
-    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[{"left": [[0, 2], [100, 2]], "right": None}]), [], {}, ARMS)
+    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[{"left": [[0, 2], [100, 2]], "right": None}]), [], {}, VARIANTS)
     assert view is not None
     assert view.lanes == ""
     assert view.lines.count("M") == 1
@@ -128,7 +128,7 @@ def test_event_is_marked_where_and_when_it_happened() -> None:
     rollout = Rollout("a", "p", "s", 3, "ok", metrics={"collision_any": 1.0, "collision_front": 1.0, "offroad": 0.0})
     hit = [0.0] * 20 + [1.0] * 31
     series = {rollout.cell: series_of(x, [0.0] * 51, collision_any=hit, collision_front=hit, offroad=[1.0] * 51)}
-    view = scene_view("s", scene(x, [0.0] * 51), [rollout], series, ARMS)
+    view = scene_view("s", scene(x, [0.0] * 51), [rollout], series, VARIANTS)
     assert view is not None
     (mark,) = view.marks  # off-road steps that the rollout's metric does not count are not marked
     assert mark.text == "a \u00b7 seed 3: collision (front) at 2.0\u00a0s, x 21.4, y 0.0\u00a0m"  # the box's centre
@@ -147,7 +147,7 @@ def test_event_during_warm_up_does_not_give_the_time() -> None:
 
 def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
     rollout = Rollout("a", "p", "s", 0, "ok", metrics={"offroad": 1.0})
-    view = scene_view("s", scene([0.0, 50.0], [0.0, 0.0]), [rollout], {}, ARMS)
+    view = scene_view("s", scene([0.0, 50.0], [0.0, 0.0]), [rollout], {}, VARIANTS)
     assert view is not None
     assert view.marks[0].x is None
     assert view.marks[0].text == "a \u00b7 seed 0: off-road at a time that no step shows"
@@ -155,7 +155,7 @@ def test_event_that_no_step_shows_is_listed_without_a_place() -> None:
 
 def test_edge_without_paint_gives_no_line() -> None:
     lane = {"left": [[0, 2], [100, 2]], "right": [[0, -2], [100, -2]], "paint": ["none", "solid_white"]}
-    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[lane]), [], {}, ARMS)
+    view = scene_view("s", scene([0.0, 100.0], [0.0, 0.0], lanes=[lane]), [], {}, VARIANTS)
     assert view is not None
     assert view.lines.count("M") == 1
     assert view.lanes.count("z") == 1
@@ -165,7 +165,7 @@ def test_one_far_rollout_does_not_flatten_the_offsets_of_the_others() -> None:
     x = np.linspace(0, 50, 51).tolist()
     near, far = Rollout("a", "p", "s", 0, "ok"), Rollout("a", "p", "s", 1, "ok")
     series = {r.cell: series_of(x, [0.0] * 51, lateral_offset_m=[d] * 51) for r, d in ((near, 1.0), (far, 300.0))}
-    view = scene_view("s", scene(x, [0.0] * 51), [near, far], series, ARMS)
+    view = scene_view("s", scene(x, [0.0] * 51), [near, far], series, VARIANTS)
     assert view is not None
     assert view.offset is not None
     assert view.offset.reach == "5\u00a0m and more"
@@ -176,8 +176,8 @@ def test_offset_chart_keeps_the_worst_rollout_inside(tmp_path: Path) -> None:
     run: Run = read_run(make_run(tmp_path, Plan(scenes=("hard/x",), harm={"3dgs": 1.0}, pictures=False, clips=False)))
     content = run.scene_data("hard/x")
     assert content is not None
-    arms = {(name, "lane-camera"): (i, 0) for i, name in enumerate(run.renderers)}
-    view = scene_view("hard/x", content, run.rollouts, read_series(run), arms)
+    variants = {(name, "lane-camera"): (i, 0) for i, name in enumerate(run.renderers)}
+    view = scene_view("hard/x", content, run.rollouts, read_series(run), variants)
     assert view is not None
     assert view.offset is not None
     assert len(view.offset.tracks) == len(view.tracks) == 9

@@ -126,9 +126,9 @@ def test_theme_follows_the_system_until_it_is_chosen(browser: Browser, usual_run
 
 def test_legend_hides_one_renderer_in_every_map(browser: Browser, usual_run: Path) -> None:
     browser.open(write_report(usual_run))
-    shown = "[...document.querySelectorAll('#views .track.arm-1')].filter(p => getComputedStyle(p).display !== 'none').length"
+    shown = "[...document.querySelectorAll('#views .track.variant-1')].filter(p => getComputedStyle(p).display !== 'none').length"
     assert browser.evaluate(shown) > 0
-    browser.evaluate("document.querySelector('button[data-arm=\"1\"]').click()")
+    browser.evaluate("document.querySelector('button[data-variant=\"1\"]').click()")
     assert browser.evaluate(shown) == 0
-    browser.evaluate("document.querySelector('button[data-arm=\"1\"]').click()")
+    browser.evaluate("document.querySelector('button[data-variant=\"1\"]').click()")
     assert browser.evaluate(shown) > 0

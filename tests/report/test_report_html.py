@@ -180,8 +180,8 @@ def test_charts_take_their_colours_from_the_page() -> None:
 
     x = np.linspace(0, 1, 5)
     first, second = (line_chart([Curve("<a>", i, 0, x, x, x, x + i)], "s", "m & more") for i in (0, 1))
-    assert "var(--arm-0)" in first
-    assert "var(--arm-1)" in second
+    assert "var(--variant-0)" in first
+    assert "var(--variant-1)" in second
     assert not re.search(r"#0[12][0-9a-f]{2}a1", first + second)
     assert "m &amp; more" in first
     ids = re.findall(r'id="([^"]+)"', first + second)

@@ -16,9 +16,10 @@ from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.lane_map import LaneIndex
 from alpasim_plugin.world.route import route_from_log
 from scenarios.cosmos import read_cosmos, read_poses
-from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, front_camera, lens_of, project_ftheta, read_lenses
+from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, front_camera, lens_of, read_lenses
 from scenarios.cosmos_layers import paint_of, read_layer, sign_pose
 from scenarios.reading import SourceFiles
+from tests.scenarios.ftheta import project_ftheta
 from tests.scenarios.make_cosmos import CLIP, WIDE, cuboid, label, lane, layers, polyline, poses, write_cosmos
 from tests.scenarios.real_drive import ruling
 

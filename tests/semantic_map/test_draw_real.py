@@ -16,8 +16,9 @@ from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.semantic_map.projection import kernel_camera, project_points
 from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.types import Box
-from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, project_ftheta, read_lenses
+from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
 from scenarios.reading import SourceFiles
+from tests.scenarios.ftheta import project_ftheta
 from tests.semantic_map.cosmos_agreement import AS_PUBLISHED, OPENGL, SOLID, compare, mounts, read_clip
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import LaneMap
-from alpasim_plugin.world.road_elements import Curve, Intersection, LaneChangeCount, Profile
+from alpasim_plugin.world.road_elements import Curve, Intersection, LaneTaper, Profile
 from alpasim_plugin.world.roads import Road, build_road, polyline
 from tests.examples import examples
 
@@ -19,11 +19,11 @@ TOWN = [
     Curve(30, 0, 0.02),
     Curve(40, 0.02, 0.02),
     Curve(30, 0.02, 0),
-    LaneChangeCount("merge", 50),
+    LaneTaper("merge", 50),
     Curve(20),
     Intersection("left"),
     Curve(50),
-    LaneChangeCount("split", 40),
+    LaneTaper("split", 40),
     Curve(40),
     Intersection("right", ("right", "straight"), cross_lanes=2),
     Curve(40),
@@ -146,7 +146,7 @@ def test_t_junction_closes_the_missing_side() -> None:
 
 
 def test_merging_lane_ends_exactly_on_its_neighbour() -> None:
-    road = build_road([Curve(30), LaneChangeCount("merge", 60), Curve(30)], Profile(3, 0))
+    road = build_road([Curve(30), LaneTaper("merge", 60), Curve(30)], Profile(3, 0))
     slant, after = road.lane_map.lanes["s1_merge"], road.lane_map.lanes["s2_f1"]
     assert slant.successors == ("s2_f1",)
     assert road.lane_map.lanes["s1_f1"].successors == ("s2_f1",)
@@ -162,7 +162,7 @@ def test_merging_lane_ends_exactly_on_its_neighbour() -> None:
         ([Intersection()], Profile(), "not a straight, arc or clothoid"),
         ([Curve(30), Intersection()], Profile(), "an intersection ends the road"),
         ([Curve(30), Intersection(), Intersection(), Curve(9)], Profile(), "two intersections"),
-        ([Curve(30), LaneChangeCount("merge", 30)], Profile(1, 1), "a merge needs two forward lanes"),
+        ([Curve(30), LaneTaper("merge", 30)], Profile(1, 1), "a merge needs two forward lanes"),
         ([Curve(30, 0.14, 0.14)], Profile(2, 2), "its inner edge would fold"),
         ([Curve(30), Intersection("left", ("right",)), Curve(9)], Profile(), "turn: left, but the arms are right"),
     ],

@@ -17,7 +17,7 @@ _MAX_LOG_SCALE = 20.0
 
 
 def is_compressed_ply(header: PlyHeader) -> bool:
-    """Tell whether a PLY header announces the packed layout."""
+    """Return whether a PLY header announces the packed layout."""
     return any("packed_position" in element.properties for element in header.elements)
 
 
@@ -67,7 +67,7 @@ def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
     quats = np.empty((len(packed), 4))
     slots = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
     np.put_along_axis(quats, slots, others, axis=1)
-    # Rounding can push the three past length 1 by a hair.
+    # Rounding can bring the three slightly above length 1.
     left_out = np.sqrt(np.maximum(1.0 - np.sum(others**2, axis=1), 0.0))
     np.put_along_axis(quats, largest[:, None], left_out[:, None], axis=1)
     return quats

@@ -120,11 +120,11 @@ class SplatRecipe:
         return (degree + 1) ** 2
 
     def densifies_after(self, done: int) -> bool:
-        """Tell whether Gaussians are densified and pruned when ``done`` updates are made."""
+        """Return whether Gaussians are densified and pruned when ``done`` updates are made."""
         inside = self.densify_from * self.steps < done <= self.densify_until * self.steps
         return inside and self.densify_every > 0 and done % self.densify_every == 0
 
     def resets_after(self, done: int) -> bool:
-        """Tell whether opacities are lowered when ``done`` updates are made."""
+        """Return whether opacities are lowered when ``done`` updates are made."""
         every = round(self.reset_every * self.steps)
         return every > 0 and done % every == 0 and 0 < done <= self.densify_until * self.steps

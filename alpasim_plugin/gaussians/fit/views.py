@@ -84,7 +84,7 @@ def logged_views(
 
     Returns:
         Views with sky, depth and actors; in order of time, the cameras of an instant together. Where the scene's opacity is below one half
-        the view shows sky: that stands for the segmentation which recorded images need.
+        the view shows sky, in place of the segmentation that recorded images need.
     """
     shift = np.eye(4)
     shift[1, 3] = aside_m

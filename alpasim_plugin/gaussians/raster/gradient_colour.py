@@ -1,6 +1,6 @@
 """Evaluate the colours of visible splats and take their gradients back to coefficients and view directions.
 
-`alpasim_plugin.gaussians.sh` is the readable twin of the basis.
+`alpasim_plugin.gaussians.sh` is the reference implementation of the basis.
 """
 
 # Numba's decorators are untyped.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.arrays import logit, sigmoid
+from alpasim_plugin.gaussians.arrays import logit
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import LOG_SCALE_LIMIT
 from alpasim_plugin.gaussians.sh import SH_SIZES
@@ -67,22 +67,6 @@ class Splats:
         logits = logit(np.clip(cloud.opacities.astype(np.float64), _OPACITY_LIMIT, 1 - _OPACITY_LIMIT))
         arrays = (cloud.means, scales, cloud.quats, logits, cloud.sh)
         return cls(*(torch.as_tensor(np.array(a), dtype=dtype, device=device) for a in arrays))
-
-    def to_cloud(self) -> GaussianCloud:
-        """Return the Gaussians as a cloud: float64 means, other fields float32, quaternions normalised.
-
-        Raises:
-            InputError: A Gaussian cannot be drawn.
-        """
-        means, log_scales, quaternions, logits, sh = (
-            t.detach().cpu().double().numpy() for t in (self.means, self.log_scales, self.quaternions, self.logit_opacities, self.sh)
-        )
-        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-            arrays = (unit, np.exp(log_scales), sigmoid(logits), sh)
-        cloud = GaussianCloud(means, *(a.astype(np.float32) for a in arrays))
-        cloud.require_drawable("turning trained splats into a cloud")
-        return cloud
 
 
 @dataclass(eq=False)

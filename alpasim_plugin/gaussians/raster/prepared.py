@@ -1,4 +1,4 @@
-"""Do the work that does not depend on the camera once, so that repeated frames only pay for what changes."""
+"""Precompute what does not depend on the camera, so that repeated frames cost only what changes."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _bounding_spheres(means: F64, reach: F64, bundle: int) -> F64:
     starts = np.arange(0, len(means), bundle)
     centre = (np.minimum.reduceat(means, starts) + np.maximum.reduceat(means, starts)) / 2
     distance = np.linalg.norm(means - np.repeat(centre, np.diff([*starts, len(means)]), axis=0), axis=1)
-    # Grown by a hair: the radius must hold after rounding too.
+    # Slightly enlarged: the radius must also hold after rounding.
     radius = np.maximum.reduceat(distance, starts) * (1 + 1e-9) + 1e-9
     return np.column_stack([centre, radius, np.maximum.reduceat(reach, starts)]).reshape(-1)
 

@@ -1,4 +1,4 @@
-"""Project prepared Gaussians, sixteen at a time: the fast twin of `alpasim_plugin.gaussians.raster.project`."""
+"""Project prepared Gaussians, sixteen at a time; `alpasim_plugin.gaussians.raster.project` is the reference implementation."""
 
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -48,7 +48,7 @@ _BLOCK_HALF = _f(1.5)
 
 @njit(cache=True, nogil=True, inline="never")
 def bundle_is_out_of_view(sphere, at, pose, camera):
-    """Tell whether no Gaussian of a bundle can touch a pixel; errs only towards False.
+    """Return whether no Gaussian of a bundle can touch a pixel; errs only towards False.
 
     A splat's half width on screen is at most 3.33 (f/z s sqrt(1 + slope^2) + sqrt(0.3)) for its largest scale s and the clamped slope, so
     "right of the image" is the half space x - z (W - cx + 1.9)/f > 3.33 s sqrt(1 + slope^2), and likewise for the other edges.

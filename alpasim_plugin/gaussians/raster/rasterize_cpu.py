@@ -191,7 +191,7 @@ def node_poses(
 
 
 def _all_rigid(T: F64) -> bool:
-    """Tell whether all of ``(N, 4, 4)`` pass `require_rigid`."""
+    """Return whether all of ``(N, 4, 4)`` pass `require_rigid`."""
     gram = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     return bool(
         np.all(np.abs(gram - np.eye(3)) <= 1e-5)

@@ -1,6 +1,7 @@
 """Render splats for training: one `torch.autograd.Function` whose forward and backward passes are compiled CPU kernels.
 
-On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.gradient_gsplat`). `rasterize_torch` is the readable twin.
+On a GPU the same function goes through gsplat (`alpasim_plugin.gaussians.raster.gradient_gsplat`). `rasterize_torch` is the
+reference implementation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Render on a GPU through gsplat, where it works.
 
-That gsplat imports proves little: it compiles CUDA code on first use. The backend therefore draws one Gaussian first and checks the
-result. Nothing here falls back to another backend: the caller asked for the GPU and is told what is missing.
+gsplat compiles CUDA code on first use, so a successful import does not show that it works. The backend first draws one Gaussian and checks
+the result. It never falls back to another backend; the error says what is missing.
 
 State of testing: the arguments and results have been checked against a stand-in for gsplat on the CPU; the path has not been run on a GPU.
 Known difference: gsplat up to 1.5.3 saturates alpha at 0.999, this package and gsplat 1.6 at 0.99.
@@ -130,7 +130,7 @@ def rasterize_gsplat(
     """Render a cloud on the GPU.
 
     Raises:
-        InputError: The cloud cannot be drawn, or ``lod_px`` is asked for, which gsplat does not offer with the same meaning.
+        InputError: The cloud cannot be drawn, or ``lod_px`` is given, which gsplat does not support with this meaning.
         RendererError: gsplat does not work here.
     """
     if lod_px:

@@ -1,4 +1,4 @@
-"""Composite Gaussians in float64, one after the other, with nothing clever: the twin that the fast backends are held against.
+"""Composite Gaussians in float64, one after the other: the reference implementation for the fast backends.
 
 Kerbl et al., 3D Gaussian Splatting (2023), with the constants of `alpasim_plugin.gaussians.constants`.
 """

@@ -177,7 +177,7 @@ def _rotations(quats: Tensor) -> Tensor:
 
 
 def sh_colours_torch(sh: Tensor, directions: Tensor) -> Tensor:
-    """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` along unit directions ``(N, 3)``; the torch twin of `sh_colours`."""
+    """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` along unit directions ``(N, 3)``, as `sh_colours` does."""
     x, y, z = directions.unbind(1)
     xx, yy, zz = x * x, y * y, z * z
     terms = [torch.full_like(x, C0)]

@@ -1,4 +1,4 @@
-"""Sixteen-lane vectors for numba kernels, so that hot loops use the machine's vector unit by construction, not by luck.
+"""Sixteen-lane vectors for numba kernels, so that hot loops use the machine's vector unit without relying on the auto-vectoriser.
 
 Numba's automatic vectoriser gives up on loops with many arrays. These types lower to LLVM's portable ``<16 x float>`` (and double, and
 bool) values, which LLVM maps to one AVX-512 register, two AVX2 registers or four NEON registers. Arithmetic follows IEEE rules (no
@@ -207,7 +207,7 @@ def negative(typingctx, a):
 
 @intrinsic
 def select(typingctx, mask, yes, no):
-    """Return lanes of ``yes`` where the mask is set, of ``no`` elsewhere; NaN in the lanes not chosen does no harm."""
+    """Return lanes of ``yes`` where the mask is set, of ``no`` elsewhere; NaN in a lane not chosen is discarded."""
 
     def codegen(context, builder, sig, args):
         return builder.select(*args)

@@ -62,7 +62,7 @@ def build_actor(actor: Actor, scene_id: str, seed: int) -> SceneNode:
 
 
 def _shadow(box: Box, label: str) -> GaussianCloud:
-    """Lay a soft dark patch on the ground below: without it a body floats."""
+    """Place a soft contact shadow on the ground below."""
     wheels = label in ("car", "truck", "bus")
     n = max(1, round(box.length_m / 1.2)) if wheels else 1
     x = ((np.arange(n) + 0.5) / n - 0.5) * box.length_m
@@ -72,7 +72,7 @@ def _shadow(box: Box, label: str) -> GaussianCloud:
 
 
 def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
-    """Skin a loft and hang wheels, lights and plates on it."""
+    """Cover a loft with Gaussians and add wheels, lights and plates."""
     length, width, height = box.length_m, box.width_m, box.height_m
     corners, rgb, gloss = loft.quads(body, GLASS_RGB)
     scale = np.array([length, width, height])

@@ -47,7 +47,7 @@ class Houses(NamedTuple):
 
 
 class _Walls(NamedTuple):
-    """Walls of all houses, plan coordinates."""
+    """Walls of all houses, ground coordinates."""
 
     start: F64  # (W, 2)
     end: F64  # (W, 2); outward is to the right of start to end

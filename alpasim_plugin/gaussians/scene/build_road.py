@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.scene.ground_texture import KERB_M, GroundTexture, paint_ground
 from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
-from alpasim_plugin.gaussians.scene.plan_image import KERB_M, PlanImage, paint_plan
 from alpasim_plugin.gaussians.scene.site import Site
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, THICKNESS, cloud_of, grid_cells, quats_along, upright_quats
 from alpasim_plugin.types import F32, F64, I64, Bool
@@ -32,8 +32,8 @@ PAINT_RGB = {WHITE: (0.88, 0.88, 0.86), YELLOW: (0.86, 0.66, 0.16)}
 def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
     """Return the ground's nodes: fine tiles along the path, coarse ones around, and the paint strokes."""
     fine_tiles = _corridor(site)
-    fine = paint_plan(site, strokes, FINE_M, _window(site, fine_tiles, FINE_M))
-    coarse = paint_plan(site, strokes, COARSE_M, None)
+    fine = paint_ground(site, strokes, FINE_M, _window(site, fine_tiles, FINE_M))
+    coarse = paint_ground(site, strokes, COARSE_M, None)
     nodes = _ground_nodes(site, "ground", fine, fine_tiles, TILE_M, (0, 1, 2, 3), keep_inside=True)
     nodes += _ground_nodes(site, "far-ground", coarse, fine_tiles, FAR_TILE_M, (0, 1, 2), keep_inside=False)
     return nodes + _stroke_nodes(site, strokes) + _surroundings(site)
@@ -57,7 +57,7 @@ def _window(site: Site, tiles: Bool, cell_m: float) -> tuple[int, int, int, int]
 
 
 def _ground_nodes(
-    site: Site, name: str, image: PlanImage, fine_tiles: Bool, tile_m: float, floors: tuple[int, ...], keep_inside: bool
+    site: Site, name: str, image: GroundTexture, fine_tiles: Bool, tile_m: float, floors: tuple[int, ...], keep_inside: bool
 ) -> list[SceneNode]:
     means = _pyramid(image.rgb)
     heights = _pyramid(image.height[:, :, None])
@@ -96,7 +96,7 @@ def _pyramid(image: F32) -> list[F32]:
 
 
 def _leaves(level: I64, floor: int) -> list[Bool | None]:
-    """Return per quadtree level which squares are leaves: the largest ones in which no cell asks for a smaller square."""
+    """Return per quadtree level which squares are leaves: the largest ones in which no cell needs a smaller square."""
     can: list[Bool] = []
     least = level
     for k in range(MAX_LEVEL + 1):

@@ -7,8 +7,8 @@ import numpy as np
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.scene.contours import contours, places
+from alpasim_plugin.gaussians.scene.ground_texture import KERB_M
 from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.scene.plan_image import KERB_M
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
 from alpasim_plugin.geometry import arc_lengths, resample
@@ -39,7 +39,7 @@ def _nodes(site: Site, name: str, items: list[Item]) -> list[SceneNode]:
 
 
 def _kerbs(site: Site) -> list[Item]:
-    """Stand a stone along the road's edge: a face towards the road and a top."""
+    """Place a kerb along the road's edge: a face towards the road and a top."""
     items: list[Item] = []
     lines = contours(site, 0.0, 60.0)
     for cell_m, step in ((0.25, 0.5), (0.7, 1.0), (1.6, 2.0)):
@@ -65,7 +65,7 @@ def _kerbs(site: Site) -> list[Item]:
 
 
 def _rails(site: Site) -> list[Item]:
-    """Run a guard rail along a fast road."""
+    """Place a guard rail along a highway."""
     items: list[Item] = []
     lines = contours(site, 1.2, 60.0)
     for cell_m, step in ((0.3, 1.0), (0.9, 2.0), (2.0, 4.0)):
@@ -89,7 +89,7 @@ def _rails(site: Site) -> list[Item]:
 
 
 def _trees(site: Site, houses: Houses) -> list[Item]:
-    """Plant street trees along the road and woods where no houses stand."""
+    """Place street trees along the road and woods where there are no houses."""
     per_100m = site.scenario.environment.trees_per_100m
     if per_100m <= 0:
         return []
@@ -187,7 +187,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     starts = [foot, top, *[p[:-1] for p in mapped]]
     ends = [top, tip, *[p[1:] for p in mapped]]
     start, end = np.concatenate(starts), np.concatenate(ends)
-    owner = np.concatenate([at, at, *[site.frame.to_plan(p[:-1]) for p in mapped]])
+    owner = np.concatenate([at, at, *[site.frame.to_ground(p[:-1]) for p in mapped]])
     items: list[Item] = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         length = np.linalg.norm(end - start, axis=1)
@@ -201,7 +201,7 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
 
 
 def _signs(site: Site) -> list[Item]:
-    """Hang the map's signs: a coloured plate with a pale rim, and a post down to the ground where it is near."""
+    """Place the map's signs: a coloured plate with a pale rim, and a post down to the ground where it is near."""
     signs = site.scenario.lane_map.signs
     if not signs:
         return []
@@ -221,11 +221,11 @@ def _signs(site: Site) -> list[Item]:
             corners.append(local @ T[:3, :3].T + T[:3, 3])
             rgbs.append(rgb)
             at.append(T[:2, 3])
-        foot = site.world(site.frame.to_plan(T[None, :2, 3]))[0]
+        foot = site.world(site.frame.to_ground(T[None, :2, 3]))[0]
         if 0.5 < T[2, 3] - foot[2] < 4.5:
             feet.append(foot)
             tops.append(T[:3, 3])
-    plan = site.frame.to_plan(np.array(at))
+    plan = site.frame.to_ground(np.array(at))
     items: list[Item] = []
     for cell_m, size in ((0.12, 0.15), (0.4, 0.5)):
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
@@ -233,6 +233,6 @@ def _signs(site: Site) -> list[Item]:
         if feet:
             posts = rods(np.stack(feet), np.stack(tops), 0.04, np.tile([0.45, 0.46, 0.47], (len(feet), 1)), 3.0)
             clouds.append(posts)
-            where.append(site.frame.to_plan(posts.means.astype(np.float64)))
+            where.append(site.frame.to_ground(posts.means.astype(np.float64)))
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(where)))
     return items

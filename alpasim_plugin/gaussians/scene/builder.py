@@ -1,4 +1,4 @@
-"""Dress a scenario in Gaussians: one call from a map, tracks and an environment to a scene graph."""
+"""Build a scene graph of Gaussians from a map, tracks and an environment."""
 
 from __future__ import annotations
 

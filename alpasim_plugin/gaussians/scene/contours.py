@@ -15,7 +15,7 @@ SMOOTH = 9  # points of the moving average that takes the raster's steps out of 
 
 
 class Roadside(NamedTuple):
-    """Places along a line beside the road, plan coordinates."""
+    """Places along a line beside the road, ground coordinates."""
 
     xy: F64  # (N, 2) metres
     along: F64  # (N, 2) unit, road on the left
@@ -23,7 +23,7 @@ class Roadside(NamedTuple):
 
 
 def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
-    """Return the lines ``(N, 2)`` where the distance to the road is ``beyond_m``, in plan coordinates, the road on their left.
+    """Return the lines ``(N, 2)`` where the distance to the road is ``beyond_m``, in ground coordinates, the road on their left.
 
     Args:
         site: What lies where.

@@ -1,4 +1,4 @@
-"""Stand in for a bad reconstruction: a seeded surrogate whose error grows with the distance from the logged path.
+"""Surrogate of a bad reconstruction: seeded errors that grow with the distance from the logged path.
 
 Nothing is trained here. A reconstruction from one drive is right where its cameras were and wrong elsewhere, and this module models the
 causes one by one (fact sheet on splatting, section 9): surfaces that no log camera saw are missing; depth along the log cameras' rays is
@@ -160,7 +160,7 @@ class Surrogate:
     def pose(self, actor_id: str, T_world_box: F64, t_us: int, seed: int, w: float) -> F64:
         """Return the pose at which the reconstruction puts an actor: tracks are a little off, and more so seen from aside."""
         s = self.amount.severity
-        off = wander(self.scenario.scene_id, seed, f"degrade/pose/{actor_id}", t_us, 3)
+        off = temporal_noise(self.scenario.scene_id, seed, f"degrade/pose/{actor_id}", t_us, 3)
         x, y = s * (0.03 + 0.22 * w) * off[0], s * (0.02 + 0.16 * w) * off[1]
         yaw = s * (0.008 + 0.05 * w) * off[2]
         move = se3([x, y, 0.0], [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
@@ -168,7 +168,7 @@ class Surrogate:
 
     def ghost_pose(self, actor_id: str, T_world_box: F64, t_us: int, seed: int, w: float) -> F64:
         """Return the pose of an actor's ghost: it trails behind along the actor's axis."""
-        late = 0.35 + 0.9 * w + 0.25 * float(wander(self.scenario.scene_id, seed, f"degrade/ghost/{actor_id}", t_us, 1)[0])
+        late = 0.35 + 0.9 * w + 0.25 * float(temporal_noise(self.scenario.scene_id, seed, f"degrade/ghost/{actor_id}", t_us, 1)[0])
         move = np.eye(4)
         move[0, 3] = -self.amount.severity * late
         return np.asarray(self.pose(actor_id, T_world_box, t_us, seed, w) @ move)
@@ -176,7 +176,7 @@ class Surrogate:
     def gain(self, t_us: int, seed: int, w: float) -> F32:
         """Return the factors ``(3,)`` of this frame's exposure and white balance."""
         s = self.amount.severity
-        off = wander(self.scenario.scene_id, seed, "degrade/exposure", t_us, 4)
+        off = temporal_noise(self.scenario.scene_id, seed, "degrade/exposure", t_us, 4)
         return np.asarray(np.exp(s * ((0.02 + 0.07 * w) * off[0] + (0.006 + 0.022 * w) * off[1:])), dtype=np.float32)
 
     def _rays(self, means: F64) -> tuple[F64, F64, F64]:
@@ -211,8 +211,8 @@ def extended(path: F64, quat: F64, by_m: float = 200.0) -> F64:
     return np.concatenate([[path[0] + by_m * start / np.linalg.norm(start)], path[keep], [path[-1] + by_m * stop / np.linalg.norm(stop)]])
 
 
-def wander(scene_id: str, seed: int, component: str, t_us: int, n: int) -> F64:
-    """Return ``(n,)`` numbers of about unit spread that wander with time and depend on nothing but the key and ``t_us``."""
+def temporal_noise(scene_id: str, seed: int, component: str, t_us: int, n: int) -> F64:
+    """Return ``(n,)`` numbers of about unit spread that vary with time and depend on nothing but the key and ``t_us``."""
     knot, part = divmod(int(t_us), KNOT_US)
     f = part / KNOT_US
     return _knot(scene_id, seed, component, knot, n) * (1 - f) + _knot(scene_id, seed, component, knot + 1, n) * f
@@ -224,7 +224,7 @@ def _knot(scene_id: str, seed: int, component: str, knot: int, n: int) -> F64:
 
 
 def _wave(at: F64, scenario: Scenario, component: str) -> F32:
-    """Return a smooth random field of about unit spread at plan points ``(N, 2)``: waves of 3 to 12 m in random directions."""
+    """Return a smooth random field of about unit spread at ground points ``(N, 2)``: waves of 3 to 12 m in random directions."""
     rng = stream(scenario.scene_id, scenario.seed, component)
     x, y = at.astype(np.float32).T
     total = np.zeros(len(at), dtype=np.float32)

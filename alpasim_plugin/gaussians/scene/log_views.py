@@ -1,4 +1,4 @@
-"""Remember what the log's cameras saw, to know which Gaussians a reconstruction could have learned."""
+"""Depth seen by the log's cameras: which Gaussians a reconstruction could have learned."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LogView:
 
 
 class LogViews:
-    """All log views, asked at once."""
+    """All log views, queried at once."""
 
     def __init__(self, views: Sequence[LogView]) -> None:
         self.views = tuple(views)

@@ -1,4 +1,4 @@
-"""What builders hand to the scene graph: named clouds at several levels of detail."""
+"""Scene-graph nodes: named clouds at several levels of detail."""
 
 from __future__ import annotations
 

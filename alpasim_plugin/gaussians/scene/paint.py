@@ -32,7 +32,7 @@ WHITE, YELLOW = 0, 1
 
 
 class Strokes(NamedTuple):
-    """Straight pieces of paint in plan coordinates."""
+    """Straight pieces of paint in ground coordinates."""
 
     start: F64  # (M, 2) metres
     end: F64  # (M, 2)
@@ -42,7 +42,7 @@ class Strokes(NamedTuple):
 
 @dataclass(frozen=True)
 class _Edge:
-    """One edge of one lane, plan coordinates, in driving direction."""
+    """One edge of one lane, ground coordinates, in driving direction."""
 
     lane_id: str
     side: int  # +1 left, -1 right
@@ -57,9 +57,9 @@ def paint_strokes(site: Site) -> Strokes:
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
     lines = [edge for edge in _painted_edges(site) if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)]
     pieces = [_line_strokes(line, paint, phase) for line, paint, phase in _with_phase(lines)]
-    pieces += [_zebra(site.frame.to_plan(ring)) for ring in lane_map.crosswalks]
+    pieces += [_zebra(site.frame.to_ground(ring)) for ring in lane_map.crosswalks]
     for stop in lane_map.stop_lines:
-        line = site.frame.to_plan(stop)
+        line = site.frame.to_ground(stop)
         if len(line) > 1:
             pieces.append(_strokes(line[:-1], line[1:], STOP_LINE_M, WHITE))
     pieces = [p for p in pieces if len(p.start)]
@@ -78,11 +78,11 @@ def _painted_edges(site: Site) -> list[tuple[F64, Paint]]:
     for marking in lane_map.markings:
         if len(marking.xyz) > 1:
             paint: Paint = "solid_white" if marking.paint == "unknown" else marking.paint
-            edges.append(_Edge("", 0, site.frame.to_plan(marking.xyz), paint, False))
+            edges.append(_Edge("", 0, site.frame.to_ground(marking.xyz), paint, False))
     for lane in (lane_map.lanes[k] for k in sorted(lane_map.lanes)):
         for side, line, paint in ((1, lane.left, lane.left_paint), (-1, lane.right, lane.right_paint)):
             if line is not None and len(line) > 1 and lane.kind != "parking":
-                edges.append(_Edge(lane.lane_id, side, site.frame.to_plan(line), paint, lane.is_intersection))
+                edges.append(_Edge(lane.lane_id, side, site.frame.to_ground(line), paint, lane.is_intersection))
     edges = [e for e in edges if arc_lengths(e.line)[-1] > 0.5]
     if not edges:
         return []

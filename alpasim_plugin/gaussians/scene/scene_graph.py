@@ -102,10 +102,6 @@ class SceneGraph:
         stats = {**out.stats, "nodes": len(chosen), "nodes_total": len(self.background) + len(actor_poses)}
         return replace(out, alpha=np.ones_like(out.alpha) if sky_in_alpha else out.alpha, stats=stats)
 
-    def cloud_for(self, camera: PinholeCamera, actor_poses: Mapping[str, F64]) -> GaussianCloud:
-        """Return what `render` draws as one cloud in world coordinates: the slow twin of the prepared path."""
-        return self._joined(self._choose(camera, actor_poses))
-
     def changed(self, change: Change, more_actors: Sequence[SceneNode], cell_px: float) -> SceneGraph:
         """Return a variant of the scene with other clouds in the same nodes, and further actors.
 

@@ -1,4 +1,4 @@
-"""Tell sky from holes in a reconstruction: where the cameras of the logged drive saw sky, a transparent pixel is nothing missing.
+"""Separate sky from holes in a reconstruction: where cameras of the logged drive saw sky, a transparent pixel is not a hole.
 
 Alpha alone cannot: it is zero in the open sky and zero where a reconstruction has nothing to show. Pipelines on recorded drives fill the
 sky from segmented log images (OneFixer, App. A). Here the log views' own alpha is that segmentation. The sky is far away, so a view of

@@ -1,4 +1,4 @@
-"""Turn surfaces into flat Gaussians: the brush that every part of a built scene is painted with.
+"""Turn surfaces into flat Gaussians (surfels), of which every built scene consists.
 
 A rectangle is covered by a grid of flat Gaussians with a standard deviation of `SPREAD` cells. At 0.64 cells the weakest point of the grid
 (a cell corner) still accumulates an opacity of about 0.97 while the outline stays within a quarter of a cell of the true edge.

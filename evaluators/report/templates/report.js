@@ -55,11 +55,11 @@
   }
 
   // Legend: show or hide one renderer's drives in every map.
-  for (const toggle of all("button[data-arm]")) {
+  for (const toggle of all("button[data-variant]")) {
     toggle.addEventListener("click", () => {
       const shown = toggle.getAttribute("aria-pressed") !== "true";
       toggle.setAttribute("aria-pressed", String(shown));
-      document.getElementById("views").classList.toggle("no-arm-" + toggle.dataset.arm, !shown);
+      document.getElementById("views").classList.toggle("no-variant-" + toggle.dataset.variant, !shown);
     });
   }
 

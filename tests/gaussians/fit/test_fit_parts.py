@@ -23,6 +23,7 @@ from alpasim_plugin.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_db, s
 from alpasim_plugin.seeding import stream
 from tests.gaussians.fit.conftest import BOX, FAR, HEIGHT, WIDTH, Posed, actor_pose
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
+from tests.gaussians.gradient_scenes import cloud_of
 
 
 def images() -> tuple[torch.Tensor, torch.Tensor]:
@@ -115,7 +116,7 @@ def test_an_actor_is_placed_as_a_moved_cloud_is() -> None:
     splats, rows = model.placed(model.motion({"car": T, "stranger": T}), 16)
     wanted = GaussianCloud.concatenate([ground, car.transformed(T)])
     assert rows.tolist() == list(range(35)), "background and car, without what is not there"
-    found = splats.to_cloud()
+    found = cloud_of(splats)
     assert np.allclose(found.means, wanted.means, atol=1e-5)
     assert np.allclose(found.covariances(), wanted.covariances(), atol=1e-5)
     assert np.allclose(found.sh, wanted.sh, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Paint the plan of a scene as an image: the colour of the ground, its height over the road, and how fine it must be sampled."""
+"""Paint the ground seen from above as an image: its colour, its height over the road, and how fine it must be sampled."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ FORECOURT_M = 6.5  # paved or planted strip up to the facades
 
 
 @dataclass(frozen=True)
-class PlanImage:
-    """The painted plan; cell (i, j) has its centre at ``low + (j + 0.5, i + 0.5) * cell_m`` in plan coordinates.
+class GroundTexture:
+    """The painted ground; cell (i, j) has its centre at ``low + (j + 0.5, i + 0.5) * cell_m`` in ground coordinates.
 
     Attributes:
         cell_m: Metres.
-        low: ``(2,)`` plan coordinates of the corner.
+        low: ``(2,)`` ground coordinates of the corner.
         rgb: ``(H, W, 3)`` 0..1.
         height: ``(H, W)`` metres above the road's surface: a kerb's height beside the road, a little below zero around paint.
         level: ``(H, W)`` the largest square that may stand for the cell is ``cell_m * 2**level``.
@@ -40,8 +40,8 @@ class PlanImage:
     level: I64
 
 
-def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, int, int, int] | None) -> PlanImage:
-    """Paint the plan.
+def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, int, int, int] | None) -> GroundTexture:
+    """Paint the ground.
 
     Args:
         site: What lies where.
@@ -66,7 +66,7 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
     rgb[:] = _verge(site, off, grain, texture)
     tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
     rgb[road] = (np.array(ASPHALT, dtype=np.float32) * tone[..., None])[road]
-    # Next to the crisp strokes laid over them, cells half covered by a thin line would show as teeth along it.
+    # Cells half covered by a thin line would alias along the crisp strokes laid over them.
     thinnest = 0.3 if cell_m < CELL_M else 0.0
     covers = [_coverage(strokes, colour, low, cell_m, (rows, columns), thinnest) for colour in (WHITE, YELLOW)]
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
@@ -88,7 +88,7 @@ def paint_plan(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, i
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
     trench = (near_paint < TRENCH_M) & (edge > TRENCH_M)  # not at the kerb's foot: a gap would open there
     height = np.where(road, np.where(trench, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
-    return PlanImage(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
+    return GroundTexture(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
 
 
 def _sampled(raster: F32, site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
@@ -132,7 +132,7 @@ def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
     for lane in site.scenario.lane_map.lanes.values():
         if lane.kind not in ("vehicle", "bus") or lane.is_intersection or len(lane.centre) < 2:
             continue
-        line = site.frame.to_plan(lane.centre)
+        line = site.frame.to_ground(lane.centre)
         if np.any(line.max(axis=0) < low) or np.any(line.min(axis=0) > high):
             continue
         d = np.gradient(line, axis=0)

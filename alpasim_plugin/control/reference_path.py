@@ -1,4 +1,4 @@
-"""A plan as the tracker sees it: a path over signed arc length, and the arc length over time."""
+"""A plan as the reference of the tracker: a path over signed arc length, and the arc length over time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferencePath:
     """A plan in coordinates around ``origin``; arc length is signed: it falls where the plan drives backwards."""
 
     t_s: F64  # (T,) seconds after the state's time
@@ -45,7 +45,7 @@ class Reference:
         return float(s[k] + np.clip((xy - foot[0]) @ along, -window_m / 20, window_m / 20))
 
 
-def build_reference(plan: Trajectory, t_us: int, origin_xy: F64) -> Reference:
+def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> ReferencePath:
     """Read a checked plan relative to a time and a place.
 
     A step counts by its component along the pose's heading, so noise on a standing plan adds up to nothing instead of to a speed.
@@ -72,4 +72,4 @@ def build_reference(plan: Trajectory, t_us: int, origin_xy: F64) -> Reference:
         path_xy = np.stack([xy[0] - heading[0], xy[0] + heading[0]])
     elif sign < 0:
         path_s, path_xy = path_s[::-1], path_xy[::-1]
-    return Reference((plan.t_us - t_us).astype(np.float64) * 1e-6, s, path_s, path_xy)
+    return ReferencePath((plan.t_us - t_us).astype(np.float64) * 1e-6, s, path_s, path_xy)

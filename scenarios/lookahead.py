@@ -1,4 +1,4 @@
-"""Seeing who will come into the expert's corridor: scripted tracks as they are written, reactive cars at their present speed."""
+"""Predict who will enter the expert's corridor: scripted tracks as written, reactive cars at constant speed."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ STANDING_M = 0.05  # a track that never moves farther than this stands
 
 
 @dataclass(frozen=True)
-class Script:
-    """A track that reacts to nobody."""
+class ScriptedTrack:
+    """A track that does not react to others."""
 
     track: Trajectory
     box: Box
 
 
-class ScriptTable:
+class ScriptedTracks:
     """Poses of all scripted tracks on a time grid; those that never move apart.
 
     Args:
         scripts: Tracks.
-        end_us: Last time that will be asked for, before the look-ahead.
+        end_us: Last queried time, before the look-ahead.
         step_us: Grid.
     """
 
-    def __init__(self, scripts: Sequence[Script], end_us: int, step_us: int) -> None:
+    def __init__(self, scripts: Sequence[ScriptedTrack], end_us: int, step_us: int) -> None:
         self.step_us = step_us
         self.times = np.arange(0, end_us + int(LOOKAHEAD_S[-1] * 1e6) + step_us, step_us, dtype=np.int64)
         still = [s for s in scripts if np.ptp(s.track.xyz[:, :2], axis=0).max() < STANDING_M and s.track.t_us[-1] >= end_us]
@@ -81,7 +81,7 @@ class ScriptTable:
 
 
 @dataclass(frozen=True)
-class Ahead:
+class PredictedBodies:
     """Road users now (first row) and after each time of `LOOKAHEAD_S`."""
 
     xy: F64  # (1 + n, K, 2)
@@ -92,7 +92,7 @@ class Ahead:
     yields: Bool  # (K,) reactive: it lets the ego go first when it is behind
 
 
-def foresee(path: Path, front_s: float, speed_mps: float, box: Box, ahead: Ahead, min_gap_m: float) -> float:
+def yielding_acceleration(path: Path, front_s: float, speed_mps: float, box: Box, ahead: PredictedBodies, min_gap_m: float) -> float:
     """Return the largest acceleration that keeps behind everyone who will come into the corridor; infinite without such a one.
 
     For a body that will be in the corridor after ``tau`` seconds with its rear at ``r``, the own front must then not be beyond
