@@ -1,6 +1,6 @@
-"""Monte-Carlo study of the intervals: coverage and power on synthetic rollouts, and the tables of docs/experiments/interval-coverage.md.
+"""Monte-Carlo study of the intervals: coverage and power on synthetic rollouts, and the tables of docs/statistics.md.
 
-``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write docs/experiments/interval-coverage.md`` writes them between marks.
+``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write docs/statistics.md`` puts them between their markers.
 
 The model: a rollout has the event if scene effect + run noise, both normal, falls below the threshold that gives the wanted rate. The
 scene's share of the variance is the within-scene correlation. Two renderers share 90 % of the scene effect, and the run noise with

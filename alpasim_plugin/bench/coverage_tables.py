@@ -1,4 +1,4 @@
-"""The tables of docs/experiments/interval-coverage.md, from the study."""
+"""The tables of docs/statistics.md, from the study."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The form is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to unit length over the channels, squared
 difference, a non-negative weight per channel, mean over the picture, sum over the stages. Its values are its own: they cannot be compared
-with published LPIPS numbers. docs/perceptual-syn.md says how it was trained and what it was checked against.
+with published LPIPS numbers. docs/video-metrics.md says how it was trained and what it was checked against.
 """
 
 from __future__ import annotations
