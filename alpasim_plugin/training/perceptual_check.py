@@ -68,7 +68,7 @@ def shift_one_px(frames: F32) -> list[F32]:
 
 
 def check(distance: ArrayDistance, frames: F32, renders: F32 | None = None, seed: int = 0) -> dict[str, Any]:
-    """Return what docs/perceptual-syn.md shows of a distance.
+    """Return what docs/video-metrics.md shows of a distance.
 
     Args:
         distance: Of pictures.

@@ -28,7 +28,7 @@ OUT = Path(__file__).resolve().parents[1] / "img" / "degradation.png"
 
 
 def main() -> None:
-    """Run the measurements asked for."""
+    """Run the requested measurements."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("scenarios", nargs="*", default=list(SHIPPED))
     parser.add_argument("--speed", action="store_true", help="measure time per frame instead of drawing the figure")
