@@ -37,7 +37,7 @@ def refine(
     source: Annotated[Path, typer.Argument(metavar="IN.mp4", help="Any video: any size, frame rate and length.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4).")],
     opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey video, white where the input is reliable; else all is.")] = None,
-    sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Video of the semantic map (docs/conditioning.md).")] = None,
+    sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Video of the semantic map (docs/semantic-map.md).")] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer-tiny",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixer's noise.")] = 0,

@@ -20,7 +20,7 @@ MARGIN_M = 60.0  # road beyond what the ego drives
 
 
 def draw_spec(family: str, scene_id: str, seed: int, duration_s: float) -> Spec:
-    """Return a scenario specification (docs/scenarios.md) of a family.
+    """Return a scenario specification (docs/scenario-files.md) of a family.
 
     Args:
         family: One of `TRAIN_FAMILIES` or `TEST_FAMILIES`.

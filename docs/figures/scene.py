@@ -15,8 +15,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.image_metrics import psnr_db
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.types import F64, U8, Renderer, RenderRequest, Scenario
+from alpasim_plugin.types import F64, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
 
 SURROGATE = ("degradation.kind=surrogate",)
@@ -27,7 +28,7 @@ OUT = Path(__file__).resolve().parents[1] / "img" / "degradation.png"
 
 
 def main() -> None:
-    """Run the measurements asked for."""
+    """Run the requested measurements."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("scenarios", nargs="*", default=list(SHIPPED))
     parser.add_argument("--speed", action="store_true", help="measure time per frame instead of drawing the figure")
@@ -55,11 +56,6 @@ def requests(scenario: Scenario, size: tuple[int, int], lateral_m: float, n: int
         actors = {a.actor_id: interpolate(a.track, t_us) for a in scenario.actors if a.track.t_us[0] <= t_us <= a.track.t_us[-1]}
         out.append(RenderRequest(int(t_us), camera, np.stack([T, T]), actors))
     return out
-
-
-def psnr_db(a: U8, b: U8) -> float:
-    """Return the peak signal-to-noise ratio of two 8-bit images."""
-    return float(10 * np.log10(255.0**2 / np.mean((a.astype(np.float64) - b) ** 2)))
 
 
 def degradation_curve(scenario: Scenario, clean: Renderer, bad: Renderer, n: int = 8) -> F64:

@@ -1,4 +1,4 @@
-"""Drive the held-out scenes behind three renderers and put the tables into docs/results.md.
+"""Drive the held-out scenes behind three renderers and put the tables into docs/experiments/fixer-closed-loop.md.
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:2] [--set KEY=VALUE]...
 
@@ -24,7 +24,7 @@ SHOWN = ("collision_at_fault", "offroad", "offroad_or_collision_at_fault", "rout
 
 
 def drive(out: Path, arguments: list[str]) -> dict[str, Any]:
-    """Run simrun and return its summary; a verdict, good, bad or open, is a result."""
+    """Run simrun and return its summary; a verdict, whatever it is, is a result."""
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", *arguments, "--out", str(out)]
     code = subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode
     if code not in (0, *VERDICTS):
@@ -75,7 +75,7 @@ def family(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run what is not there yet and fill in the page."""
+    """Run what is missing and fill in the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
@@ -94,7 +94,7 @@ def main() -> None:
         rows = pq.read_table(given.runs / policy / "rollouts.parquet").to_pylist()
         head = f"**{policy}**: {len(scenes)} scenes x {seeds or '5'} seeds"
         parts.append("\n\n".join((head, table(summary), families(rows))))
-    page = DOCS / "results.md"
+    page = DOCS / "experiments" / "fixer-closed-loop.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
 
 

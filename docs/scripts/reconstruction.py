@@ -1,4 +1,4 @@
-"""Fit scenarios with several recipes and print docs/reconstruction.md's table; draw its picture.
+"""Fit scenarios with several recipes and print docs/experiments/reconstruction.md's table; draw its picture.
 
 python docs/scripts/reconstruction.py [--recipes NAME...] [--picture FILE] SCENARIO...
 python docs/scripts/reconstruction.py            without a scenario: time of the similarity and its gradient, and their error

@@ -1,9 +1,9 @@
-"""Make the pictures and tables of docs/results.md.
+"""Make the pictures and tables of docs/experiments/clean-and-3dgs.md.
 
     python docs/scripts/results.py DATA [RUNS]
 
 DATA is the folder of third-party data sets (av2, commonroad, cosmos-drive-dreams); RUNS (default: runs/results) keeps the run folders, so a
-second call continues an interrupted first one. Pictures go to docs/img/, tables replace what stands between the markers of docs/results.md.
+second call continues an interrupted first one. Pictures go to docs/img/, tables between the page's markers.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def replace(text: str, marker: str, content: str) -> str:
     """Replace what stands between a marker's two comments."""
     pattern = re.compile(rf"(<!-- begin {marker} -->\n).*?(<!-- end {marker} -->)", re.S)
     if not pattern.search(text):
-        raise SystemExit(f"docs/results.md has no marker {marker}")
+        raise SystemExit(f"the page has no marker {marker}")
     return pattern.sub(lambda match: f"{match[1]}{content}\n{match[2]}", text)
 
 
@@ -158,7 +158,7 @@ def main() -> None:
     scenes = list(dict.fromkeys(row["scene"] for row in pq.read_table(runs / "real" / "rollouts.parquet").to_pylist()))
     for name, scene in zip(given, scenes, strict=True):
         picture(runs / "real", scene, DOCS / "img" / f"drive-{name}.jpg")
-    page = DOCS / "results.md"
+    page = DOCS / "experiments" / "clean-and-3dgs.md"
     text = page.read_text()
     text = replace(text, "real", table(real) + "\n\n" + scene_table(runs / "real"))
     text = replace(text, "replay", scene_table(runs / "replay"))

@@ -17,7 +17,7 @@ BLOCK = 4_000_000  # drawn scenes held in memory at once
 def cluster_bootstrap(values: npt.ArrayLike, clusters: Sequence[str] | I64, generator: np.random.Generator, draws: int = DRAWS) -> Interval:
     """Return the percentile interval of the mean over scenes.
 
-    Too short where scenes are few (docs/statistics.md); it is a second opinion that assumes no shape, not the default.
+    Too short where scenes are few (docs/experiments/interval-coverage.md); it is a second opinion that assumes no shape, not the default.
 
     Args:
         values: ``(N,)``.

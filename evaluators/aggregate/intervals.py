@@ -1,8 +1,8 @@
 """Intervals of a mean over rollouts, at 95 %.
 
 `normal_half_width` is the paper's formula. It treats the seeds of one scene as independent, which makes it too short where scenes differ;
-`clustered` takes the scene as the unit. A quantity that does not exist is None and comes with a reason. docs/statistics.md holds the
-measured coverage of each.
+`clustered` takes the scene as the unit. A quantity that does not exist is None and comes with a reason. The measured
+coverage of each is in docs/experiments/interval-coverage.md.
 """
 
 from __future__ import annotations

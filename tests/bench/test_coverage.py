@@ -1,4 +1,7 @@
-"""Coverage and power by simulation: 95 % intervals must hold the truth in 93 to 97 % of runs. docs/statistics.md has the full grid."""
+"""Coverage and power by simulation: 95 % intervals must hold the truth in 93 to 97 % of runs.
+
+The full grid is in docs/experiments/interval-coverage.md.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from functools import cache
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 MAX_LINES = 200
+PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios")
 RECORDS = "experiments"  # records of experiments may be longer
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 MENTION = re.compile(r"\bdocs/[\w./-]+\.(?:md|png|jpg|py)\b")
@@ -83,3 +85,27 @@ def test_every_picture_is_shown(repo: Path, pages: list[Path]) -> None:
     shown = {file for page in pages for file, _ in local_links(page)}
     pictures = [path for path in (repo / "docs").rglob("*") if path.suffix in (".png", ".jpg")]
     assert [path.name for path in pictures if path.resolve() not in shown] == []
+
+
+def test_files_that_pages_name_exist(repo: Path, pages: list[Path]) -> None:
+    roots = (repo, repo / "alpasim_plugin", repo / "alpasim_plugin" / "gaussians", repo / "docs")
+    named = re.compile(r"\b([a-z][\w]*(?:/\w+)+\.(?:py|proto))\b")
+    missing = []
+    for page in pages:
+        code = re.findall(r"`([^`\n]+)`", without_code(page.read_text(encoding="utf-8")))
+        files = {file for text in code for file in named.findall(text)}
+        missing += [f"{page.relative_to(repo)}: {file}" for file in sorted(files) if not any((root / file).is_file() for root in roots)]
+    assert missing == []
+
+
+def test_python_examples_parse_and_import_what_exists(repo: Path, pages: list[Path]) -> None:
+    missing = []
+    for page in pages:
+        for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.S | re.M):
+            for node in ast.walk(ast.parse(block)):
+                if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+                    base = repo.joinpath(*node.module.split("."))
+                    file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+                    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+                    missing += [f"{page.name}: {node.module}.{a.name}" for a in node.names if not re.search(rf"\b{a.name}\b", text)]
+    assert missing == []

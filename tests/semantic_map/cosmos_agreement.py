@@ -5,7 +5,7 @@ The copy of the clip at hand has no camera extrinsics. The mounts in ``cosmos_mo
 compared.
 
     python -m tests.semantic_map.cosmos_agreement FOLDER            prints the table
-    python -m tests.semantic_map.cosmos_agreement FOLDER --pictures docs/img   makes the pictures of docs/conditioning.md
+    python -m tests.semantic_map.cosmos_agreement FOLDER --pictures docs/img   makes its pictures
     python -m tests.semantic_map.cosmos_agreement FOLDER --fit      estimates the mounts anew (minutes)
 
 FOLDER holds ``example`` and ``example_outputs`` of Cosmos-Drive-Dreams (CC-BY-4.0, (c) NVIDIA).
