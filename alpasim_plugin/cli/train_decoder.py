@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli import training_options as options
-from alpasim_plugin.training.decoder_finetune import PainterRecipe
-from alpasim_plugin.training.decoder_finetune_run import train_painter
+from alpasim_plugin.training.decoder_finetune import DecoderRecipe
+from alpasim_plugin.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.trainer import Schedule
 
@@ -40,8 +40,8 @@ def painter(
     options.use_threads(threads)
     progress = options.Progress(steps)
     distance = progress.perceptual_term(metric_weights) if perceptual else None
-    recipe = PainterRecipe(clips, rows, columns, perceptual_weight=perceptual, seed=seed)
+    recipe = DecoderRecipe(clips, rows, columns, perceptual_weight=perceptual, seed=seed)
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=0.99, save_every=max(steps // 20, 5))
     prepared = partial(progress.prepared, every=50)
-    path = train_painter(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update)
+    path = finetune_decoder(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update)
     progress.wrote(path, as_json)

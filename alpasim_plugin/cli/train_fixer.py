@@ -73,7 +73,7 @@ def train_fixer_command(
     """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
     del debug
     options.use_threads(threads)
-    chosen, progress = variant_of(variant).weighing(perceptual), options.Progress(steps)
+    chosen, progress = variant_of(variant).with_perceptual_weight(perceptual), options.Progress(steps)
     recipe = GeneratorRecipe(
         clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share, channels=channels
     )

@@ -13,8 +13,8 @@ import typer
 
 from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.image_distance import ImageDistance, load_distance
 from alpasim_plugin.nets.perceptual import load_perceptual
-from alpasim_plugin.nets.picture_distance import PictureDistance, load_distance
 from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.perceptual_check import ArrayDistance, check, check_frames
 from alpasim_plugin.types import F32, F64, U8
@@ -54,7 +54,7 @@ def named_distance(name: str) -> ArrayDistance:
     """Return a distance of arrays by name, or by file of weights."""
     if name == "ssim":
         return lambda a, b: 1 - ssim(_u8(a), _u8(b))
-    net: PictureDistance = load_perceptual(name) if name.endswith(".safetensors") else load_distance(name)
+    net: ImageDistance = load_perceptual(name) if name.endswith(".safetensors") else load_distance(name)
 
     def distance(a: F32, b: F32) -> F64:
         return picture_distances(net, _u8(a), _u8(b))

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import file_sha256
-from alpasim_plugin.nets.picture_distance import distance_for_training
+from alpasim_plugin.nets.image_distance import distance_for_training
 from alpasim_plugin.training.model_card import curves
 from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.trainer import LOG_FILE

@@ -1,4 +1,4 @@
-"""One transformer block and the final layer, each with its modulation or with the modulation folded into its weights."""
+"""The transformer block and the final layer, with adaLN modulation or with the modulation folded into the weights."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ class Block(nn.Module):
         self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
         self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
 
-    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, look: Attend) -> Tensor:
-        """Advance the stream by one block.
+    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend) -> Tensor:
+        """Apply the block.
 
         Args:
             x: ``(B, T, N, width)``.
             time: Time signal; None once folded.
             text: Cross-attention keys and values of this block.
             table: Rotation of the block's tokens.
-            look: Self-attention with whatever past it holds.
+            attention: Self-attention with the cached past.
         """
-        x = residual(x, lambda n: self.self_attn(n, table, look), _modulation(self.adaln_modulation_self_attn, time))
+        x = residual(x, lambda n: self.self_attn(n, table, attention), _modulation(self.adaln_modulation_self_attn, time))
         x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
         return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
 
     def fold(self, time: TimeSignal) -> None:
-        """Move the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
+        """Fold the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
         attn, cross, mlp = self.self_attn, self.cross_attn, self.mlp
         shift, scale, gate = _due(self.adaln_modulation_self_attn, time)
         attn.fuse(fold_input(stack_rows([attn.q_proj, attn.k_proj, attn.v_proj]), shift, scale))
@@ -75,7 +75,7 @@ class FinalLayer(nn.Module):
         return cast(Tensor, self.linear(layer_norm(x) * (1 + scale) + shift))
 
     def fold(self, time: TimeSignal) -> None:
-        """Move the modulation of one time step into the weights, in place."""
+        """Fold the modulation of one time step into the weights, in place."""
         assert self.adaln_modulation is not None, "folded twice"
         shift, scale = self.adaln_modulation.split(*time)
         self.linear = fold_input(self.linear, shift, scale)

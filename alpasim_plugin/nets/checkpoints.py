@@ -1,6 +1,6 @@
-"""Weights on disk: safetensors first, pickles only as far as they hold nothing but tensors.
+"""Read weights: safetensors, or pickles that hold only tensors.
 
-Precision: by default tensors come back as they are stored; ``dtype`` converts the floating ones on request.
+Tensors keep their stored precision by default; ``dtype`` converts the floating ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     """Read a checkpoint file.
 
     Args:
-        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (nothing but tensors and plain containers).
+        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (only tensors and plain containers).
         dtype: Precision for floating tensors; None keeps each as stored.
         device: Where the tensors go.
         sha256: Expected digest, in hexadecimal; checked before anything is read.
@@ -38,7 +38,7 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         Tensors by key, taken out of an outer ``{"model": ...}`` or ``{"state_dict": ...}``.
 
     Raises:
-        InputError: No file, wrong digest, truncated or foreign file, or a pickle with anything but tensors.
+        InputError: No file, wrong digest, truncated or foreign file, or a pickle with other objects than tensors.
     """
     path = Path(path)
     doing = "reading network weights"
@@ -49,14 +49,14 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
     with path.open("rb") as file:
         head = file.read(9)
-    # A safetensors file is a length of 8 bytes and a JSON object; that length may itself begin like a pickle.
+    # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like the start of a pickle.
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path, device)
     else:
         try:
             content = load_file(path, device=device)
         except (SafetensorError, ValueError) as error:
-            found = f"not a whole safetensors file of {path.stat().st_size} bytes: {error}"
+            found = f"not a complete safetensors file of {path.stat().st_size} bytes: {error}"
             raise InputError(doing, str(path), found, "download or copy the file again; it is truncated or of another format") from error
     tensors = unwrap(content, str(path))
     if dtype is None:
@@ -68,9 +68,9 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     """Return the text entries in a safetensors file's header.
 
     Raises:
-        InputError: No file, or anything but safetensors (a pickle, for example).
+        InputError: No file, or not a safetensors file.
     """
-    doing, do = "reading the header of a safetensors file", "give a whole .safetensors file"
+    doing, do = "reading the header of a safetensors file", "give a complete .safetensors file"
     if not Path(path).is_file():
         raise InputError(doing, str(path), "no such file", do)
     try:
@@ -87,7 +87,7 @@ def file_sha256(path: str | Path) -> str:
 
 
 def unwrap(content: object, source: str) -> StateDict:
-    """Take the tensors out of an outer dictionary; entries of the training framework are left behind.
+    """Take the tensors out of an outer dictionary; entries of the training framework are dropped.
 
     Raises:
         InputError: No dictionary, no tensors, or something else under a key that should hold a tensor.
@@ -108,7 +108,7 @@ def unwrap(content: object, source: str) -> StateDict:
 def clean(tensors: Mapping[str, Tensor]) -> StateDict:
     """Return the network's own tensors under their plain keys.
 
-    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights, optimiser) is left behind. Also left behind:
+    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights, optimiser) is dropped. Also dropped:
     rotary buffers (recomputed), training counters, transformer-engine states, the infix of activation checkpointing.
     """
     prefixed = any(key.startswith("net.") for key in tensors)
@@ -123,7 +123,7 @@ def clean(tensors: Mapping[str, Tensor]) -> StateDict:
 
 
 def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
-    """Return a floating tensor in another precision, always as a copy; others as they are.
+    """Return a floating tensor in another precision, always as a copy; others unchanged.
 
     Raises:
         InputError: A finite value that overflows the new precision.
@@ -138,10 +138,10 @@ def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
 
 
 def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
-    """Return a copy of one weight in the precision a network wants, after checking that it can be one.
+    """Return a copy of one weight in the precision a network wants, after validation.
 
     Raises:
-        InputError: An integer tensor, or values that are not finite, or not finite any more.
+        InputError: An integer tensor, or values that are not finite before or after the conversion.
     """
     doing = "loading network weights"
     if not value.is_floating_point():
@@ -158,7 +158,7 @@ def _is_bookkeeping(key: str) -> bool:
 
 def _load_pickle(path: Path, device: str) -> object:
     try:
-        # As an open file, for torch would choose its reader by the suffix. Byte buffers hold transformer-engine states, which are dropped.
+        # Pass an open file, since torch chooses its reader by the suffix. Byte buffers hold transformer-engine states, which are dropped.
         with path.open("rb") as file, torch.serialization.safe_globals([io.BytesIO]):
             return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:

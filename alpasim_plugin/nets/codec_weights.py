@@ -1,4 +1,4 @@
-"""Fill a video codec with weights: from a checkpoint, every key and shape checked, or at random from a keyed stream."""
+"""Load the weights of a video codec from a checkpoint, with every key and shape checked, or initialise them at random."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
     """Give ``net`` (built on the meta device) copies of ``tensors`` in one precision.
 
     Args:
-        net: Its state dict names every key and shape that is due.
+        net: Its state dict gives the expected keys and shapes.
         tensors: Half, single or double precision, also mixed.
         dtype: Precision of the network's parameters; its constants are float32.
         doing, source, do: For the message.
@@ -37,14 +37,14 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
         *_listing("not floating point", other),
     ]
     if found:
-        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} due)", "; ".join(found), do)
+        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} expected)", "; ".join(found), do)
     constants = {key for key, _ in net.named_buffers()}
     precision = {key: torch.float32 if key in constants else dtype for key in due}
     net.load_state_dict({key: _packed(convert(key, tensors[key], precision[key], source)) for key in due}, assign=True)
 
 
 def fill_random(net: nn.Module, seed: int, component: str) -> None:
-    """Fill ``net`` with weights that depend on nothing but the key names, the seed and the component.
+    """Initialise ``net`` with weights that depend on the key names, the seed and the component only.
 
     Matrices are normal with standard deviation 1/sqrt(fan-in), vectors that multiply (``gamma``) are 1, biases 0.
     """
@@ -59,7 +59,7 @@ def fill_random(net: nn.Module, seed: int, component: str) -> None:
 
 
 def _packed(value: Tensor) -> Tensor:
-    """Lay a kernel out in memory as the convolutions read it: input channels innermost, taps outermost; shape and values unchanged."""
+    """Return a kernel in channels-last memory format; shape and values unchanged."""
     if value.ndim == 4:
         return value.contiguous(memory_format=torch.channels_last)
     return value.permute(2, 0, 3, 4, 1).contiguous().permute(1, 4, 0, 2, 3) if value.ndim == 5 else value

@@ -1,4 +1,4 @@
-"""The transformer's feed-forward part."""
+"""The transformer's feed-forward layer."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class Mlp(nn.Module):
-    """Two linears around an exact GELU, no biases unless folded in."""
+    """Linear, exact GELU, linear; without biases unless modulation is folded in."""
 
     def __init__(self, width: int, inner: int) -> None:
         super().__init__()

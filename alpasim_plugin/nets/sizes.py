@@ -1,4 +1,4 @@
-"""Sizes of the causal transformer, the checkpoint keys that follow from them, and the way back from tensors to sizes."""
+"""Sizes of the causal transformer, the checkpoint keys and shapes that follow, and reading sizes from a checkpoint."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ class DiTSizes:
 
 
 def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
-    """Read all sizes off the tensors of a checkpoint and check every key against them.
+    """Read all sizes from the tensors of a checkpoint and check every key against them.
 
-    Each size is voted for by all tensors that show it, so that one bad tensor is blamed instead of all others. A square matrix
-    that was transposed cannot be told from a right one.
+    Each size is the majority vote of the tensors that depend on it, so that a single wrong tensor is reported, not all others. A
+    transposed square matrix cannot be detected.
 
     Args:
         shapes: Shape of every tensor by key, already cleaned (see `checkpoints.clean`).
@@ -109,7 +109,7 @@ def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSize
         return [n for key in keys for n in shapes[key]]
 
     def votes(keys: list[str], known: int, divisor: int = 1, minus: int = 0) -> list[int]:
-        """Return what each matrix says about its other side, given one."""
+        """Return the other side of each matrix, given one."""
         matrices = [shapes[key] for key in keys if len(shapes[key]) == 2 and known in shapes[key]]
         rests = [sum(shape) - known for shape in matrices]
         return [rest // divisor - minus for rest in rests if rest % divisor == 0 and rest // divisor > minus]

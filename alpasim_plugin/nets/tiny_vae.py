@@ -1,19 +1,19 @@
 """A causal video autoencoder for CPUs: 4x8x8 compression to 16 channels, as the Wan autoencoder, at a small part of its work.
 
-What makes it fast: 2D convolutions only, with one frame of memory; none above a quarter of the resolution (pixels are folded into
-channels); the encoder and half of the decoder run once per latent, not once per frame; channels last throughout.
+Cost: 2D convolutions only, with one past frame; none above a quarter of the resolution (space-to-depth); the encoder and half of the
+decoder run once per latent, not once per frame; channels last throughout.
 
-What makes it faithful from the start: around the networks runs a fixed transform (`CosineTransform`). The latent is 16 cosine components of
-each 4x8x8 group plus what the encoder adds; the picture is their synthesis plus what the decoder adds. Untrained, both additions are zero
-and the round trip is a blurred copy.
+The networks predict residuals of a fixed transform (`CosineTransform`). The latent is 16 cosine components of each 4x8x8 group plus the
+encoder's correction; the image is their synthesis plus the decoder's correction. Untrained, both corrections are zero and the round trip is
+a blurred copy.
 
-The decoder may see the render's own frames. With P the projection on the components, s the synthesised picture, r the render and a its
+The decoder can be conditioned on the render. With P the projection on the components, s the synthesised image, r the render and a its
 opacity, it starts from
 
     s + g (1 - P) a (r - s),
 
-the latent's picture with the detail of the render where the render is opaque; the gate g (a number a pixel, 1 when untrained) and an
-additive correction are learned. If the latent is the render's own, untrained decoding returns an opaque render exactly.
+the decoded image with the detail of the render where the render is opaque; the gate g (one value a pixel, 1 when untrained) and an
+additive correction are learned. If the latent encodes the render, untrained decoding returns an opaque render exactly.
 
 Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times; decoding it gives one frame.
 """
@@ -33,10 +33,10 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import load_weights, unwrap
 from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
-from alpasim_plugin.nets.frame_layers import from_layers, halves_to_frames, split_last, to_layers
+from alpasim_plugin.nets.frame_layers import channels_first, channels_last, channels_to_frames, split_last
 from alpasim_plugin.nets.latent_stats import LatentStats
-from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
-from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinyEncoder, TinyPainter, TinySizes
+from alpasim_plugin.nets.streaming_state import State, Stream, StreamingState, in_passes
+from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinySizes, TinyVAEDecoder, TinyVAEEncoder
 from alpasim_plugin.nets.tiny_vae_transform import CELL, COLOURS, CosineTransform, from_grid, to_grid
 
 DOING = "loading tiny VAE weights"
@@ -46,7 +46,7 @@ DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
 class TinyVAE(nn.Module):
     """Encode video to latents of about unit variance and back, on a CPU in a few milliseconds a frame.
 
-    ``latents_per_pass`` (1; None for all) is how many latents are made at once: it bounds memory and changes results by rounding only.
+    ``latents_per_pass`` (1; None for all) is the number of latents processed at once, which bounds memory; results differ by rounding only.
 
     Example:
         >>> vae = TinyVAE.random()
@@ -59,8 +59,8 @@ class TinyVAE(nn.Module):
     def __init__(self, sizes: TinySizes = TinySizes()) -> None:
         super().__init__()
         self.sizes = sizes
-        self.encoder = TinyEncoder(sizes)
-        self.decoder = TinyPainter(sizes)
+        self.encoder = TinyVAEEncoder(sizes)
+        self.decoder = TinyVAEDecoder(sizes)
         self.stats = _untrained_stats()
         self.transform = CosineTransform()
         self.latents_per_pass: int | None = 1
@@ -69,7 +69,7 @@ class TinyVAE(nn.Module):
     @classmethod
     def random(cls, sizes: TinySizes = TinySizes(), seed: int = 0) -> Self:
         """Build an untrained, trainable network whose round trip is the cosine transform's blurred copy."""
-        with torch.device("meta"):  # layers draw their own initial values from the global generator otherwise
+        with torch.device("meta"):  # layers would draw initial values from the global generator
             vae = cls(sizes)
         for name, part in (("encoder", vae.encoder), ("decoder", vae.decoder)):
             fill_random(part, seed, f"tiny_vae.{name}")
@@ -103,7 +103,7 @@ class TinyVAE(nn.Module):
         return cls.from_state_dict(load_weights(path), dtype=dtype, source=str(path))
 
     def save(self, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
-        """Write a safetensors file, whole or not at all."""
+        """Write a safetensors file atomically."""
         write_safetensors(path, self.state_dict(), metadata)
 
     @property
@@ -130,8 +130,8 @@ class TinyVAE(nn.Module):
 
         Args:
             z: ``(B, 16, t, h, w)``, normalised.
-            render: ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1]: frames whose detail may be used, or None.
-            opacity: ``(B, 1, ...)`` of the render's size, 0 to 1: where the render shows something; None is everywhere.
+            render: ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1]: frames whose detail the decoder uses, or None.
+            opacity: ``(B, 1, ...)`` of the render's size, 0 to 1: coverage of the render; None is opaque everywhere.
             clamp: Whether to cut the result to [-1, 1].
 
         Returns:
@@ -197,38 +197,38 @@ class TinyVAE(nn.Module):
         return Stream(partial(self.decode_next, detach=detach))
 
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        grid = to_grid(_whole_groups(frames, carry.first))
-        mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), carry)
-        return self.stats.normalise(from_layers(mu)).to(self.dtype), carry.state
+        streaming = StreamingState(state, detach)
+        grid = to_grid(_whole_groups(frames, streaming.first))
+        mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), streaming)
+        return self.stats.normalise(channels_first(mu)).to(self.dtype), streaming.state
 
     def _decode_pass(
         self, z: Tensor, render: Tensor | None, opacity: Tensor | None, state: State | None, detach: bool
     ) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        mu = to_layers(self.stats.denormalise(z))
+        streaming = StreamingState(state, detach)
+        mu = channels_last(self.stats.denormalise(z))
         grid = self.transform.synthesise(mu)
-        skipped = DROPPED if carry.first else 0
+        skipped = DROPPED if streaming.first else 0
 
         def as_frames(x: Tensor) -> Tensor:
-            return halves_to_frames(x, GROUP)[:, skipped:]
+            return channels_to_frames(x, GROUP)[:, skipped:]
 
         frames = as_frames(grid)
         if render is None:
-            correction, _ = self.decoder.next(mu.to(self.dtype), None, carry)
-            return from_grid(frames + correction).to(self.dtype), carry.state
-        shown = to_grid(_whole_groups(render, carry.first))
+            correction, _ = self.decoder.next(mu.to(self.dtype), None, streaming)
+            return from_grid(frames + correction).to(self.dtype), streaming.state
+        shown = to_grid(_whole_groups(render, streaming.first))
         if opacity is None:
             cover, difference = None, shown  # the synthesised picture has no detail to subtract
         else:
-            cover = to_grid(_whole_groups(opacity, carry.first))
+            cover = to_grid(_whole_groups(opacity, streaming.first))
             shown, difference = _per_pixel(shown, cover), _per_pixel(shown - grid, cover)
         seen = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
-        correction, gate = self.decoder.next(mu.to(self.dtype), seen, carry)
+        correction, gate = self.decoder.next(mu.to(self.dtype), seen, streaming)
         assert gate is not None
         detail = split_last(as_frames(self.transform.residue(difference)), CELL)
         picture = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
-        return from_grid(picture.flatten(-2)).to(self.dtype), carry.state
+        return from_grid(picture.flatten(-2)).to(self.dtype), streaming.state
 
 
 def _untrained_stats() -> LatentStats:
@@ -241,7 +241,7 @@ def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:
 
 
 def _whole_groups(frames: Tensor, first: bool) -> Tensor:
-    """Put three copies of the video's first frame before it, so that the first latent has a group of four as well."""
+    """Repeat the video's first frame three times before it, so that the first latent has a group of four frames."""
     return torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2) if first else frames
 
 

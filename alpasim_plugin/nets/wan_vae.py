@@ -17,20 +17,20 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import unwrap
 from alpasim_plugin.nets.clips import check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
-from alpasim_plugin.nets.frame_layers import Pointwise, from_layers, run, to_layers
+from alpasim_plugin.nets.frame_layers import PointwiseConv, channels_first, channels_last, run_layers
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
-from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
-from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Down, FrameAttention, ResidualBlock, Up
+from alpasim_plugin.nets.streaming_state import State, Stream, StreamingState, in_passes
+from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Downsample, FrameAttention, ResidualBlock, Upsample
 from alpasim_plugin.nets.wan_vae_layout import DECODER_TIME, DO, DOING, ENCODER_TIME, WanLayout, read_layout
 
 
 def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:
-    """Return one stage's blocks; the first changes the width."""
+    """Return the residual blocks of one stage; the first changes the width."""
     return [ResidualBlock(inputs if i == 0 else outputs, outputs) for i in range(count)]
 
 
 class Coder(nn.Module):
-    """What encoder and decoder share: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
+    """Common part of encoder and decoder: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
 
     def __init__(self, stem: tuple[int, int], middle: int, head: tuple[int, int]) -> None:
         super().__init__()
@@ -49,12 +49,12 @@ class Encoder(Coder):
         for stage, (inputs, outputs) in enumerate(zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)):
             blocks += residual_blocks(inputs, outputs, layout.blocks)
             if stage < len(ENCODER_TIME):
-                blocks.append(Down(outputs, ENCODER_TIME[stage]))
+                blocks.append(Downsample(outputs, ENCODER_TIME[stage]))
         self.downsamples = nn.ModuleList(blocks)
 
-    def next(self, x: Tensor, carry: Carry) -> Tensor:
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map frames ``(B, T, H, W, 3)`` to ``(B, t, H/8, W/8, 2 * latent)``."""
-        return run((self.conv1, *self.downsamples, *self.middle, *self.head), x, carry)
+        return run_layers((self.conv1, *self.downsamples, *self.middle, *self.head), x, streaming)
 
 
 class Decoder(Coder):
@@ -67,19 +67,19 @@ class Decoder(Coder):
         for stage, (inputs, outputs) in enumerate(zip(layout.decoder_in, layout.decoder_out, strict=True)):
             blocks += residual_blocks(inputs, outputs, layout.blocks + 1)
             if stage < len(DECODER_TIME):
-                blocks.append(Up(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
+                blocks.append(Upsample(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
         self.upsamples = nn.ModuleList(blocks)
 
-    def next(self, x: Tensor, carry: Carry) -> Tensor:
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, t, h, w, latent)`` to frames ``(B, T, 8h, 8w, 3)``."""
-        return run((self.conv1, *self.middle, *self.upsamples, *self.head), x, carry)
+        return run_layers((self.conv1, *self.middle, *self.upsamples, *self.head), x, streaming)
 
 
 class WanVAE(nn.Module):
     """Encode video to normalised latents and back.
 
-    Weights are frozen; gradients with respect to the input flow. ``latents_per_pass`` (1; None for all) is how many latents are made at
-    once: it bounds memory and changes results by rounding only.
+    Weights are frozen; gradients with respect to the input flow. ``latents_per_pass`` (1; None for all) is the number of latents processed
+    at once: it bounds memory and changes results by rounding only.
 
     Example:
         >>> vae = WanVAE.random(WanLayout.of_base(8))
@@ -92,8 +92,8 @@ class WanVAE(nn.Module):
         super().__init__()
         self.layout = layout
         self.encoder = Encoder(layout)
-        self.conv1 = Pointwise(2 * layout.latent, 2 * layout.latent, axes=3)
-        self.conv2 = Pointwise(layout.latent, layout.latent, axes=3)
+        self.conv1 = PointwiseConv(2 * layout.latent, 2 * layout.latent, axes=3)
+        self.conv2 = PointwiseConv(layout.latent, layout.latent, axes=3)
         self.decoder = Decoder(layout)
         self.stats = LatentStats(mean, std)
         self.latents_per_pass: int | None = 1
@@ -179,14 +179,14 @@ class WanVAE(nn.Module):
 
         Args:
             frames: ``(B, 3, n, H, W)``: n = 1 + 4k if ``state`` is None (the video starts here), else 4k.
-            state: What the call before returned.
+            state: State after the previous call.
             detach: Whether to cut gradients after every pass.
 
         Returns:
             Latents ``(B, 16, m, H/8, W/8)`` and the state for the next call.
 
         Raises:
-            InputError: A number of frames or a size that is not due.
+            InputError: An invalid number of frames or size.
         """
         check_frames(frames, "encoding video frames", first=state is None, channels=self.layout.colours)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
@@ -197,7 +197,7 @@ class WanVAE(nn.Module):
 
         Args:
             z: ``(B, 16, m, h, w)``, any m.
-            state: What the call before returned, None at the start of the video.
+            state: State after the previous call, None at the start of the video.
             clamp: Whether to cut the result to [-1, 1].
             detach: Whether to cut gradients after every pass (one latent a pass is a truncation distance of 1).
 
@@ -221,10 +221,10 @@ class WanVAE(nn.Module):
         return Stream(partial(self.decode_next, detach=detach))
 
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        moments = self.conv1(self.encoder.next(to_layers(frames), carry))
-        return self.stats.normalise(from_layers(moments[..., : self.layout.latent])), carry.state
+        streaming = StreamingState(state, detach)
+        moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
+        return self.stats.normalise(channels_first(moments[..., : self.layout.latent])), streaming.state
 
     def _decode_pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        return from_layers(self.decoder.next(self.conv2(to_layers(self.stats.denormalise(z))), carry)), carry.state
+        streaming = StreamingState(state, detach)
+        return channels_first(self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)), streaming.state

@@ -22,7 +22,7 @@ PAINT_OFF = 1.0  # levels; rounding alone takes a paint's pixel this far from it
 OFF, OFF_SHARE = 4.0, 0.06  # a pixel may lie this far (levels, and share of its length) from a mixture of the two colours
 
 
-def recolour_boxes(sdmap: U8, kind: str) -> U8:
+def swap_class_colours(sdmap: U8, kind: str) -> U8:
     """Return a semantic map whose cars have the colours of another class.
 
     Args:

@@ -31,7 +31,7 @@ from alpasim_plugin.training.vae import picture_error
 
 
 @dataclass(frozen=True)
-class PainterRecipe:
+class DecoderRecipe:
     """What a batch holds and what counts.
 
     Args:
@@ -103,7 +103,7 @@ class Rollouts:
 
 
 @dataclass(frozen=True)
-class PainterBatch:
+class DecoderBatch:
     """Latents ``(B, C, N, h, w)``, the render, its opacity and the clean frames ``(B, c, 1 + 4 (N - 1), 8h, 8w)``, and a position."""
 
     z: Tensor
@@ -113,7 +113,7 @@ class PainterBatch:
     w: int
 
 
-class PainterTask:
+class DecoderTask:
     """Batches and loss of the decoder, for `Trainer`; sets what of the autoencoder is trained.
 
     Args:
@@ -126,7 +126,7 @@ class PainterTask:
         InputError: A crop larger than the clips.
     """
 
-    def __init__(self, vae: TinyVAE, rollouts: Rollouts, recipe: PainterRecipe, distance: tuple[str, Distance] | None = None) -> None:
+    def __init__(self, vae: TinyVAE, rollouts: Rollouts, recipe: DecoderRecipe, distance: tuple[str, Distance] | None = None) -> None:
         size = tuple(rollouts[0][1].shape[2:])
         if recipe.rows > size[0] or recipe.columns > size[1]:
             found = f"a crop of {recipe.rows} x {recipe.columns} latents from {size[0]} x {size[1]}"
@@ -144,15 +144,15 @@ class PainterTask:
             "distance": self.distance[0] if self.distance else "none",
         }  # fmt: skip
 
-    def batch(self, index: int) -> PainterBatch:
+    def batch(self, index: int) -> DecoderBatch:
         """Make batch ``index``: a function of the index and the recipe's seed alone."""
         r = self.recipe
         rng = stream("training", r.seed, "painter.clips", index)
         drawn = [self._crop(rng) for _ in range(r.clips)]
         z, render, opacity, clean = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-        return PainterBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
+        return DecoderBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
 
-    def loss(self, batch: PainterBatch, index: int) -> Loss:
+    def loss(self, batch: DecoderBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         made = self.vae.decode(batch.z, render=batch.render, opacity=batch.opacity, clamp=False)
         parts = {"picture": picture_error(made, batch.clean, self.recipe.edge_weight)}

@@ -16,7 +16,7 @@ from alpasim_plugin.fixers.networks import streaming_dit
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights, read_metadata
-from alpasim_plugin.training.decoder_finetune import PainterRecipe, PainterTask, Rollouts
+from alpasim_plugin.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.model_card import ModelCard, curves
@@ -27,12 +27,12 @@ from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 DOING = "adapting a decoder"
 
 
-def train_painter(
+def finetune_decoder(
     bundle: Path,
     data: Path,
     out: Path,
     form: ClipForm,
-    recipe: PainterRecipe,
+    recipe: DecoderRecipe,
     schedule: Schedule,
     distance: tuple[str, Distance] | None = None,
     prepared: Callable[[str, int, int], None] | None = None,
@@ -64,7 +64,7 @@ def train_painter(
 
     clips = LatentClips(PairDataset(data, "train").sequences, vae, form, out.parent / "latents", tell("latents"))
     rollouts = Rollouts(clips, net, settings.block_latents, settings.window, settings.uses_map, out.parent / "rollouts", tell("rollouts"))
-    task = PainterTask(vae, rollouts, recipe, distance)
+    task = DecoderTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
     trainer.run(report)

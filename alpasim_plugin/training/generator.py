@@ -19,7 +19,7 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
 from alpasim_plugin.training.perceptual_term import DecodedDistance, Distance
-from alpasim_plugin.training.shared_rollout import T_SOURCE, Objectives, Perceptual, Sample, losses, weighed
+from alpasim_plugin.training.shared_rollout import T_SOURCE, Objectives, Perceptual, Sample, channel_weighted, losses
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.training.vae import channel_amplitudes
 from alpasim_plugin.training.variants import BASE, Variant
@@ -191,7 +191,7 @@ def diffusion_forcing(
     z_t = interpolant(s.z_0, z_1, t[:, None, :, None, None])
     v = net(z_t, T_SOURCE * t, text, s.z_map, block_latents=recipe.block_latents, window=recipe.window)
     error: Tensor = v - (z_1 - s.z_0)
-    return weighed(error.square(), channel_weights).mean()
+    return channel_weighted(error.square(), channel_weights).mean()
 
 
 def widen_map(weights: Mapping[str, Tensor], channels: int, latent_channels: int = 16) -> dict[str, Tensor]:

@@ -28,7 +28,7 @@ from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.sampling import opacity_mask
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.class_colours import OTHERS, recolour_boxes
+from alpasim_plugin.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.training.clips import to_tensor
 from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 
@@ -152,7 +152,7 @@ def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mi
     sdmap = cut.sdmap
     if mirrored and form.recolour:
         rng = stream(sequence.name, 0, "training.map_colours", start)
-        sdmap = recolour_boxes(sdmap, OTHERS[int(rng.integers(len(OTHERS)))])
+        sdmap = swap_class_colours(sdmap, OTHERS[int(rng.integers(len(OTHERS)))])
     videos = torch.stack([to_tensor(x, mirrored) for x in (cut.rgb_input, cut.rgb_gt, sdmap)])
     mask = opacity_mask((to_tensor(cut.opacity[..., None], mirrored)[None] + 1) / 2)
     z = vae.encode(videos)

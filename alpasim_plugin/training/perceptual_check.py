@@ -22,7 +22,7 @@ MODERATE = 0.5  # strength at which structural damage must count more than a shi
 
 
 @dataclass(frozen=True)
-class Ladder:
+class SeveritySweep:
     """Distances of frames under one kind of damage at rising strengths: ``made`` and ``wanted`` ``(frames, strengths)``."""
 
     made: F64
@@ -45,7 +45,7 @@ def check_frames(sequences: Sequence[PairSequence], count: int, channel: str = "
     return np.stack(picked).astype(np.float32) / np.float32(255)
 
 
-def ladders(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, Ladder]:
+def severity_sweeps(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, SeveritySweep]:
     """Damage every frame in every way at rising strengths."""
     out = {}
     for kind in KINDS:
@@ -56,7 +56,7 @@ def ladders(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, La
             made.append(distance(damaged, frames))
             moved = draws[0].displacement_px(s)
             wanted.append([target_distance(f, d, kind, moved) for f, d in zip(frames, damaged, strict=True)])
-        out[kind] = Ladder(np.array(made).T, np.array(wanted).T)
+        out[kind] = SeveritySweep(np.array(made).T, np.array(wanted).T)
     return out
 
 
@@ -81,7 +81,7 @@ def check(distance: ArrayDistance, frames: F32, renders: F32 | None = None, seed
         ``moderate`` (median distance by structural kind at strength 0.5, and ``above_shift``: share of frames where it exceeds the
         frame's shift of one pixel); ``render`` (median distance of damaged renders).
     """
-    steps = ladders(distance, frames, seed)
+    steps = severity_sweeps(distance, frames, seed)
     shift = np.mean([distance(moved, frames) for moved in shift_one_px(frames)], axis=0)
     at = STRENGTHS.index(MODERATE)
     moderate = {
@@ -90,15 +90,15 @@ def check(distance: ArrayDistance, frames: F32, renders: F32 | None = None, seed
     }
     return {
         "frames": len(frames),
-        "in_order": {kind: round(ladder.in_order, 4) for kind, ladder in steps.items()},
+        "in_order": {kind: round(sweep.in_order, 4) for kind, sweep in steps.items()},
         "rank_correlation": float(stats.spearmanr(*_flat(steps)).statistic),
         "shift_1px": float(np.median(shift)),
         "moderate": moderate,
-        "by_strength": {kind: [round(float(v), 5) for v in np.median(ladder.made, axis=0)] for kind, ladder in steps.items()},
+        "by_strength": {kind: [round(float(v), 5) for v in np.median(sweep.made, axis=0)] for kind, sweep in steps.items()},
         "shift_px_at_1": SHIFT_PX,
         "render": None if renders is None else float(np.median(distance(renders, frames))),
     }
 
 
-def _flat(steps: Mapping[str, Ladder]) -> tuple[F64, F64]:
-    return tuple(np.concatenate([getattr(ladder, name).ravel() for ladder in steps.values()]) for name in ("made", "wanted"))  # type: ignore[return-value]
+def _flat(steps: Mapping[str, SeveritySweep]) -> tuple[F64, F64]:
+    return tuple(np.concatenate([getattr(sweep, name).ravel() for sweep in steps.values()]) for name in ("made", "wanted"))  # type: ignore[return-value]

@@ -143,7 +143,7 @@ def losses(
     return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, seen)
 
 
-def weighed(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
+def channel_weighted(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
     """Return squared errors ``(B, C, ...)`` times the weights ``(C,)`` of their channels."""
     return squares if channel_weights is None else squares * channel_weights.view(1, -1, *[1] * (squares.ndim - 2))
 
@@ -210,7 +210,7 @@ class _Rollout:
         z_t = interpolant(s.z_0, self.z_1, t)
         for b in self.blocks:
             v = self.net.step(z_t[:, :, b], T_SOURCE * s.t[:, b], self.text, self.condition[:, :, b], cache, write=False)
-            errors.append(weighed((v - (self.z_1 - s.z_0)[:, :, b]).square(), channel_weights).mean(dim=(0, 1, 3, 4)))
+            errors.append(channel_weighted((v - (self.z_1 - s.z_0)[:, :, b]).square(), channel_weights).mean(dim=(0, 1, 3, 4)))
             self._write(history[:, :, b], b, cache)
         return torch.cat(errors).mean()
 

@@ -36,7 +36,7 @@ class Variant:
         """Return what update ``step`` of ``steps`` minimises."""
         return self.stages[min(step * len(self.stages) // steps, len(self.stages) - 1)]
 
-    def weighing(self, perceptual: float) -> Variant:
+    def with_perceptual_weight(self, perceptual: float) -> Variant:
         """Return the variant with another weight lambda of its perceptual term.
 
         Raises:

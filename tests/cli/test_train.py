@@ -93,10 +93,10 @@ def test_weights_come_with_digest_updates_and_time(data: Path, tmp_path: Path, c
     assert f"wrote {weights}" in err.replace("\n", "")
 
 
-def lessons(folder: Path) -> None:
-    """Write two lessons of a grey road."""
+def demonstrations(folder: Path) -> None:
+    """Write two demonstrations on a grey road."""
     folder.mkdir(parents=True)
-    numbers = ("turn", "turn_before", "speed", "wanted", "gap", "leader")
+    numbers = ("turn", "turn_before", "speed", "desired_speed", "gap", "leader")
     arrays = {
         "frames": np.full((2, 114, 352, 3), 128, dtype=np.uint8), "points": np.ones((2, 9, 2), dtype=np.float32),
         "headings": np.zeros((2, 9), dtype=np.float32), "speeds": np.zeros((2, 8), dtype=np.float32),
@@ -106,24 +106,24 @@ def lessons(folder: Path) -> None:
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)
     lens = {"K": [[176.0, 0, 176], [0, 176.0, 57], [0, 0, 1]], "T_rig_camera": np.eye(4).tolist()}
-    (folder / "lessons.json").write_text(json.dumps({**lens, "lessons": 2, "recipe": {"renderer": "clean"}}))
+    (folder / "demonstrations.json").write_text(json.dumps({**lens, "samples": 2, "recipe": {"renderer": "clean"}}))
 
 
 def test_a_policys_card_says_what_made_it_and_how_well_it_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for split, name in (("train", "street_000"), ("train", "street_003"), ("train", "bend_001"), ("val", "street_000")):
-        lessons(tmp_path / "lessons" / split / name)
-    monkeypatch.setattr(sys, "argv", ["simrun", "train", "policy", "lessons", "--threads", "1"])
-    document, _ = told(capsys, "policy", tmp_path / "lessons", "--out", tmp_path / "run", "--steps", 1)
+        demonstrations(tmp_path / "demonstrations" / split / name)
+    monkeypatch.setattr(sys, "argv", ["simrun", "train", "policy", "demonstrations", "--threads", "1"])
+    document, _ = told(capsys, "policy", tmp_path / "demonstrations", "--out", tmp_path / "run", "--steps", 1)
     card = json.loads(Path(document["card"]).read_text())
     load_net(Path(document["weights"]))
     assert Path(document["card"]).name == "learned.json"
-    assert card["command"] == "simrun train policy lessons --threads 1"
+    assert card["command"] == "simrun train policy demonstrations --threads 1"
     assert card["machine"]["cores"] == os.cpu_count()
     assert card["sha256"] == document["sha256"]
-    assert card["data"] == {"frames": 6, "lessons": 6, "scenes": {"bend": 1, "street": 2}, "renderer": "clean"}
-    assert card["held_out"]["lessons"] == 2
+    assert card["data"] == {"frames": 6, "samples": 6, "scenes": {"bend": 1, "street": 2}, "renderer": "clean"}
+    assert card["held_out"]["samples"] == 2
     assert card["curves"][-1]["step"] == card["steps"] == 1
 
 

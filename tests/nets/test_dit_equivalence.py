@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.nets import DiTSizes
-from alpasim_plugin.nets.attention import block_causal_attention, block_causal_reference
+from alpasim_plugin.nets.attention import block_causal_attention
+from tests.nets.attention_reference import block_causal_reference
 from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
 from tests.nets.dit_reference import latent_mask, random_weights, velocity
 

@@ -12,7 +12,7 @@ from alpasim_plugin.nets.perceptual import PerceptualDistance, load_perceptual
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.distortions import KINDS, draw_distortion
 from alpasim_plugin.training.perceptual import PerceptualRecipe, PerceptualTask, draw_shapes
-from alpasim_plugin.training.perceptual_check import Ladder, check, shift_one_px
+from alpasim_plugin.training.perceptual_check import SeveritySweep, check, shift_one_px
 from alpasim_plugin.training.perceptual_targets import GAINS, colour_error, structure_error, target_distance
 from alpasim_plugin.training.semantics import CLASSES, class_masks
 from alpasim_plugin.training.trainer import Schedule, Trainer
@@ -120,7 +120,7 @@ def test_check_tells_a_good_distance_from_a_bad_one() -> None:
     assert good["rank_correlation"] > 0.4 > bad["rank_correlation"]
     assert np.mean(list(good["in_order"].values())) > 0.9
     assert np.mean(list(bad["in_order"].values())) < 0.1
-    assert Ladder(np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3]])).in_order == 0.0
+    assert SeveritySweep(np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3]])).in_order == 0.0
 
 
 def test_shift_moves_by_one_pixel() -> None:
