@@ -74,10 +74,10 @@ def policy_data(
 
 def policy(
     data: Annotated[Path, typer.Argument(help="Folder that 'simrun train policy-data' wrote.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")],
     steps: Steps = 4000,
     seed: Seed = 0,
-    threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of the arithmetic.")] = 1,
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Measure whether a distance of pictures does what `perceptual-syn` was trained to do, on frames it has not seen."""
+"""Validate a perceptual image distance on held-out frames: monotonicity in severity and rank correlation with the targets."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from alpasim_plugin.training.pair_store import PairSequence
 from alpasim_plugin.training.perceptual_targets import target_distance
 from alpasim_plugin.types import F32, F64
 
-ArrayDistance = Callable[[F32, F32], F64]  # pictures (N, H, W, 3) in 0 to 1, twice -> (N,), smaller is nearer
+ArrayDistance = Callable[[F32, F32], F64]  # images (N, H, W, 3) in 0 to 1, twice -> (N,), smaller is closer
 STRENGTHS = (0.05, 0.15, 0.3, 0.5, 0.75, 1.0)
 STRUCTURAL = ("blur", "coarse", "erase", "ghost", "splat")
-MODERATE = 0.5  # strength at which structural damage must count more than a shift of one pixel
+MODERATE = 0.5  # strength at which a structural distortion must be farther than a shift of one pixel
 
 
 @dataclass(frozen=True)
 class SeveritySweep:
-    """Distances of frames under one kind of damage at rising strengths: ``made`` and ``wanted`` ``(frames, strengths)``."""
+    """Distances under one kind of distortion at increasing strengths: ``made`` and target ``wanted``, ``(frames, strengths)``."""
 
     made: F64
     wanted: F64
 
     @property
     def in_order(self) -> float:
-        """Share of neighbouring strengths where more damage is farther away; steps that hardly change the picture are left out."""
+        """Share of consecutive strengths with increasing distance; steps with a negligible target difference are excluded."""
         counted = np.diff(self.wanted, axis=1) > 1e-3
         return float((np.diff(self.made, axis=1) > 0)[counted].mean()) if counted.any() else float("nan")
 
@@ -46,7 +46,7 @@ def check_frames(sequences: Sequence[PairSequence], count: int, channel: str = "
 
 
 def severity_sweeps(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, SeveritySweep]:
-    """Damage every frame in every way at rising strengths."""
+    """Distort every frame with every kind at increasing strengths."""
     out = {}
     for kind in KINDS:
         draws = [draw_distortion(stream("training", seed, f"perceptual.check.{kind}", i), f.shape, kind) for i, f in enumerate(frames)]
@@ -61,25 +61,25 @@ def severity_sweeps(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict
 
 
 def shift_one_px(frames: F32) -> list[F32]:
-    """Return the frames moved by one pixel to the right and down, ``(N, H, W, 3)`` each; the far row or column is repeated."""
+    """Return the frames moved by one pixel to the right and down, ``(N, H, W, 3)`` each; the border is repeated."""
     right = np.concatenate([frames[:, :, :1], frames[:, :, :-1]], axis=2)
     down = np.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
     return [right, down]
 
 
 def check(distance: ArrayDistance, frames: F32, renders: F32 | None = None, seed: int = 0) -> dict[str, Any]:
-    """Return what docs/video-metrics.md shows of a distance.
+    """Return the validation results of a distance (docs/video-metrics.md).
 
     Args:
-        distance: Of pictures.
+        distance: Of images.
         frames: ``(N, H, W, 3)`` clean, in 0 to 1.
-        renders: Their damaged renders, or None.
-        seed: Of the damage.
+        renders: Their degraded renders, or None.
+        seed: Of the distortions.
 
     Returns:
         ``in_order`` by kind; ``rank_correlation`` with the targets over all kinds and strengths; ``shift_1px`` (median distance), and
         ``moderate`` (median distance by structural kind at strength 0.5, and ``above_shift``: share of frames where it exceeds the
-        frame's shift of one pixel); ``render`` (median distance of damaged renders).
+        frame's shift of one pixel); ``render`` (median distance of degraded renders).
     """
     steps = severity_sweeps(distance, frames, seed)
     shift = np.mean([distance(moved, frames) for moved in shift_one_px(frames)], axis=0)

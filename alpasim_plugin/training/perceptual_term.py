@@ -1,4 +1,4 @@
-"""The perceptual term of the shared rollout: decode one position causally, compare its frames with equally decoded clean ones."""
+"""The perceptual term of the shared rollout: decode one position causally and compare its frames with decoded clean latents."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Distance = Callable[[Tensor, Tensor], Tensor]  # frames (F, 3, H, W) in [-1, 1],
 class DecodedDistance:
     """Decode position w of the predictions and of the clean latents, and average a distance over its frames.
 
-    The decoder's memory of what came before w is made without gradients: truncation distance 1 (paper, App. A.3).
+    The decoder state before w has no gradients: truncation distance 1 (paper, App. A.3).
 
     Args:
         decoder: Frozen.
         distance: Frozen, differentiable in its first argument.
         z_0: ``(B, C, N, H, W)`` clean latents.
-        render: ``(B, 3, 1 + 4 (N - 1), 8H, 8W)`` render's frames for a decoder that sees them, or None.
+        render: ``(B, 3, 1 + 4 (N - 1), 8H, 8W)`` render for a conditioned decoder, or None.
         opacity: ``(B, 1, ...)`` their opacity, or None.
     """
 
@@ -36,7 +36,7 @@ class DecodedDistance:
     opacity: Tensor | None = None
 
     def __call__(self, predicted: Tensor, w: int) -> Tensor:
-        """Return the mean distance of position ``w``'s frames; ``predicted`` reaches at least to w."""
+        """Return the mean distance of position ``w``'s frames; ``predicted`` includes position w."""
         with torch.no_grad():
             wanted = self._decode(self.z_0, w)
         made = self._decode(predicted, w)
@@ -56,5 +56,5 @@ class DecodedDistance:
 
 
 def frames_of(video: Tensor) -> Tensor:
-    """Line up the frames of clips: ``(B, C, T, H, W)`` to ``(B T, C, H, W)``."""
+    """Flatten clips to frames: ``(B, C, T, H, W)`` to ``(B T, C, H, W)``."""
     return video.transpose(1, 2).flatten(0, 1)

@@ -23,7 +23,7 @@ def drawn(label: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_recoloured_cars_are_what_the_other_class_looks_like(kind: str) -> None:
+def test_augmented_cars_have_the_colours_of_the_other_class(kind: str) -> None:
     car, wanted = drawn("car"), drawn(LABELS[kind])
     made = swap_class_colours(car, kind)
     differs = (car != wanted).any(axis=-1)

@@ -84,13 +84,13 @@ def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
 
 def test_only_the_decoder_learns_and_pictures_get_nearer(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     schedule = Schedule(30, peak_lr=5e-3, warmup=3, ema=0.5, save_every=10)
-    path = finetune_decoder(bundle, data, tmp_path / "painter", FORM, RECIPE, schedule, ("brightness", brightness))
+    path = finetune_decoder(bundle, data, tmp_path / "decoder", FORM, RECIPE, schedule, ("brightness", brightness))
     before, after = load_weights(bundle), load_weights(path)
     assert before.keys() == after.keys()
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert changed
     assert all(key.startswith("vae.decoder.") for key in changed)
-    rows = [json.loads(line) for line in (tmp_path / "painter" / "log.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (tmp_path / "decoder" / "log.jsonl").read_text().splitlines()]
     gains = [row["psnr_db"] - row["render_psnr_db"] for row in rows]
     assert np.mean(gains[-8:]) > np.mean(gains[:8]) + 0.5, "decibels over the render"
     card = json.loads(path.with_suffix(".card.json").read_text())

@@ -13,7 +13,7 @@ import pytest
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.training.pairs import MOVING_M, SHARES, PairRecipe, draw_degradation, make_sequence, wander
+from alpasim_plugin.training.pairs import MOVING_M, SHARES, PairRecipe, draw_degradation, lateral_offsets, make_sequence
 from alpasim_plugin.types import Degradation, Environment, Scenario
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
@@ -34,7 +34,7 @@ def draws(street: Scenario) -> list[tuple[Degradation, float]]:
     recipe, out = PairRecipe(), []
     for seed in range(60):
         amount = draw_degradation(street, recipe, seed)
-        out.append((amount, float(np.abs(wander(replace(street, degradation=amount), recipe, seed)).max())))
+        out.append((amount, float(np.abs(lateral_offsets(replace(street, degradation=amount), recipe, seed)).max())))
     return out
 
 

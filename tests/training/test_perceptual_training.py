@@ -1,4 +1,4 @@
-"""Training of the perceptual distance: damage that is monotone, targets that say so, batches that repeat, lessons that are learned."""
+"""Training of the perceptual distance: damage that is monotone, targets that say so, batches that repeat, module that are learned."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_map_colours_are_read_back_however_faded() -> None:
             assert masks.sum() == 1
 
 
-SMALL = PerceptualRecipe(pictures=3, side=32)
+SMALL = PerceptualRecipe(images=3, side=32)
 
 
 @pytest.fixture
