@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -22,6 +22,7 @@ StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")
 RECOMPUTED = ("pos_embedder.seq", "pos_embedder.dim_spatial_range", "pos_embedder.dim_temporal_range")
 CHECKPOINT_INFIX = "_checkpoint_wrapped_module."
+LISTED = 8  # keys named in one error message; the rest is counted
 ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
 
 
@@ -150,6 +151,12 @@ def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
         found = f"{key} holds {int((~value.isfinite()).sum())} values that are not finite, of {value.numel()}"
         raise InputError(doing, source, found, "use a checkpoint from before training diverged")
     return convert(key, value, dtype, source)
+
+
+def listed(what: str, keys: Sequence[str]) -> str:
+    """Return keys for an error message, the first `LISTED` by name; empty without keys."""
+    rest = f" and {len(keys) - LISTED} more" if len(keys) > LISTED else ""
+    return f"{what}: {', '.join(keys[:LISTED])}{rest}" if keys else ""
 
 
 def _is_bookkeeping(key: str) -> bool:

@@ -9,9 +9,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin import seeding
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.checkpoints import convert
-
-LISTED = 6  # keys named in one error before the rest is only counted
+from alpasim_plugin.nets.checkpoints import convert, listed
 
 
 def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dtype, doing: str, source: str, do: str) -> None:
@@ -30,13 +28,9 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
     due = {key: tuple(value.shape) for key, value in net.state_dict().items()}
     wrong = [_describe(key, tensors[key], due[key]) for key in sorted(due.keys() & tensors.keys()) if tuple(tensors[key].shape) != due[key]]
     other = [f"{key} ({tensors[key].dtype})" for key in sorted(tensors) if not tensors[key].is_floating_point()]
-    found = [
-        *_listing("missing", sorted(due.keys() - tensors.keys())),
-        *_listing("unexpected", sorted(tensors.keys() - due.keys())),
-        *_listing("wrong shape", wrong),
-        *_listing("not floating point", other),
-    ]
-    if found:
+    missing, unexpected = sorted(due.keys() - tensors.keys()), sorted(tensors.keys() - due.keys())
+    groups = {"missing": missing, "unexpected": unexpected, "wrong shape": wrong, "not floating point": other}
+    if found := [listed(what, keys) for what, keys in groups.items() if keys]:
         raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} expected)", "; ".join(found), do)
     constants = {key for key, _ in net.named_buffers()}
     precision = {key: torch.float32 if key in constants else dtype for key in due}
@@ -69,10 +63,3 @@ def _describe(key: str, value: Tensor, due: tuple[int, ...]) -> str:
     shape = tuple(value.shape)
     hint = ", transposed" if sorted(shape) == sorted(due) else ""
     return f"{key} is {list(shape)} for {list(due)}{hint}"
-
-
-def _listing(what: str, items: list[str]) -> list[str]:
-    if not items:
-        return []
-    rest = f" and {len(items) - LISTED} more" if len(items) > LISTED else ""
-    return [f"{what}: {', '.join(items[:LISTED])}{rest}"]

@@ -32,7 +32,8 @@ from alpasim_plugin.nets.frame_layers import (
     run_layers,
 )
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
-from alpasim_plugin.nets.streaming_state import State, Stream, StreamingState, in_passes
+from alpasim_plugin.nets.streaming_codec import StreamingDecoder
+from alpasim_plugin.nets.streaming_state import State, StreamingState, in_passes
 
 GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3
@@ -89,10 +90,8 @@ def decoder_layers(latent: int, widths: Sequence[int]) -> nn.ModuleList:
     return nn.ModuleList([*layers, nn.ReLU(inplace=True), FrameConv(widths[-1], COLOURS)])
 
 
-class TinyDecoder(nn.Module):
+class TinyDecoder(StreamingDecoder):
     """Decode normalised Wan latents with a small network; weights are frozen, gradients with respect to the input flow.
-
-    ``latents_per_pass`` (1; None for all) is the number of latents decoded at once: it bounds memory and changes results by rounding only.
 
     Args:
         latent: Channels of the latent.
@@ -111,7 +110,6 @@ class TinyDecoder(nn.Module):
         self.scaled = scaled
         self.decoder = decoder_layers(latent, widths)
         self.stats: LatentStats | None = None
-        self.latents_per_pass: int | None = 1
         self.eval().requires_grad_(False)
 
     @classmethod
@@ -157,30 +155,6 @@ class TinyDecoder(nn.Module):
         net.stats = LatentStats() if scaled else None
         return net
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the weights, and of every result."""
-        return next(self.parameters()).dtype
-
-    def forward(self, z: Tensor, *, clamp: bool = True) -> Tensor:
-        """Decode a whole clip.
-
-        Args:
-            z: ``(B, 16, t, h, w)``, normalised.
-            clamp: Whether to cut the result to [-1, 1].
-
-        Returns:
-            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1].
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.decode_next(z, None, clamp=clamp)[0]
-
-    def decode(self, z: Tensor, *, clamp: bool = True) -> Tensor:
-        """Decode a whole clip: the method name that all decoders share."""
-        return self.decode_next(z, None, clamp=clamp)[0]
-
     def decode_next(self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function.
 
@@ -205,9 +179,7 @@ class TinyDecoder(nn.Module):
         frames = run_layers(self.decoder, channels_last(z if self.stats is None else self.stats.denormalise(z)), streaming)
         return channels_first(frames[:, DROPPED if streaming.first else 0 :]), streaming.state
 
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents) -> frames`` as `decode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.decode_next, detach=detach))
+    forward = StreamingDecoder.decode
 
 
 def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple[int, ...]]:

@@ -35,7 +35,8 @@ from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, 
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import channels_first, channels_last, channels_to_frames, split_last
 from alpasim_plugin.nets.latent_stats import LatentStats
-from alpasim_plugin.nets.streaming_state import State, Stream, StreamingState, in_passes
+from alpasim_plugin.nets.streaming_codec import StreamingCodec
+from alpasim_plugin.nets.streaming_state import State, StreamingState, in_passes
 from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinySizes, TinyVAEDecoder, TinyVAEEncoder
 from alpasim_plugin.nets.tiny_vae_transform import CELL, COLOURS, CosineTransform, from_grid, to_grid
 
@@ -43,10 +44,8 @@ DOING = "loading tiny VAE weights"
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
 
 
-class TinyVAE(nn.Module):
+class TinyVAE(StreamingCodec):
     """Encode video to latents of about unit variance and back, on a CPU in a few milliseconds a frame.
-
-    ``latents_per_pass`` (1; None for all) is the number of latents processed at once, which bounds memory; results differ by rounding only.
 
     Example:
         >>> vae = TinyVAE.random()
@@ -63,7 +62,6 @@ class TinyVAE(nn.Module):
         self.decoder = TinyVAEDecoder(sizes)
         self.stats = _untrained_stats()
         self.transform = CosineTransform()
-        self.latents_per_pass: int | None = 1
         self.eval()
 
     @classmethod
@@ -106,42 +104,6 @@ class TinyVAE(nn.Module):
         """Write a safetensors file atomically."""
         write_safetensors(path, self.state_dict(), metadata)
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the learned parts and of every result; the fixed transform always works in float32."""
-        return self.encoder.stem.weight.dtype
-
-    def encode(self, video: Tensor) -> Tensor:
-        """Encode a whole clip.
-
-        Args:
-            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` brings any clip there).
-
-        Returns:
-            ``(B, 16, 1 + k, H/8, W/8)``, normalised.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.encode_next(video, None)[0]
-
-    def decode(self, z: Tensor, *, render: Tensor | None = None, opacity: Tensor | None = None, clamp: bool = True) -> Tensor:
-        """Decode a whole clip.
-
-        Args:
-            z: ``(B, 16, t, h, w)``, normalised.
-            render: ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1]: frames whose detail the decoder uses, or None.
-            opacity: ``(B, 1, ...)`` of the render's size, 0 to 1: coverage of the render; None is opaque everywhere.
-            clamp: Whether to cut the result to [-1, 1].
-
-        Returns:
-            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)``.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.decode_next(z, None, render=render, opacity=opacity, clamp=clamp)[0]
-
     def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function, with the same rules as `WanVAE.encode_next`."""
         check_frames(frames, "encoding video frames with the tiny VAE", first=state is None)
@@ -163,7 +125,8 @@ class TinyVAE(nn.Module):
         Args:
             z: ``(B, 16, m, h, w)``, any m.
             state: What the call before returned, None at the start of the video.
-            render, opacity: See `decode`; as many frames as are returned.
+            render: ``(B, 3, n, 8h, 8w)`` in [-1, 1]: frames whose detail the decoder uses, or None.
+            opacity: ``(B, 1, n, 8h, 8w)``, 0 to 1: coverage of the render; None is opaque everywhere.
             clamp: Whether to cut the result to [-1, 1].
             detach: Whether to cut gradients after every pass.
 
@@ -187,14 +150,6 @@ class TinyVAE(nn.Module):
         assert state is not None
         video = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
         return video.clamp(-1, 1) if clamp else video, state
-
-    def encoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.encode_next, detach=detach))
-
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents, render=...) -> frames`` as `decode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.decode_next, detach=detach))
 
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)

@@ -19,7 +19,8 @@ from alpasim_plugin.nets.clips import check_frames, check_latents, group_ends, p
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
 from alpasim_plugin.nets.frame_layers import PointwiseConv, channels_first, channels_last, run_layers
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
-from alpasim_plugin.nets.streaming_state import State, Stream, StreamingState, in_passes
+from alpasim_plugin.nets.streaming_codec import StreamingCodec
+from alpasim_plugin.nets.streaming_state import State, StreamingState, in_passes
 from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Downsample, FrameAttention, ResidualBlock, Upsample
 from alpasim_plugin.nets.wan_vae_layout import DECODER_TIME, DO, DOING, ENCODER_TIME, WanLayout, read_layout
 
@@ -75,11 +76,10 @@ class Decoder(Coder):
         return run_layers((self.conv1, *self.middle, *self.upsamples, *self.head), x, streaming)
 
 
-class WanVAE(nn.Module):
+class WanVAE(StreamingCodec):
     """Encode video to normalised latents and back.
 
-    Weights are frozen; gradients with respect to the input flow. ``latents_per_pass`` (1; None for all) is the number of latents processed
-    at once: it bounds memory and changes results by rounding only.
+    Weights are frozen; gradients with respect to the input flow.
 
     Example:
         >>> vae = WanVAE.random(WanLayout.of_base(8))
@@ -96,7 +96,6 @@ class WanVAE(nn.Module):
         self.conv2 = PointwiseConv(layout.latent, layout.latent, axes=3)
         self.decoder = Decoder(layout)
         self.stats = LatentStats(mean, std)
-        self.latents_per_pass: int | None = 1
         self.eval().requires_grad_(False)
 
     @classmethod
@@ -140,40 +139,6 @@ class WanVAE(nn.Module):
         vae.stats = LatentStats(WAN_MEAN, WAN_STD)
         return vae
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the weights, and of every result."""
-        return self.conv1.weight.dtype
-
-    def encode(self, video: Tensor) -> Tensor:
-        """Encode a whole clip.
-
-        Args:
-            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` brings any clip there).
-
-        Returns:
-            ``(B, 16, 1 + k, H/8, W/8)``, normalised means; nothing is sampled.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.encode_next(video, None)[0]
-
-    def decode(self, z: Tensor, *, clamp: bool = True) -> Tensor:
-        """Decode a whole clip.
-
-        Args:
-            z: ``(B, 16, t, h, w)``, normalised.
-            clamp: Whether to cut the result to [-1, 1], as the original does; off for losses.
-
-        Returns:
-            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)``.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.decode_next(z, None, clamp=clamp)[0]
-
     def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function.
 
@@ -211,14 +176,6 @@ class WanVAE(nn.Module):
         ends = pass_ends(z.shape[2], self.latents_per_pass)
         video, state = in_passes(partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends)
         return video.clamp(-1, 1) if clamp else video, state
-
-    def encoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.encode_next, detach=detach))
-
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents) -> frames`` as `decode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.decode_next, detach=detach))
 
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
         streaming = StreamingState(state, detach)

@@ -222,7 +222,7 @@ def test_decoded_frames_are_those_of_the_whole_clip() -> None:
 def test_impossible_objectives_are_refused(net: CosmosCausalDiT) -> None:
     with pytest.raises(InputError, match="nothing to minimise"):
         Objectives(flow=None, horizon=0)
-    with pytest.raises(InputError, match="no function that measures it"):
+    with pytest.raises(InputError, match="no distance function"):
         losses(net, sample(), TEXT, Objectives())
     with pytest.raises(InputError, match="w = 8"):
         losses(net, sample(8), TEXT, Objectives(horizon=0))
