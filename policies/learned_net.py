@@ -56,8 +56,8 @@ class LearnedNet(nn.Module):
         )  # fmt: skip
         self.word = nn.Embedding(len(COMMANDS), 16)
         self.state = nn.Sequential(nn.Linear(STATES, 32), nn.ReLU())
-        seen = 24 * (HEIGHT // 16) * (WIDTH // 16)
-        self.plan = nn.Sequential(nn.Linear(seen + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU())
+        features = 24 * (HEIGHT // 16) * (WIDTH // 16)
+        self.plan = nn.Sequential(nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU())
         self.out = nn.Linear(128, sum(_PARTS))
         self._init_weights(torch.Generator().manual_seed(seed))
         self.register_buffer("knot_scale", torch.tensor(_KNOT_SCALE), persistent=False)
@@ -77,8 +77,8 @@ class LearnedNet(nn.Module):
 
     def forward(self, image: Tensor, state: Tensor, command: Tensor) -> Prediction:
         """Predict from images ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands ``(B,)``."""
-        seen = torch.cat([self.see(image), self.state(state), self.word(command)], dim=1)
-        heading, speed, sigma, leader = self.out(self.plan(seen)).split(_PARTS, dim=1)
+        features = torch.cat([self.see(image), self.state(state), self.word(command)], dim=1)
+        heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
         leader = torch.stack([torch.sigmoid(leader[:, 0]), SPEED_UNIT_MPS * leader[:, 1]], dim=1)
         return Prediction(heading * self.knot_scale, speed * self.speed_scale, sigma, leader)

@@ -21,7 +21,7 @@ from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
 from alpasim_plugin.training.pair_import import PairSources, import_sequence
 from alpasim_plugin.training.pair_sheet import contact_sheet, measure_sequence, sheet, write_sheet
 from alpasim_plugin.training.pair_store import PairDataset
-from alpasim_plugin.training.pairs import Draw, PairRecipe, make_sequence
+from alpasim_plugin.training.pairs import DegradationMode, PairRecipe, make_sequence
 from alpasim_plugin.training.scenes import SPLITS
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand
@@ -78,7 +78,8 @@ def pairs(
     split: Annotated[str, typer.Option("--split", help="Splits, comma-separated.")] = ",".join(SPLITS),
     source: Annotated[str, typer.Option("--source", help="Renderer of the degraded frames.")] = "3dgs",
     degradation: Annotated[
-        Draw, typer.Option("--degradation", help="mixed: reconstruction or cycle render, at random; as-set: the setting of each scenario.")
+        DegradationMode,
+        typer.Option("--degradation", help="mixed: reconstruction or cycle render, at random; as-set: as in the scenario."),
     ] = "mixed",
     max_offset_m: Annotated[float, typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres.")] = 1.5,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the degradation and of the lateral offset.")] = 0,

@@ -62,8 +62,8 @@ def named_distance(name: str) -> ArrayDistance:
     return distance
 
 
-def _u8(pictures: F32) -> U8:
-    return np.rint(pictures * 255).astype(np.uint8)
+def _u8(images: F32) -> U8:
+    return np.rint(images * 255).astype(np.uint8)
 
 
 def _read(path: Path) -> F32:

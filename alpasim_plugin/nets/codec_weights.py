@@ -25,16 +25,17 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
         InputError: Missing, unexpected, mis-shaped (also transposed), non-floating keys, all in one message; or a value that
             overflows ``dtype``.
     """
-    due = {key: tuple(value.shape) for key, value in net.state_dict().items()}
-    wrong = [_describe(key, tensors[key], due[key]) for key in sorted(due.keys() & tensors.keys()) if tuple(tensors[key].shape) != due[key]]
+    expected = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+    shared = sorted(expected.keys() & tensors.keys())
+    wrong = [_describe(key, tensors[key], expected[key]) for key in shared if tuple(tensors[key].shape) != expected[key]]
     other = [f"{key} ({tensors[key].dtype})" for key in sorted(tensors) if not tensors[key].is_floating_point()]
-    missing, unexpected = sorted(due.keys() - tensors.keys()), sorted(tensors.keys() - due.keys())
+    missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     groups = {"missing": missing, "unexpected": unexpected, "wrong shape": wrong, "not floating point": other}
     if found := [listed(what, keys) for what, keys in groups.items() if keys]:
-        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} expected)", "; ".join(found), do)
+        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(expected)} expected)", "; ".join(found), do)
     constants = {key for key, _ in net.named_buffers()}
-    precision = {key: torch.float32 if key in constants else dtype for key in due}
-    net.load_state_dict({key: _packed(convert(key, tensors[key], precision[key], source)) for key in due}, assign=True)
+    precision = {key: torch.float32 if key in constants else dtype for key in expected}
+    net.load_state_dict({key: _packed(convert(key, tensors[key], precision[key], source)) for key in expected}, assign=True)
 
 
 def fill_random(net: nn.Module, seed: int, component: str) -> None:
@@ -59,7 +60,7 @@ def _packed(value: Tensor) -> Tensor:
     return value.permute(2, 0, 3, 4, 1).contiguous().permute(1, 4, 0, 2, 3) if value.ndim == 5 else value
 
 
-def _describe(key: str, value: Tensor, due: tuple[int, ...]) -> str:
+def _describe(key: str, value: Tensor, expected: tuple[int, ...]) -> str:
     shape = tuple(value.shape)
-    hint = ", transposed" if sorted(shape) == sorted(due) else ""
-    return f"{key} is {list(shape)} for {list(due)}{hint}"
+    hint = ", transposed" if sorted(shape) == sorted(expected) else ""
+    return f"{key} is {list(shape)} for {list(expected)}{hint}"

@@ -18,7 +18,6 @@ from typing import Self, cast
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import checkpoints
@@ -50,7 +49,6 @@ class CosmosCausalDiT(nn.Module):
         time_rounding: ``torch.bfloat16`` rounds time steps as the original training code does; float32 does not round.
 
     Attributes:
-        checkpoint_blocks: Recompute blocks in the backward pass to save memory (activation checkpointing); whole clips only.
         folded_t: The only valid time step of a network from `folded`.
     """
 
@@ -63,7 +61,6 @@ class CosmosCausalDiT(nn.Module):
         super().__init__()
         self.sizes, self.rope_ratios, self.time_rounding = sizes, rope_ratios, time_rounding
         self.rope = Rope3D(sizes.head_width, rope_ratios)
-        self.checkpoint_blocks = False
         self.folded_t: float | None = None
         self.x_embedder = PatchEmbed(sizes.latent_channels + MASK_CHANNELS, sizes.width)
         self.additional_patch_embedding = PatchEmbed(sizes.map_channels, sizes.width)
@@ -153,7 +150,7 @@ class CosmosCausalDiT(nn.Module):
         attention = functools.partial(
             block_causal_attention, tokens=rows * columns, block_latents=block_latents or frames, window=window, sink=sink
         )
-        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: attention, self.checkpoint_blocks)
+        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: attention)
 
     def step(
         self,
@@ -246,15 +243,13 @@ class CosmosCausalDiT(nn.Module):
         padding_mask: Tensor | None,
         table: RopeTable,
         attention: Callable[[int], Attend],
-        recompute: bool = False,
     ) -> Tensor:
         time = self._time(t)
         text = text if isinstance(text, TextContext) else self.encode_text(text)
         tokens = embed_latents(self.x_embedder.linear, x.to(self.dtype), condition_mask, padding_mask)
         tokens = tokens + self.additional_patch_embedding.linear.embed(hdmap.to(self.dtype))
         for layer, block in enumerate(self.blocks):
-            args = (tokens, time, text.keys_values[layer], table, attention(layer))
-            tokens = checkpoint(block, *args, use_reentrant=False) if recompute and torch.is_grad_enabled() else block(*args)
+            tokens = block(tokens, time, text.keys_values[layer], table, attention(layer))
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal | None:
@@ -276,9 +271,9 @@ class CosmosCausalDiT(nn.Module):
         if x.ndim != 5 or x.shape[1] != sizes.latent_channels or x.shape[2] < 1 or x.shape[3] % 2 or x.shape[4] % 2 or 0 in x.shape:
             do = f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)"
             raise InputError(doing, "x", f"shape {list(x.shape)}", do)
-        due = [x.shape[0], sizes.map_channels, *x.shape[2:]]
-        if list(hdmap.shape) != due:
-            raise InputError(doing, "hdmap", f"shape {list(hdmap.shape)}", f"give {due}, the map at the latents of x")
+        expected = [x.shape[0], sizes.map_channels, *x.shape[2:]]
+        if list(hdmap.shape) != expected:
+            raise InputError(doing, "hdmap", f"shape {list(hdmap.shape)}", f"give {expected}, the map at the latents of x")
         if isinstance(t, Tensor) and (t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])):
             do = f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number"
             raise InputError(doing, "t", f"shape {list(t.shape)}", do)
@@ -295,13 +290,13 @@ class CosmosCausalDiT(nn.Module):
 
     def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
         made: tuple[object, ...] = (cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios)
-        due: tuple[object, ...] = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
+        expected: tuple[object, ...] = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
         if isinstance(cache, RollingCache):
-            made, due = (*made, *cache.layout), (*due, self.sizes.blocks, self.sizes.heads, self.dtype)
-        if made != due:
+            made, expected = (*made, *cache.layout), (*expected, self.sizes.blocks, self.sizes.heads, self.dtype)
+        if made != expected:
             do = "make the cache with this network's new_cache for this batch and latent size"
             names = "batch, height, width, head width, rope ratios, layers, heads, dtype"
-            raise InputError("running one block with a cache", names, f"cache {made}, block and network {due}", do)
+            raise InputError("running one block with a cache", names, f"cache {made}, block and network {expected}", do)
 
 
 __all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext"]

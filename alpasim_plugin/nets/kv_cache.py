@@ -90,10 +90,6 @@ class BlockCache(ABC):
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Attend from the open block to itself and the visible past; see `attention.attend` for shapes."""
 
-    @abstractmethod
-    def history(self, layer: int) -> tuple[Tensor, Tensor]:
-        """Return a layer's cached keys and values, oldest first, ``(B, latents * tokens, heads, head_width)``."""
-
 
 class RollingCache(BlockCache):
     """Hold at most ``window`` latents per layer in preallocated buffers.
@@ -175,14 +171,6 @@ class RollingCache(BlockCache):
         past = self.visible[1] * self.tokens
         return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
 
-    def history(self, layer: int) -> tuple[Tensor, Tensor]:
-        """Return a copy of a layer's cached keys and values, oldest first."""
-        ring = self.size - self.sink
-        rolling = range(max(self.sink, self.filled - ring), self.filled)
-        slots = [*range(min(self.sink, self.filled)), *(self.sink + (i - self.sink) % ring for i in rolling)]
-        rows = self._token_rows(slots).to(self.device)
-        return self.keys[layer][:, rows], self.values[layer][:, rows]
-
     def _keep_in_place(self, old: Tensor | None, latents: list[int]) -> Tensor:
         """Return the rows of these latents, in the old tensor's storage if the shape is equal."""
         rows = self._token_rows(latents)
@@ -212,8 +200,8 @@ class GraphCache(BlockCache):
         """Attend to the concatenation of the visible past and the block."""
         self._open[layer] = (k, v)
         kept = self._kept.get(layer, [])
-        seen = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
-        return attend(q, torch.cat([*(kept[i][0] for i in seen), k], dim=1), torch.cat([*(kept[i][1] for i in seen), v], dim=1))
+        visible = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
+        return attend(q, torch.cat([*(kept[i][0] for i in visible), k], dim=1), torch.cat([*(kept[i][1] for i in visible), v], dim=1))
 
     def commit(self) -> None:
         """Keep the tensors of the last forward."""
@@ -236,15 +224,3 @@ class GraphCache(BlockCache):
         copy.position, copy.filled = self.position, self.filled
         copy._kept = {layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()}
         return copy
-
-    def detach(self) -> None:
-        """Detach everything cached so far: gradients of later blocks stop here."""
-        for layer, kept in self._kept.items():
-            self._kept[layer] = [(k.detach(), v.detach()) for k, v in kept]
-
-    def history(self, layer: int) -> tuple[Tensor, Tensor]:
-        """Return a layer's cached keys and values, oldest first."""
-        kept = self._kept.get(layer, [])
-        newest = len(kept) - (self.window - self.sink) if self.window is not None else 0
-        seen = [pair for i, pair in enumerate(kept) if i < self.sink or i >= newest]
-        return torch.cat([k for k, _ in seen], dim=1), torch.cat([v for _, v in seen], dim=1)

@@ -139,12 +139,12 @@ class TinyVAE(StreamingCodec):
         check_latents(z, "decoding latents with the tiny VAE", LATENT)
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
-        _check_seen(render, opacity, (b, frames, h * SIDE, w * SIDE))
+        _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
         latent_ends, frame_ends = pass_ends(m, self.latents_per_pass), group_ends(frames, state is None, self.latents_per_pass)
         parts, start, first = [], 0, 0
         for end, last in zip(latent_ends, frame_ends, strict=True):
-            seen = [None if x is None else x[:, :, first:last].float() for x in (render, opacity)]
-            part, state = self._decode_pass(z[:, :, start:end].float(), seen[0], seen[1], state, detach)
+            condition = [None if x is None else x[:, :, first:last].float() for x in (render, opacity)]
+            part, state = self._decode_pass(z[:, :, start:end].float(), condition[0], condition[1], state, detach)
             parts.append(part)
             start, first = end, last
         assert state is not None
@@ -174,16 +174,16 @@ class TinyVAE(StreamingCodec):
             return from_grid(frames + correction).to(self.dtype), streaming.state
         shown = to_grid(_whole_groups(render, streaming.first))
         if opacity is None:
-            cover, difference = None, shown  # the synthesised picture has no detail to subtract
+            cover, difference = None, shown  # the synthesised image has no detail to subtract
         else:
             cover = to_grid(_whole_groups(opacity, streaming.first))
             shown, difference = _per_pixel(shown, cover), _per_pixel(shown - grid, cover)
-        seen = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
-        correction, gate = self.decoder.next(mu.to(self.dtype), seen, streaming)
+        condition = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
+        correction, gate = self.decoder.next(mu.to(self.dtype), condition, streaming)
         assert gate is not None
         detail = split_last(as_frames(self.transform.residue(difference)), CELL)
-        picture = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
-        return from_grid(picture.flatten(-2)).to(self.dtype), streaming.state
+        image = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
+        return from_grid(image.flatten(-2)).to(self.dtype), streaming.state
 
 
 def _untrained_stats() -> LatentStats:
@@ -200,8 +200,8 @@ def _whole_groups(frames: Tensor, first: bool) -> Tensor:
     return torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2) if first else frames
 
 
-def _check_seen(render: Tensor | None, opacity: Tensor | None, due: tuple[int, int, int, int]) -> None:
-    b, *size = due
+def _check_condition(render: Tensor | None, opacity: Tensor | None, expected: tuple[int, int, int, int]) -> None:
+    b, *size = expected
     for name, given, channels in (("render", render, COLOURS), ("opacity", opacity, 1)):
         if given is not None and tuple(given.shape) != (b, channels, *size):
             raise InputError(

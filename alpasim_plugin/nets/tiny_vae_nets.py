@@ -136,13 +136,13 @@ class TinyVAEDecoder(nn.Module):
         self.mix = TemporalResidualBlock(frame)
         self.head = FrameConv(frame, PIXELS + CELL)
 
-    def next(self, z: Tensor, seen: tuple[Tensor, Tensor | None] | None, streaming: StreamingState) -> tuple[Tensor, Tensor | None]:
+    def next(self, z: Tensor, condition: tuple[Tensor, Tensor | None] | None, streaming: StreamingState) -> tuple[Tensor, Tensor | None]:
         """Map latents to corrections.
 
         Args:
             z: ``(B, t, H/8, W/8, 16)``.
-            seen: Colours of the render times its opacity ``(B, T, H/4, W/4, 48)``, and the opacity ``(B, T, H/4, W/4, 16)`` or None for
-                opaque; None without a render.
+            condition: Colours of the render times its opacity ``(B, T, H/4, W/4, 48)``, and the opacity ``(B, T, H/4, W/4, 16)`` or
+                None for opaque; None without a render.
             streaming: Cached frames.
 
         Returns:
@@ -151,11 +151,11 @@ class TinyVAEDecoder(nn.Module):
         """
         latent_rate = (self.stem, activation(), *self.far, self.quarter, activation(), self.near, self.grow)
         x = channels_to_frames(run_layers(latent_rate, z, streaming), GROUP)[:, DROPPED if streaming.first else 0 :]
-        if seen is not None:
-            covered = self.see_opacity.weight.sum(1) if seen[1] is None else self.see_opacity(seen[1])
-            x = x + self.see_colour(seen[0]) + covered
+        if condition is not None:
+            covered = self.see_opacity.weight.sum(1) if condition[1] is None else self.see_opacity(condition[1])
+            x = x + self.see_colour(condition[0]) + covered
         x = self.mix.next(F.leaky_relu_(x, SLOPE), streaming)
-        if seen is None:
+        if condition is None:
             assert self.head.bias is not None
             return conv_frames(x, self.head.weight[:PIXELS], self.head.bias[:PIXELS], padding=1), None
         out = self.head(x)

@@ -44,8 +44,8 @@ def causal_conv(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Te
     for back in range(1, TAPS):
         start = max(0, back - past)  # first output frame that has a frame ``back`` steps before it
         if start < frames:
-            seen = joined[:, past + start - back : past + frames - back]
-            out[:, start:] += conv_frames(seen, weight[:, :, -1 - back], None, padding=pad)
+            inputs = joined[:, past + start - back : past + frames - back]
+            out[:, start:] += conv_frames(inputs, weight[:, :, -1 - back], None, padding=pad)
     return out
 
 
@@ -82,8 +82,8 @@ class TemporalDownsampleConv(nn.Module):
         """Halve the frames of ``(B, T, H, W, C)``; the first frame of a video passes unchanged and is the predecessor of the second."""
         joined = streaming.extend(x, 1)
         taps = self.weight.flatten(2).unbind(2)
-        seen = [joined[:, back : joined.shape[1] - (TAPS - 1) + back : 2] for back in range(TAPS)]
-        out = F.linear(seen[0], taps[0], self.bias) + F.linear(seen[1], taps[1]) + F.linear(seen[2], taps[2])
+        inputs = [joined[:, back : joined.shape[1] - (TAPS - 1) + back : 2] for back in range(TAPS)]
+        out = F.linear(inputs[0], taps[0], self.bias) + F.linear(inputs[1], taps[1]) + F.linear(inputs[2], taps[2])
         return torch.cat([x[:, :1], out], dim=1) if streaming.first else out
 
 
@@ -148,8 +148,8 @@ class FrameAttention(nn.Module):
         """Map ``(B, T, H, W, C)`` to the same shape."""
         pixels = self.norm(x).flatten(0, 1).flatten(1, 2)[:, None]  # (B * T, one head, H * W, C)
         q, k, v = self.to_qkv(pixels).chunk(3, dim=-1)
-        seen: Tensor = self.proj(F.scaled_dot_product_attention(q, k, v))
-        return x + seen.view(x.shape)
+        attended: Tensor = self.proj(F.scaled_dot_product_attention(q, k, v))
+        return x + attended.view(x.shape)
 
 
 class Downsample(nn.Module):

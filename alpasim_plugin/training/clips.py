@@ -21,7 +21,7 @@ DOING = "drawing a training clip"
 
 
 @dataclass(frozen=True)
-class ClipSize:
+class CropSize:
     """Frames, and the height and width of the crop, pixels; sides are multiples of 16."""
 
     frames: int
@@ -39,7 +39,7 @@ class Clip:
     sdmap: Tensor | None = None
 
 
-def draw_pair_clip(sequences: Sequence[PairSequence], size: ClipSize, seed: int, index: int) -> Clip:
+def draw_pair_clip(sequences: Sequence[PairSequence], size: CropSize, seed: int, index: int) -> Clip:
     """Sample a clip from pairs: random sequence, start, crop and horizontal flip."""
     rng = stream("training", seed, "clips.pairs", index)
     clip = sequences[int(rng.integers(len(sequences)))].clip
@@ -53,7 +53,7 @@ def draw_pair_clip(sequences: Sequence[PairSequence], size: ClipSize, seed: int,
     return Clip(tensor(cut.rgb_gt), tensor(cut.rgb_input), (tensor(cut.opacity[..., None]) + 1) / 2, tensor(cut.sdmap))
 
 
-def draw_video_clip(videos: Sequence[U8], size: ClipSize, seed: int, index: int) -> Clip:
+def draw_video_clip(videos: Sequence[U8], size: CropSize, seed: int, index: int) -> Clip:
     """Sample a clip from videos ``(T, H, W, 3)``: random start, crop, time reversal and horizontal flip."""
     rng = stream("training", seed, "clips.videos", index)
     lengths = np.array([len(v) for v in videos], dtype=np.float64)
@@ -87,7 +87,7 @@ def to_tensor(frames: U8, flip: bool = False) -> Tensor:
     return torch.from_numpy(array).permute(3, 0, 1, 2).float() / 127.5 - 1
 
 
-def _window(rng: np.random.Generator, shape: tuple[int, ...], size: ClipSize) -> tuple[int, slice, slice]:
+def _window(rng: np.random.Generator, shape: tuple[int, ...], size: CropSize) -> tuple[int, slice, slice]:
     free = [shape[0] - size.frames, shape[1] - size.height, shape[2] - size.width]
     if min(free) < 0:
         raise InputError(DOING, f"frames {list(shape[:3])}", f"no room for {size}", "make larger sequences, or draw smaller clips")

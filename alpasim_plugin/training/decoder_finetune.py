@@ -24,7 +24,7 @@ from alpasim_plugin.nets.dit import CosmosCausalDiT
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
-from alpasim_plugin.training.perceptual_term import Distance, frames_of
+from alpasim_plugin.training.perceptual_term import Distance, flatten_frames
 from alpasim_plugin.training.shared_rollout import roll_out
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.training.vae import reconstruction_loss
@@ -155,10 +155,10 @@ class DecoderTask:
     def loss(self, batch: DecoderBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         made = self.vae.decode(batch.z, render=batch.render, opacity=batch.opacity, clamp=False)
-        parts = {"picture": reconstruction_loss(made, batch.clean, self.recipe.edge_weight)}
+        parts = {"image": reconstruction_loss(made, batch.clean, self.recipe.edge_weight)}
         if self.distance is not None and self.recipe.perceptual_weight:
             frames = slice(max(1 + GROUP * (batch.w - 1), 0), 1 + GROUP * batch.w)
-            distance = self.distance[1](frames_of(made[:, :, frames]), frames_of(batch.clean[:, :, frames])).mean()
+            distance = self.distance[1](flatten_frames(made[:, :, frames]), flatten_frames(batch.clean[:, :, frames])).mean()
             parts["perceptual"] = self.recipe.perceptual_weight * distance
         numbers = {name: float(value.detach()) for name, value in parts.items()}
         numbers["psnr_db"] = psnr_db(made.detach(), batch.clean)

@@ -127,7 +127,7 @@ def _append_sample(
 ) -> None:  # fmt: skip
     """Append one sample: a state with the rig rotated about its camera."""
     turn_rad = MAX_TURN_RAD * turn
-    pose = turned(state.T_world_rig, camera, turn_rad)
+    pose = rotated_about_camera(state.T_world_rig, camera, turn_rad)
     path = rollout.line.path
     points, headings = expert_path(path, state.s_m, pose, state.speed_mps)
     box, axle_m = scenario.vehicle.box, scenario.vehicle.rear_axle_to_centre_m
@@ -148,7 +148,7 @@ def _append_sample(
         rows[name].append(value)
 
 
-def turned(T_world_rig: F64, camera: CameraSpec, turn_rad: float) -> F64:
+def rotated_about_camera(T_world_rig: F64, camera: CameraSpec, turn_rad: float) -> F64:
     """Return the rig's pose rotated to the left about its camera."""
     at = se3(camera.T_rig_camera[:3, 3], [1.0, 0.0, 0.0, 0.0])
     return np.asarray(T_world_rig @ at @ se3([0.0, 0.0, 0.0], quat_from_yaw(turn_rad)) @ inverse(at))

@@ -113,7 +113,7 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
     return T, times
 
 
-def frames_of(path: Path) -> Iterator[U8]:
+def read_frames(path: Path) -> Iterator[U8]:
     """Yield the images ``(H, W, 3)`` of a channel one at a time.
 
     Raises:
@@ -152,7 +152,7 @@ def _array_frames(path: Path) -> Iterator[U8]:
 
 def _first_and_count(path: Path) -> tuple[U8, int]:
     """Return the first image and the number of images; videos are decoded to the end to count frames."""
-    frames = frames_of(path)
+    frames = read_frames(path)
     first = next(frames, None)
     if first is None:
         raise InputError(DOING, str(path), "no frame", "give a channel with images")
@@ -160,7 +160,7 @@ def _first_and_count(path: Path) -> tuple[U8, int]:
 
 
 def _pairs(named: Mapping[str, Path], T: F64, t_us: list[int], length: int, size: tuple[int, int] | None) -> Iterator[Pair]:
-    streams = {name: frames_of(path) for name, path in named.items()}
+    streams = {name: read_frames(path) for name, path in named.items()}
     for i in range(length):
         images = {name: _scaled(next(stream), size) for name, stream in streams.items()}
         opacity = cv2.cvtColor(images["opacity"], cv2.COLOR_RGB2GRAY)

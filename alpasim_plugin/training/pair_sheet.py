@@ -166,11 +166,11 @@ def contact_sheet(sequences: Sequence[PairSequence], rows: int = ROWS) -> U8:
     return np.concatenate([np.pad(line, ((0, 2), (0, width - line.shape[1]), (0, 0))) for line in lines])
 
 
-def write_sheet(out: Path, document: Mapping[str, Any], picture: U8) -> None:
+def write_sheet(out: Path, document: Mapping[str, Any], image: U8) -> None:
     """Write ``sheet.md`` and ``sheet.jpg`` into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "sheet.md", markdown(document))
-    cv2.imwrite(str(out / "sheet.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    cv2.imwrite(str(out / "sheet.jpg"), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def _thumb(image: U8) -> U8:

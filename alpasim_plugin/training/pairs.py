@@ -23,8 +23,8 @@ from alpasim_plugin.types import F64, CameraSpec, Degradation, RenderRequest, Sc
 from alpasim_plugin.world.ground import ground_pose
 
 DOING = "making training pairs"
-Draw = Literal["mixed", "as-set"]
-SHARES = (0.08, 0.24)  # of the fit's schedule, sampled for mixed sequences, so that the quality of the renderer varies
+DegradationMode = Literal["mixed", "as-set"]
+FIT_SHARES = (0.08, 0.24)  # of the fit's schedule, sampled for mixed sequences, so that the quality of the renderer varies
 SHIFT_M = 1.0  # of the cycle render (paper, App. A); the side is random
 MOVING_M = 2.0  # an actor with a longer track counts as moving
 
@@ -45,7 +45,7 @@ class PairRecipe:
 
     source: str = "3dgs"
     target: str = "clean"
-    degradation: Draw = "mixed"
+    degradation: DegradationMode = "mixed"
     max_offset_m: float = 1.5
     interval_us: int = 100_000
     camera: str | None = None
@@ -89,7 +89,7 @@ def draw_degradation(scenario: Scenario, recipe: PairRecipe, seed: int) -> Degra
     if recipe.degradation == "as-set":
         return scenario.degradation
     rng = stream(scenario.scene_id, seed, "training.degradation")
-    is_cycle, side, share = rng.random() < 0.5, rng.random() < 0.5, round(float(rng.uniform(*SHARES)), 2)
+    is_cycle, side, share = rng.random() < 0.5, rng.random() < 0.5, round(float(rng.uniform(*FIT_SHARES)), 2)
     if is_cycle:
         return Degradation("cycle", share=share, shift_m=SHIFT_M if side else -SHIFT_M)
     return Degradation("reconstruction", share=share)

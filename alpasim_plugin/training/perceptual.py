@@ -82,20 +82,20 @@ class PerceptualTraining(nn.Module):
         super().__init__()
         self.net = net
         one, two, three, four = net.trunk.widths
-        self.see = nn.ModuleList([nn.Conv2d(c, len(CLASSES), 1) for c in (two, three, four)])
-        self.read_half = nn.Conv2d(one, 3 * 2 * 2, 1)
-        self.read_quarter = nn.Conv2d(two, 3 * CELL * CELL, 1)
+        self.semantic_heads = nn.ModuleList([nn.Conv2d(c, len(CLASSES), 1) for c in (two, three, four)])
+        self.reconstruct_half = nn.Conv2d(one, 3 * 2 * 2, 1)
+        self.reconstruct_quarter = nn.Conv2d(two, 3 * CELL * CELL, 1)
 
     def semantics(self, features: list[Tensor]) -> Tensor:
         """Return logits ``(N, classes, H / 4, W / 4)``."""
         size = features[1].shape[2:]
-        parts = [F.interpolate(head(x), size=size, mode="bilinear") for head, x in zip(self.see, features[1:], strict=True)]
+        parts = [F.interpolate(head(x), size=size, mode="bilinear") for head, x in zip(self.semantic_heads, features[1:], strict=True)]
         return torch.stack(parts).sum(0)
 
     def readout_error(self, features: list[Tensor], image: Tensor) -> Tensor:
         """Return the mean absolute error of the linear reconstruction of ``image`` from the first two stages."""
-        half = F.pixel_shuffle(self.read_half(features[0]), 2)
-        quarter = F.pixel_shuffle(self.read_quarter(features[1]), CELL)
+        half = F.pixel_shuffle(self.reconstruct_half(features[0]), 2)
+        quarter = F.pixel_shuffle(self.reconstruct_quarter(features[1]), CELL)
         return (half - image).abs().mean() + (quarter - image).abs().mean()
 
 

@@ -40,7 +40,7 @@ class DecodedDistance:
         with torch.no_grad():
             wanted = self._decode(self.z_0, w)
         made = self._decode(predicted, w)
-        return self.distance(frames_of(made), frames_of(wanted)).mean()
+        return self.distance(flatten_frames(made), flatten_frames(wanted)).mean()
 
     def _decode(self, z: Tensor, w: int) -> Tensor:
         state, end = None, 0
@@ -55,6 +55,6 @@ class DecodedDistance:
         return self.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
 
 
-def frames_of(video: Tensor) -> Tensor:
+def flatten_frames(video: Tensor) -> Tensor:
     """Flatten clips to frames: ``(B, C, T, H, W)`` to ``(B T, C, H, W)``."""
     return video.transpose(1, 2).flatten(0, 1)

@@ -53,14 +53,14 @@ def perturbed_rollouts(scenario: Scenario, count: int, drive_s: float, seed: int
     """Yield rollouts of a scenario along its route, its neighbouring lanes and the other turns of its junctions."""
     first = ego_state_from_log(scenario.ego_log, scenario.start_us, scenario.vehicle)
     cruise = max(first.speed_mps, 6.0)
-    others = [*turning_lines(scenario), *((path, None) for path in lines_beside(scenario))]
+    others = [*turning_lines(scenario), *((path, None) for path in neighbour_lines(scenario))]
     for k in range(count):
         # Every third rollout follows the route; the others alternate among the other lines.
         path, turn_s_m = others[(k - 1 - k // 3) % len(others)] if others and k % 3 else (smooth_path(scenario.route.xyz), None)
         yield _drive(scenario, path, turn_s_m, cruise, drive_s, stream(scenario.scene_id, seed, "training.policy.drive", k))
 
 
-def lines_beside(scenario: Scenario) -> list[Path]:
+def neighbour_lines(scenario: Scenario) -> list[Path]:
     """Return the left and right neighbouring lanes that exist along the whole route."""
     lanes = scenario.lane_map.lanes
     out = []
@@ -109,7 +109,7 @@ def _drive(
     front = scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
     half = scenario.vehicle.box.width_m / 2
     leader = _SyntheticLeader.draw(scenario, path, s + front, style.desired_mps, random)
-    offset = _lateral_offset(random, MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and lines_beside(scenario) else MAX_OFFSET_M)
+    offset = _lateral_offset(random, MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M)
     states = []
     lag = random.uniform(0.0, 1.0)  # a delayed driver gets closer to the leader than the expert
     accel = 0.0
@@ -117,7 +117,7 @@ def _drive(
         t = t_us + round(step * STEP_S * 1e6)
         if t > scenario.end_us or s > path.length_m - 15.0:
             break
-        actors, bodies = others_at(scenario, t, leader)
+        actors, bodies = traffic_at(scenario, t, leader)
         ahead = leader_on(line, s, front, half, bodies)
         if step % round(FRAME_INTERVAL_S / STEP_S) == 0:
             states.append(_state_at(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
@@ -156,10 +156,10 @@ def _state_at(
     xyz, yaw = path.at(s, offset)
     heading = float(yaw) + float(np.arctan2(np.clip(drift, -0.17 * max(v, 1.0), 0.17 * max(v, 1.0)), max(v, 1.0)))
     pose = ground_pose(scenario.ground, float(xyz[0]), float(xyz[1]), heading)
-    return RolloutState(t_us, pose, v, s, actors, bodies, not _touches(scenario, pose, bodies))
+    return RolloutState(t_us, pose, v, s, actors, bodies, not _collides(scenario, pose, bodies))
 
 
-def _touches(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: float = 0.1) -> bool:
+def _collides(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: float = 0.1) -> bool:
     """Return whether the car's footprint overlaps an actor's (tested on a grid of points of each)."""
     if len(bodies.xy) == 0:
         return False
@@ -173,18 +173,18 @@ def _touches(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: flo
             (xy, yaw, np.array([length, width]), centre, yaw_of(T_world_rig), half),
             (centre, yaw_of(T_world_rig), half, xy, yaw, np.array([length, width])),
         ):
-            points = at + (grid * extent) @ _turn(angle).T
-            local = (points - other) @ _turn(other_angle)
+            points = at + (grid * extent) @ _rotation(angle).T
+            local = (points - other) @ _rotation(other_angle)
             if (np.abs(local) < other_extent).all(axis=1).any():
                 return True
     return False
 
 
-def _turn(angle: float) -> F64:
+def _rotation(angle: float) -> F64:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def others_at(scenario: Scenario, t_us: int, leader: _SyntheticLeader | None) -> tuple[dict[str, F64], Bodies]:
+def traffic_at(scenario: Scenario, t_us: int, leader: _SyntheticLeader | None) -> tuple[dict[str, F64], Bodies]:
     """Return the poses of all actors at a recorded time, and the same as bodies with velocities."""
     actors = log_actors(scenario, t_us)
     before, after = (log_actors(scenario, t_us + dt_us) for dt_us in (-100_000, 100_000))

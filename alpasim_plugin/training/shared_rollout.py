@@ -66,7 +66,7 @@ class Sample:
         eps: Noise of the source, like ``z_0``.
         eps_context: Noise of the cache write, like ``z_0``.
         t: ``(B, N)`` uniform in 0..1, flow matching's times.
-        t_again: ``(B, N)`` uniform in 0..1, the noise levels of re-denoised history.
+        t_redenoise: ``(B, N)`` uniform in 0..1, the noise levels of re-denoised history.
         w: Position of the perceptual term.
     """
 
@@ -77,7 +77,7 @@ class Sample:
     eps: Tensor
     eps_context: Tensor
     t: Tensor
-    t_again: Tensor
+    t_redenoise: Tensor
     w: int
 
 
@@ -90,14 +90,14 @@ class Losses:
         flow: Mean over all elements; None if off.
         perceptual: Unweighted; None if off.
         rollout: ``(B, C, N, H, W)`` the model's own predictions, detached; None if no objective needs them.
-        seen: The predictions up to w of the perceptual term, block by block, before detaching at the horizon.
+        predictions: The predictions up to w of the perceptual term, block by block, before detaching at the horizon.
     """
 
     total: Tensor
     flow: Tensor | None
     perceptual: Tensor | None
     rollout: Tensor | None
-    seen: tuple[Tensor, ...] = ()
+    predictions: tuple[Tensor, ...] = ()
 
 
 def losses(
@@ -133,14 +133,14 @@ def losses(
     rollout = _Rollout(net, sample, text, objectives, block_latents, window)
     history = rollout.history()
     flow = None if objectives.flow is None else rollout.flow_matching(history, channel_weights)
-    seen: tuple[Tensor, ...] = ()
+    predictions: tuple[Tensor, ...] = ()
     perc = None
     if objectives.horizon:
         assert perceptual is not None
-        seen = rollout.predictions_with_gradient()
-        perc = perceptual(torch.cat([rollout.cut(z, b) for z, b in zip(seen, rollout.blocks, strict=False)], dim=2), sample.w)
+        predictions = rollout.predictions_with_gradient()
+        perc = perceptual(torch.cat([rollout.cut(z, b) for z, b in zip(predictions, rollout.blocks, strict=False)], dim=2), sample.w)
     terms = [term for term in (flow, None if perc is None else objectives.weight * perc) if term is not None]
-    return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, seen)
+    return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, predictions)
 
 
 def channel_weighted(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
@@ -251,7 +251,7 @@ class _Rollout:
 
     def _denoise_again(self, b: slice, cache: GraphCache) -> Tensor:
         """Noise the clean latents to a random level and denoise them, given previously denoised blocks."""
-        t = self.s.t_again[:, b]
+        t = self.s.t_redenoise[:, b]
         z_t = interpolant(self.s.z_0[:, :, b], self.z_1[:, :, b], t[:, None, :, None, None])
         v = self.net.step(z_t, T_SOURCE * t, self.text, self.condition[:, :, b], cache, write=False)
         return flow_step(z_t, v, t[:, None, :, None, None])

@@ -150,10 +150,10 @@ class Trainer(Generic[Batch]):
             group["lr"] = lr
         self.optimiser.step()
         self.step += 1
-        self._follow()
+        self._update_average()
         return {**sums, "grad_norm": norm, "lr": lr, "s": time.perf_counter() - began}
 
-    def _follow(self) -> None:
+    def _update_average(self) -> None:
         """Update the EMA; its decay is lower in early updates, so that the initial weights have little influence."""
         decay = min(self.schedule.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():

@@ -18,7 +18,7 @@ from torch import Tensor
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import LATENT
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.clips import Clip, ClipSize, draw_pair_clip, draw_video_clip
+from alpasim_plugin.training.clips import Clip, CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import U8
@@ -34,16 +34,16 @@ class VaeRecipe:
         size: Frames (1 + 4k) and crop.
         latent_noise: Standard deviation of the noise on latents, which have unit variance.
         edge_weight: Weight of the difference of neighbouring pixels and frames: sharpness and flicker.
-        side_weight: Weight of degraded renders and semantic maps.
+        auxiliary_weight: Weight of degraded renders and semantic maps.
         seed: Of sampling and noise.
     """
 
     pair_clips: int = 2
     video_clips: int = 1
-    size: ClipSize = ClipSize(9, 96, 160)
+    size: CropSize = CropSize(9, 96, 160)
     latent_noise: float = 0.05
     edge_weight: float = 0.3
-    side_weight: float = 0.3
+    auxiliary_weight: float = 0.3
     seed: int = 0
 
 
@@ -53,7 +53,7 @@ class VaeBatch:
 
     pairs: Clip | None
     video: Tensor | None
-    side: Tensor | None  # one degraded render or one semantic map
+    auxiliary: Tensor | None  # one degraded render or one semantic map
 
 
 class VaeTask:
@@ -73,16 +73,16 @@ class VaeTask:
         """Make batch ``index``."""
         r = self.recipe
         pairs = None
-        side = None
+        auxiliary = None
         if r.pair_clips:
             clips = [draw_pair_clip(self.sequences, r.size, r.seed, index * r.pair_clips + i) for i in range(r.pair_clips)]
             pairs = Clip(*(torch.stack([getattr(c, name) for c in clips]) for name in ("target", "render", "opacity", "sdmap")))
-            side = (pairs.render if index % 2 else pairs.sdmap)[:1]  # type: ignore[index]
+            auxiliary = (pairs.render if index % 2 else pairs.sdmap)[:1]  # type: ignore[index]
         video = None
         if r.video_clips and self.videos:
             clips = [draw_video_clip(self.videos, r.size, r.seed, index * r.video_clips + i) for i in range(r.video_clips)]
             video = torch.stack([c.target for c in clips])
-        return VaeBatch(pairs, video, side)
+        return VaeBatch(pairs, video, auxiliary)
 
     def loss(self, batch: VaeBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
@@ -97,9 +97,10 @@ class VaeTask:
         if batch.video is not None:
             _, noisy = self._latents(batch.video, index, 1)
             parts["video"] = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.video, r.edge_weight)
-        if batch.side is not None:
-            _, noisy = self._latents(batch.side, index, 2)
-            parts["side"] = r.side_weight * reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.side, r.edge_weight)
+        if batch.auxiliary is not None:
+            _, noisy = self._latents(batch.auxiliary, index, 2)
+            error = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.auxiliary, r.edge_weight)
+            parts["auxiliary"] = r.auxiliary_weight * error
         total = torch.stack(list(parts.values())).sum()
         return total, {name: float(value.detach()) for name, value in parts.items()}
 

@@ -31,8 +31,8 @@ def round_trip(vae: TinyVAE, video: Tensor, render: Tensor | None = None, opacit
     """Encode and decode a clip ``(1, 3, T, H, W)`` of any size; a render conditions the decoder."""
     with torch.inference_mode():
         padded, size = pad_clip(video)
-        seen = [None if x is None else pad_clip(x)[0] for x in (render, opacity)]
-        return crop_clip(vae.decode(vae.encode(padded), render=seen[0], opacity=seen[1]), size)
+        condition = [None if x is None else pad_clip(x)[0] for x in (render, opacity)]
+        return crop_clip(vae.decode(vae.encode(padded), render=condition[0], opacity=condition[1]), size)
 
 
 def quality(made: Tensor, wanted: Tensor) -> VaeQuality:

@@ -12,6 +12,7 @@ from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text
 from alpasim_plugin.nets.sampling import finalise, mixed_source, sample_block
 from alpasim_plugin.nets.schedule import steps
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from tests.nets.cache_history import history
 from tests.nets.dit_reference import random_weights
 from tests.nets.eager_recorder import EagerRecorder
 
@@ -72,7 +73,7 @@ def test_replayed_blocks_are_eager_blocks_bit_for_bit(precision):
     assert sum(recorded.function.counts.values()) == 9
     assert all(place == places[1] for place in places[1:]), "the cache moved"
     for layer in range(SIZES.blocks):
-        for ours, theirs in zip(recorded.cache.history(layer), eager.cache.history(layer), strict=True):
+        for ours, theirs in zip(history(recorded.cache, layer), history(eager.cache, layer), strict=True):
             assert torch.equal(ours, theirs)
 
 

@@ -8,6 +8,7 @@ import torch
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names, named, shifted, steps
+from tests.nets.cache_history import history
 from tests.nets.dit_cases import clip, furthest, network
 
 
@@ -130,7 +131,7 @@ def test_one_step_is_equation_two_and_folding_changes_nothing():
     folded = sample_block(net.folded(1000.0), [z_1, eps], text, hdmap, three, steps(1), "finalise", finalise_net=net.folded(128.0))
     two.reset()
     assert furthest(folded, sample_block(net, [z_1, eps], *args)) < 1e-5
-    assert furthest(two.history(1)[0], three.history(1)[0]) < 1e-5
+    assert furthest(history(two, 1)[0], history(three, 1)[0]) < 1e-5
 
 
 @pytest.mark.parametrize("history", ["finalise", "last-forward"])

@@ -19,11 +19,11 @@ from alpasim_plugin.training.demonstrations import (
     DemonstrationRecipe,
     Demonstrations,
     read_demonstrations,
-    turned,
+    rotated_about_camera,
     wide_camera,
     write_demonstrations,
 )
-from alpasim_plugin.training.perturbed_rollouts import others_at, perturbed_rollouts, turning_lines
+from alpasim_plugin.training.perturbed_rollouts import perturbed_rollouts, traffic_at, turning_lines
 from alpasim_plugin.training.policy import PolicyRecipe, PolicyTask, measure
 from alpasim_plugin.training.trainer import Schedule, Trainer
 from alpasim_plugin.types import Trajectory
@@ -69,7 +69,7 @@ def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
     assert (a["turn"][::3] == 0).all()
     assert (a["before"] <= a["frame"]).all()
     assert set(a["command"].tolist()) == {COMMANDS.index("keep")}
-    # A car turned to the left of its road is led to the right.
+    # A car rotated_about_camera to the left of its road is led to the right.
     turn, heading = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=1, keepdims=True) for x in (a["turn"], a["headings"][:, -1]))
     assert np.corrcoef(turn.ravel(), heading.ravel())[0, 1] < -0.7
 
@@ -88,7 +88,7 @@ def test_missing_and_damaged_demonstrations_are_named(root: Path, tmp_path: Path
 def test_turning_leaves_the_camera_where_it_is(scenario) -> None:
     camera = wide_camera(scenario.cameras[0])
     T = np.array([[0.6, -0.8, 0, 5], [0.8, 0.6, 0, 7], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    after = turned(T, camera, 0.1)
+    after = rotated_about_camera(T, camera, 0.1)
     np.testing.assert_allclose((after @ camera.T_rig_camera)[:3, 3], (T @ camera.T_rig_camera)[:3, 3], atol=1e-12)
     assert yaw_of(after) - yaw_of(T) == pytest.approx(0.1)
 
@@ -110,8 +110,8 @@ def test_who_appears_at_this_instant_moves_as_the_log_shows_it_next(scenario) ->
     actor = next(a for a in scenario.actors if np.linalg.norm(np.ptp(a.track.xyz[:, :2], axis=0)) > 5.0)
     late = replace(actor, track=Trajectory(actor.track.t_us[10:], actor.track.xyz[10:], actor.track.quat[10:]))
     t_us = int(late.track.t_us[0])
-    _, seen = others_at(replace(scenario, actors=(late,)), t_us, None)
-    _, before = others_at(replace(scenario, actors=(actor,)), t_us, None)
+    _, seen = traffic_at(replace(scenario, actors=(late,)), t_us, None)
+    _, before = traffic_at(replace(scenario, actors=(actor,)), t_us, None)
     assert np.linalg.norm(before.velocity) > 1.0
     np.testing.assert_allclose(seen.velocity, before.velocity, atol=0.5)
 
