@@ -28,7 +28,7 @@ DEMONSTRATIONS_FILE = "demonstrations.json"
 DEMONSTRATIONS_VERSION = 3  # of the format
 READING = "reading demonstrations for the learned policy"
 WIDE_PX, TOP_ROW = 352, 30  # frames are wider than the policy's input, so that it can be rotated; most of the sky is cut
-MAX_TURN_RAD = np.deg2rad(8.5)
+MAX_YAW_RAD = np.deg2rad(8.5)
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ _FORMS: dict[str, tuple[int, str]] = {
     "frames": (4, "uint8"),  # (F, 114, 352, 3)
     "frame": (1, "int32"),  # (N,) row in frames
     "before": (1, "int32"),  # (N,) row of the frame 0.5 s earlier; the frame itself where there is none
-    "turn": (1, "float32"),  # (N,) radians, yaw perturbation of the view, left positive
-    "turn_before": (1, "float32"),  # (N,)
+    "yaw": (1, "float32"),  # (N,) radians, yaw perturbation of the view, left positive
+    "yaw_before": (1, "float32"),  # (N,)
     "speed": (1, "float32"),  # (N,) metres per second
     "desired_speed": (1, "float32"),  # (N,) metres per second
     "command": (1, "int64"),  # (N,) index in COMMANDS
@@ -123,11 +123,11 @@ def _demonstrate(scenario: Scenario, camera: CameraSpec, recipe: DemonstrationRe
 
 def _append_sample(
     rows: dict[str, list[Any]], scenario: Scenario, camera: CameraSpec, rollout: PerturbedRollout, state: RolloutState, now: int,
-    last: tuple[int, RolloutState] | None, turn: float, recipe: DemonstrationRecipe, random: np.random.Generator,
+    last: tuple[int, RolloutState] | None, yaw: float, recipe: DemonstrationRecipe, random: np.random.Generator,
 ) -> None:  # fmt: skip
     """Append one sample: a state with the rig rotated about its camera."""
-    turn_rad = MAX_TURN_RAD * turn
-    pose = rotated_about_camera(state.T_world_rig, camera, turn_rad)
+    yaw_rad = MAX_YAW_RAD * yaw
+    pose = rotated_about_camera(state.T_world_rig, camera, yaw_rad)
     path = rollout.line.path
     points, headings = expert_path(path, state.s_m, pose, state.speed_mps)
     box, axle_m = scenario.vehicle.box, scenario.vehicle.rear_axle_to_centre_m
@@ -135,9 +135,9 @@ def _append_sample(
     route = route_in_rig(Route(path.xyz[::4]), pose)
     earlier = last if last is not None and random.random() > 0.1 else (now, state)
     # The earlier frame has nearly the same yaw perturbation.
-    turn_before = float(np.clip(turn_rad + random.normal(0.0, 0.02), -MAX_TURN_RAD, MAX_TURN_RAD))
+    yaw_before = float(np.clip(yaw_rad + random.normal(0.0, 0.02), -MAX_YAW_RAD, MAX_YAW_RAD))
     sample = {
-        "frame": now, "before": earlier[0], "turn": turn_rad, "turn_before": turn_rad if earlier[0] == now else turn_before,
+        "frame": now, "before": earlier[0], "yaw": yaw_rad, "yaw_before": yaw_rad if earlier[0] == now else yaw_before,
         "speed": state.speed_mps, "desired_speed": rollout.style.desired_mps,
         "command": COMMANDS.index(route_command(route, float(random.normal(0.0, recipe.announcement_sigma_m)))),
         "points": points, "headings": headings,
@@ -148,10 +148,10 @@ def _append_sample(
         rows[name].append(value)
 
 
-def rotated_about_camera(T_world_rig: F64, camera: CameraSpec, turn_rad: float) -> F64:
+def rotated_about_camera(T_world_rig: F64, camera: CameraSpec, yaw_rad: float) -> F64:
     """Return the rig's pose rotated to the left about its camera."""
     at = se3(camera.T_rig_camera[:3, 3], [1.0, 0.0, 0.0, 0.0])
-    return np.asarray(T_world_rig @ at @ se3([0.0, 0.0, 0.0], quat_from_yaw(turn_rad)) @ inverse(at))
+    return np.asarray(T_world_rig @ at @ se3([0.0, 0.0, 0.0], quat_from_yaw(yaw_rad)) @ inverse(at))
 
 
 class Demonstrations:

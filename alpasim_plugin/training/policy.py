@@ -122,8 +122,8 @@ class PolicyTask:
         demonstrations = self.demonstrations[scene]
         a, row = demonstrations.arrays, number - int(self.ends[scene] - len(demonstrations))
         frames = a["frames"]
-        now = level_view(frames[a["frame"][row]], demonstrations.camera, float(a["turn"][row]))
-        before = level_view(frames[a["before"][row]], demonstrations.camera, float(a["turn_before"][row]))
+        now = level_view(frames[a["frame"][row]], demonstrations.camera, float(a["yaw"][row]))
+        before = level_view(frames[a["before"][row]], demonstrations.camera, float(a["yaw_before"][row]))
         speed, desired = float(a["speed"][row]), float(a["desired_speed"][row])
         real = float(a["frame"][row] != a["before"][row])
         state = np.array([speed, desired], dtype=np.float32)

@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from alpasim_plugin.atomic import atomic_file, write_safetensors, write_text
+from alpasim_plugin.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.errors import InfrastructureError, InputError
 
 Batch = TypeVar("Batch")
@@ -170,8 +170,12 @@ class Trainer(Generic[Batch]):
 
     def _write_log(self, numbers: Mapping[str, float]) -> None:
         row = {"step": self.step, **{k: float(f"{v:.6g}") for k, v in numbers.items()}}
-        with (self.folder / LOG_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        path = self.folder / LOG_FILE
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+        except OSError as error:
+            raise disk_error(path, error, "writing a training log") from error
 
     def _resume(self) -> None:
         path = self.folder / STATE_FILE

@@ -98,7 +98,7 @@ def test_weights_come_with_digest_updates_and_time(data: Path, tmp_path: Path, c
 def demonstrations(folder: Path) -> None:
     """Write two demonstrations on a grey road."""
     folder.mkdir(parents=True)
-    numbers = ("turn", "turn_before", "speed", "desired_speed", "gap", "leader")
+    numbers = ("yaw", "yaw_before", "speed", "desired_speed", "gap", "leader")
     arrays = {
         "frames": np.full((2, 114, 352, 3), 128, dtype=np.uint8), "points": np.ones((2, 9, 2), dtype=np.float32),
         "headings": np.zeros((2, 9), dtype=np.float32), "speeds": np.zeros((2, 8), dtype=np.float32),

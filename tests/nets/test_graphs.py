@@ -126,7 +126,7 @@ def test_arguments_are_left_alone_and_none_may_be_among_them():
 
 
 def test_results_are_not_there_before_the_replay():
-    """The twin must not be kinder than a graph, which computes nothing while it is recorded."""
+    """The eager recorder must also leave its outputs undefined before the first replay, as a graph does."""
     recording = EagerRecorder().record(lambda: (torch.ones(2), torch.ones(2, dtype=torch.long)))
     assert recording.outputs[0].isnan().all()
     assert not recording.outputs[1].any()

@@ -1,4 +1,4 @@
-"""Recolouring a drawn map equals drawing it with the other class, and leaves the rest alone."""
+"""Class-colour augmentation of a drawn map equals drawing it with the other class, and changes nothing else."""
 
 from __future__ import annotations
 

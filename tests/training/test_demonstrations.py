@@ -57,7 +57,7 @@ def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root: P
     for name, array in first.arrays.items():
         np.testing.assert_array_equal(array, Demonstrations(other).arrays[name])
     assert write_demonstrations(scenario, other, QUICK, 1)
-    assert not np.array_equal(Demonstrations(other).arrays["turn"], first.arrays["turn"])
+    assert not np.array_equal(Demonstrations(other).arrays["yaw"], first.arrays["yaw"])
 
 
 def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
@@ -65,12 +65,12 @@ def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
     a = demonstrations.arrays
     assert len(demonstrations) == len(a["frame"]) == 3 * len(a["frames"]) == 12
     assert a["frames"].shape[1:] == (114, 352, 3)
-    assert np.abs(a["turn"]).max() <= np.deg2rad(8.5) + 1e-6
-    assert (a["turn"][::3] == 0).all()
+    assert np.abs(a["yaw"]).max() <= np.deg2rad(8.5) + 1e-6
+    assert (a["yaw"][::3] == 0).all()
     assert (a["before"] <= a["frame"]).all()
     assert set(a["command"].tolist()) == {COMMANDS.index("keep")}
     # A car rotated_about_camera to the left of its road is led to the right.
-    turn, heading = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=1, keepdims=True) for x in (a["turn"], a["headings"][:, -1]))
+    turn, heading = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=1, keepdims=True) for x in (a["yaw"], a["headings"][:, -1]))
     assert np.corrcoef(turn.ravel(), heading.ravel())[0, 1] < -0.7
 
 

@@ -87,7 +87,7 @@ def test_batch_depends_on_its_number_alone(task: PerceptualTask) -> None:
     assert torch.all(first.targets[1] >= first.targets[0] - 1e-3)  # the stronger damage of a kind
 
 
-def test_every_lesson_reaches_the_trunk(task: PerceptualTask) -> None:
+def test_every_loss_term_reaches_the_trunk(task: PerceptualTask) -> None:
     batch = task.batch(0)
     loss, parts = task.loss(batch, 0)
     loss.backward()

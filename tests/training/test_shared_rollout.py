@@ -152,7 +152,7 @@ def test_history_of_every_kind_is_what_its_name_says(net: CosmosCausalDiT) -> No
     s = sample()
     with torch.no_grad():
         own, clean, again = (losses(net, s, TEXT, Objectives(flow=kind, horizon=0)).flow for kind in ("own", "clean", "redenoised"))
-        # a model that is told almost no noise gives the clean latents back: history as if it were clean
+        # a model at almost no noise gives the clean latents back: history as if it were clean
         near = losses(net, replace(s, t_redenoise=torch.zeros_like(s.t_redenoise)), TEXT, Objectives(flow="redenoised", horizon=0)).flow
     assert len({float(x) for x in (own, clean, again)}) == 3
     torch.testing.assert_close(near, clean, atol=0, rtol=0)
