@@ -1,4 +1,4 @@
-"""Drive by a small network trained on clean frames: image, speed and a navigation command in, trajectory out."""
+"""Drive by a small network trained by imitation on clean frames: image, speed and a navigation command in, trajectory out."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from policies.camera_frame import camera_frame
 from policies.lane_camera import front_camera
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, correlated_noise, sampled
 from policies.learned_command import COMMANDS, route_command
-from policies.learned_view import look, picture
+from policies.learned_view import level_view, network_input
 from policies.pure_pursuit import MIN_CRUISE_MPS
 
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
-EARLIER_US = 500_000  # the earlier frame shows how the others move
+EARLIER_US = 500_000  # age of the earlier frame, which shows motion
 EARLIEST_US = 700_000
 MAX_SIGMA_M, MAX_SIGMA_SPEED = 0.5, 0.15
 STANDS_MPS = 0.3
 
 
 class Learned(Policy):
-    """Predict a path and a speed profile with a network; drive a sample of the prediction.
+    """Predict a path and a speed profile with a network, and drive a sample of the prediction.
 
-    It reads two frames of one camera, 0.5 s apart, the car's speed, the first speed of the drive as the wanted one, and one of five
-    commands that are read off the route (`policies.learned_command`). Nothing else of the route reaches it: the place in the lane comes
-    from the pixels. It is trained on frames of the renderer ``clean`` alone.
+    It reads two frames of one camera, 0.5 s apart, the car's speed, the initial speed of the drive as the desired speed, and one of five
+    commands computed from the route (`policies.learned_command`). It gets no other information on the route: the position in the lane
+    comes from the image. It was trained on frames of the renderer ``clean`` only.
 
     Args:
         scenario: Gives the camera, the scene's id for the random streams, and nothing else.
         weights: File that ``simrun train policy`` wrote; None takes the class's ``files``. In runs, name a subclass whose
-            ``files`` name the file: a rollout's key holds that file's digest.
+            ``files`` is the file: a rollout's content key holds that file's digest.
         temperature: Scale of the network's own standard deviations when a plan is drawn; 0 drives the mean.
 
     Raises:
-        InputError: No camera looks ahead, the weights are not there or not of this network, or the temperature is negative.
+        InputError: No camera looks ahead, the weights are missing or of another network, or the temperature is negative.
     """
 
     files: ClassVar[tuple[Path, ...]] = (WEIGHTS,)  # part of a rollout's key
     trained = True
 
     def __init__(self, scenario: Scenario, weights: Path | str | None = None, temperature: float = 1.0) -> None:
-        from policies.learned_net import knot_weights, load_net, path_grid  # torch is loaded only where it is needed
+        from policies.learned_net import knot_weights, load_net, path_grid  # imports torch
 
         if not (np.isfinite(temperature) and temperature >= 0):
             raise InputError("making the policy 'learned'", "temperature", f"{temperature}", "give 0 or a positive number")
@@ -60,42 +60,42 @@ class Learned(Policy):
         self.reset(0, scenario.route)
 
     def reset(self, seed: int, route: Route) -> None:
-        """Forget everything of the drive before."""
+        """Start a new rollout."""
         self.seed, self.step, self.acted_us = seed, 0, 0
-        self.noise: F64 | None = None  # the samples' errors, which last for seconds
-        self.wanted_mps: float | None = None
+        self.noise: F64 | None = None  # errors of the samples, correlated over seconds
+        self.desired_mps: float | None = None
         self.views: deque[tuple[int, U8]] = deque()
 
     def act(self, observation: Observation) -> Plan:
-        """Return a plan drawn from the network's prediction to the newest frame.
+        """Return a plan sampled from the network's prediction for the newest frame.
 
         Raises:
             PolicyError: The observation has no frame of the camera, or one of another size.
         """
         frame = camera_frame(observation, self.camera, "learned")
         if not self.views or frame.t_us > self.views[-1][0]:
-            self.views.append((frame.t_us, look(frame.rgb, self.camera)))
+            self.views.append((frame.t_us, level_view(frame.rgb, self.camera)))
         while self.views[0][0] < frame.t_us - EARLIEST_US:
             self.views.popleft()
         speed = max(observation.ego.speed_mps, 0.0)
-        if self.wanted_mps is None:
-            self.wanted_mps = max(speed, MIN_CRUISE_MPS)
+        if self.desired_mps is None:
+            self.desired_mps = max(speed, MIN_CRUISE_MPS)
         command = route_command(observation.route_rig)
-        heading, faster, sigma = self._predict(speed, command)
+        heading, speed_change, sigma = self._predict(speed, command)
         times = plan_times(observation.t_us)
-        xy, yaw = self._mean(heading, faster, speed, seconds(times))
+        xy, yaw = self._mean(heading, speed_change, speed, seconds(times))
         random = stream(self.scene_id, self.seed, "policy", self.step)
         self.noise = correlated_noise(self.noise, (observation.t_us - self.acted_us) * 1e-6, random)
         self.step, self.acted_us = self.step + 1, observation.t_us
-        aside_m, share = self.temperature * np.minimum(sigma, [MAX_SIGMA_M, MAX_SIGMA_SPEED])
+        lateral_m, share = self.temperature * np.minimum(sigma, [MAX_SIGMA_M, MAX_SIGMA_SPEED])
         drawn = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
-        plans = sampled(xy, yaw, drawn, float(aside_m))[1:] if self.temperature else [np.column_stack([xy, yaw])] * N_SAMPLES
-        debug: dict[str, Any] = {"command": command, "wanted_mps": self.wanted_mps}
+        plans = sampled(xy, yaw, drawn, float(lateral_m))[1:] if self.temperature else [np.column_stack([xy, yaw])] * N_SAMPLES
+        debug: dict[str, Any] = {"command": command, "desired_mps": self.desired_mps}
         debug.update(sigma_m=float(sigma[0]), sigma_speed=float(sigma[1]))
         return Plan(observation.t_us, times, plans[0][:, :2].copy(), plans[0][:, 2].copy(), tuple(plans[1:]), debug)
 
     def _predict(self, speed_mps: float, command: str) -> tuple[F64, F64, F64]:
-        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the two standard deviations ``(2,)``."""
+        """Return headings at the knots ``(9,)``, changes of speed ``(8,)`` and the standard deviations ``(2,)``."""
         import torch
 
         from policies.learned_net import SPEED_UNIT_MPS
@@ -103,32 +103,32 @@ class Learned(Policy):
         t_us, now = self.views[-1]
         earlier = min(self.views, key=lambda view: abs(t_us - EARLIER_US - view[0]))
         real = t_us - earlier[0] > EARLIER_US // 2
-        assert self.wanted_mps is not None
-        state = [speed_mps / SPEED_UNIT_MPS, self.wanted_mps / SPEED_UNIT_MPS, float(real)]
+        assert self.desired_mps is not None
+        state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]
         threads = torch.get_num_threads()
         if threads != 1:
-            torch.set_num_threads(1)  # the sums of a convolution must not depend on who else runs
+            torch.set_num_threads(1)  # the order of summation in a convolution depends on the thread count
         try:
             with torch.inference_mode():
-                seen = torch.from_numpy(picture(now, earlier[1] if real else now))[None]
-                prediction = self.net(seen, torch.tensor([state]), torch.tensor([COMMANDS.index(command)]))
+                image = torch.from_numpy(network_input(now, earlier[1] if real else now))[None]
+                prediction = self.net(image, torch.tensor([state]), torch.tensor([COMMANDS.index(command)]))
         finally:
             if threads != 1:
                 torch.set_num_threads(threads)
-        heading, faster, sigma = (part[0].double().numpy() for part in (prediction.heading, prediction.speed, prediction.sigma))
-        return heading, faster, sigma
+        heading, speed_change, sigma = (part[0].double().numpy() for part in (prediction.heading, prediction.speed, prediction.sigma))
+        return heading, speed_change, sigma
 
-    def _mean(self, heading: F64, faster: F64, speed_mps: float, t_s: F64) -> tuple[F64, F64]:
-        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the network's own prediction."""
+    def _mean(self, heading: F64, speed_change: F64, speed_mps: float, t_s: F64) -> tuple[F64, F64]:
+        """Return positions ``(T, 2)`` and headings ``(T,)`` at times ``(T,)`` of the mean prediction."""
         from policies.learned_net import TIMES_S
 
-        speeds = np.maximum(np.interp(t_s, [0.0, *TIMES_S], speed_mps + np.array([0.0, *faster])), 0.0)
+        speeds = np.maximum(np.interp(t_s, [0.0, *TIMES_S], speed_mps + np.array([0.0, *speed_change])), 0.0)
         speeds[speeds < STANDS_MPS * min(1.0, speed_mps)] = 0.0
         progress = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(t_s))])
         yaw = self.weights @ heading
         middle = 0.5 * (yaw[1:] + yaw[:-1])
         xy = np.concatenate([np.zeros((1, 2)), np.cumsum(np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)])
-        over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight on beyond the last knot
+        over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight beyond the last knot
         at = [np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)]
         return np.stack([at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])], axis=1), at[2]
 

@@ -1,4 +1,4 @@
-"""Navigation command of the learned policy: one of five words, derived from the shape of the route ahead."""
+"""Navigation command of the learned policy: one of five, computed from the shape of the route ahead."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from alpasim_plugin.types import F64
 Command = Literal["keep", "left-ahead", "left-now", "right-ahead", "right-now"]
 COMMANDS: tuple[Command, ...] = get_args(Command)
 
-TURN_RADIUS_M = 28.0  # a tighter bend is a turn and is announced; a wider one is the road's own
+TURN_RADIUS_M = 28.0  # tighter curves are turns and are announced; wider ones belong to the road
 AHEAD_M, NOW_M = 40.0, 6.0
 
 
@@ -20,11 +20,11 @@ def route_command(route_rig: F64, late_m: float = 0.0) -> Command:
     """Return the command for a route ahead ``(20, 3)`` in the rig frame, NaN where it ends.
 
     A turn is a stretch of two route segments on which the route bends tighter than `TURN_RADIUS_M`. The nearest one within `AHEAD_M` is
-    announced, with "now" from `NOW_M` before it. Where in the lane the route lies cannot be read from the command.
+    announced, with "now" from `NOW_M` before it. The command does not depend on the route's lateral position in the lane.
 
     Args:
         route_rig: As in `Observation`.
-        late_m: How much later the navigation is than it should be; negative: earlier.
+        late_m: Delay of the announcement, metres; negative: early.
     """
     points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
     if len(points) < 4:

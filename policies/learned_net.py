@@ -1,4 +1,4 @@
-"""The learned policy's network: from an image, two speeds and a command to a path and a speed profile, each with a standard deviation."""
+"""The learned policy's network: image, two speeds and a command to a path and a speed profile, with heteroscedastic sigma."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from alpasim_plugin.types import F64
 from policies.learned_command import COMMANDS
 from policies.learned_view import CHANNELS, HEIGHT, WIDTH
 
-KNOTS_M = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0, 42.0, 60.0)  # distances along the path where the network gives its heading
-TIMES_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)  # when it gives its speed
-STATES = 3  # speed and wanted speed in `SPEED_UNIT_MPS`; 1 if the earlier frame is really an earlier one
+KNOTS_M = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0, 42.0, 60.0)  # distances along the path of the predicted headings
+TIMES_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)  # times of the predicted speeds
+STATES = 3  # speed and desired speed in `SPEED_UNIT_MPS`; 1 if there is an earlier frame, else 0
 SPEED_UNIT_MPS = 15.0
 GRID_M = 1.0
 
-_KNOT_SCALE = [min(0.6, 0.05 + 0.02 * s) for s in KNOTS_M]  # radians: what an output of one means
+_KNOT_SCALE = [min(0.6, 0.05 + 0.02 * s) for s in KNOTS_M]  # radians per unit of output
 _SPEED_SCALE = [1.5 * t for t in TIMES_S]  # metres per second
 _PARTS = [len(KNOTS_M), len(TIMES_S), 2, 2]
 _MIN_SIGMA = 0.02
-NEARNESS_M = 20.0
+PROXIMITY_M = 20.0
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """The network's output for a batch of B observations."""
+    """Network outputs for a batch of B observations."""
 
     heading: Tensor  # (B, 9) radians to the left of the rig's x axis at `KNOTS_M`
     speed: Tensor  # (B, 8) change of speed until `TIMES_S`, metres per second
     sigma: Tensor  # (B, 2) standard deviations: to the side 16 m ahead, metres; of the mean speed over the plan, as a share
-    leader: Tensor  # (B, 2) nearness of who is ahead, exp(-gap / 20 m), and their speed, metres per second; no part of the plan
+    leader: Tensor  # (B, 2) proximity of the leader, exp(-gap / 20 m), and its speed, metres per second; auxiliary
 
 
 class LearnedNet(nn.Module):
-    """Five convolutions over the picture, two layers that bring in speeds and command."""
+    """Six convolutions over the image, then two fully connected layers with speeds and command; attribute names are checkpoint keys."""
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
@@ -56,15 +56,15 @@ class LearnedNet(nn.Module):
         )  # fmt: skip
         self.word = nn.Embedding(len(COMMANDS), 16)
         self.state = nn.Sequential(nn.Linear(STATES, 32), nn.ReLU())
-        seen = 24 * (HEIGHT // 16) * (WIDTH // 16)
-        self.plan = nn.Sequential(nn.Linear(seen + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU())
+        features = 24 * (HEIGHT // 16) * (WIDTH // 16)
+        self.plan = nn.Sequential(nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU())
         self.out = nn.Linear(128, sum(_PARTS))
         self._init_weights(torch.Generator().manual_seed(seed))
         self.register_buffer("knot_scale", torch.tensor(_KNOT_SCALE), persistent=False)
         self.register_buffer("speed_scale", torch.tensor(_SPEED_SCALE), persistent=False)
 
     def _init_weights(self, random: torch.Generator) -> None:
-        """Draw the weights as torch does by default, but from a generator of their own; the last layer begins at zero."""
+        """Initialise as torch does by default, from the given generator; the last layer is zero."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):
                 bound = float(module.weight[0].numel()) ** -0.5
@@ -75,27 +75,27 @@ class LearnedNet(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, picture: Tensor, state: Tensor, command: Tensor) -> Prediction:
-        """Predict for pictures ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands ``(B,)``."""
-        seen = torch.cat([self.see(picture), self.state(state), self.word(command)], dim=1)
-        heading, speed, sigma, leader = self.out(self.plan(seen)).split(_PARTS, dim=1)
+    def forward(self, image: Tensor, state: Tensor, command: Tensor) -> Prediction:
+        """Predict from images ``(B, 4, 80, 192)``, states ``(B, 3)`` and indices of commands ``(B,)``."""
+        features = torch.cat([self.see(image), self.state(state), self.word(command)], dim=1)
+        heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
         leader = torch.stack([torch.sigmoid(leader[:, 0]), SPEED_UNIT_MPS * leader[:, 1]], dim=1)
         return Prediction(heading * self.knot_scale, speed * self.speed_scale, sigma, leader)
 
 
 def path_grid() -> F64:
-    """Return the distances ``(G,)`` along the path at which it is laid out: every metre from 0 to the last knot."""
+    """Return the distances ``(G,)`` along the path of its points: every metre from 0 to the last knot."""
     return np.arange(0.0, KNOTS_M[-1] + 0.5 * GRID_M, GRID_M)
 
 
 def knot_weights() -> F64:
-    """Return the matrix ``(G, 9)`` from headings at the knots to headings on `path_grid`; linear between knots, 0 at the car."""
+    """Return the interpolation matrix ``(G, 9)`` from headings at the knots to headings on `path_grid`: linear, 0 at the car."""
     knots = np.array((0.0, *KNOTS_M))
     return np.stack([np.interp(path_grid(), knots, row) for row in np.eye(len(knots))[1:]], axis=1)
 
 
-def path_from_headings(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def integrate_path(heading: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return points ``(B, G, 2)`` and headings ``(B, G)`` of paths with headings ``(B, 9)`` at the knots, in metres and radians."""
     yaw = heading @ weights.T
     middle = 0.5 * (yaw[:, 1:] + yaw[:, :-1])
@@ -122,7 +122,7 @@ def load_net(path: Path) -> LearnedNet:
     try:
         state = load_file(str(path))
     except (SafetensorError, ValueError) as error:
-        raise InputError(doing, str(path), f"not a whole safetensors file: {error}", "copy or train it again") from error
+        raise InputError(doing, str(path), f"not a complete safetensors file: {error}", "copy or train it again") from error
     found = {name: tuple(value.shape) for name, value in state.items()}
     if found != wanted:
         odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))

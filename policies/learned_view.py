@@ -1,4 +1,4 @@
-"""Input view of the learned policy: any camera's frame warped into one small level view."""
+"""Image input of the learned policy: a camera frame warped to one small level view."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ WIDTH, HEIGHT = 192, 80  # pixels
 FOCAL_PX = 125.0  # 75 degrees across
 HORIZON_ROW = 18.0
 CHANNELS = 4  # red, green, blue now; brightness of an earlier frame
-MEAN, SPREAD = 115.0, 64.0  # grey levels
+MEAN, STD = 115.0, 64.0  # grey levels
 
 _K = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HORIZON_ROW], [0.0, 0.0, 1.0]])
 _RIG_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 
-def view_map(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:
+def view_homography(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:
     """Return the homography ``(3, 3)`` from pixels of the view to pixels of the camera.
 
-    The view looks level along the rig's x axis, turned to the left by ``yaw_rad``, from the camera's own place: a pure rotation, so no
-    depth is needed.
+    The view is level along the rig's x axis, rotated to the left by ``yaw_rad``, at the camera's position: a pure rotation, so no depth is
+    needed.
     """
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -30,12 +30,12 @@ def view_map(camera: CameraSpec, yaw_rad: float = 0.0) -> F64:
     return np.asarray(camera.K @ rotation @ np.linalg.inv(_K))
 
 
-def look(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
-    """Return the view ``(80, 192, 3)`` of a frame ``(H, W, 3)``; beyond the frame's border its last pixels go on.
+def level_view(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
+    """Return the view ``(80, 192, 3)`` of a frame ``(H, W, 3)``; borders are replicated.
 
-    A camera with much more pixels an angle is averaged down first.
+    Frames of higher angular resolution are area-averaged first.
     """
-    to_camera = view_map(camera, yaw_rad)
+    to_camera = view_homography(camera, yaw_rad)
     shrink = int(camera.K[0, 0] / FOCAL_PX)
     if shrink > 1:
         size = (rgb.shape[1] // shrink, rgb.shape[0] // shrink)
@@ -47,9 +47,9 @@ def look(rgb: U8, camera: CameraSpec, yaw_rad: float = 0.0) -> U8:
     return np.asarray(cv2.warpPerspective(rgb, to_camera, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
 
 
-def picture(now: U8, before: U8) -> F32:
+def network_input(now: U8, before: U8) -> F32:
     """Return the network's input ``(4, 80, 192)`` from two views ``(80, 192, 3)``."""
     out = np.empty((CHANNELS, HEIGHT, WIDTH), dtype=np.float32)
     out[:3] = now.transpose(2, 0, 1)
     out[3] = before.astype(np.float32) @ _GREY
-    return (out - np.float32(MEAN)) / np.float32(SPREAD)
+    return (out - np.float32(MEAN)) / np.float32(STD)

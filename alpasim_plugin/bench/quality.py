@@ -16,7 +16,7 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.types import I64, U8, Fixer, Frame
 from evaluators.video import clip_quality
-from evaluators.video.perceptual import PictureDistance
+from evaluators.video.perceptual import ImageDistance
 from evaluators.video.summary import TRUTH
 
 RAW = "3dgs"  # the arm of the damaged render as it is
@@ -110,7 +110,7 @@ def roll(clip: QualityClip, arm: Arm, fixer: Fixer | None) -> Rolled:
     return Rolled(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
 
 
-def measure(clip: QualityClip, arm: Arm, rolled: Rolled, seed: int, networks: Mapping[str, PictureDistance]) -> dict[str, Any]:
+def measure(clip: QualityClip, arm: Arm, rolled: Rolled, seed: int, networks: Mapping[str, ImageDistance]) -> dict[str, Any]:
     """Return the row of one clip under one arm, as `evaluators.video.summary` takes it."""
     found = clip_quality(rolled.video, None if arm.label == TRUTH else clip.truth, networks)
     return {

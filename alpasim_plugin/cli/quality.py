@@ -23,9 +23,9 @@ from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.nets.checkpoints import file_sha256
+from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.nets.lpips import TRUNKS
 from alpasim_plugin.nets.perceptual import NAME, shipped_weights
-from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistance, available, load_distance, weights_folder
 from alpasim_plugin.parts import build, resolve
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json
@@ -233,5 +233,5 @@ def _picture(path: Path) -> Any:
 
 
 @cache
-def _network(name: str, folder: Path | None) -> PictureDistance:
+def _network(name: str, folder: Path | None) -> ImageDistance:
     return load_distance(name, weights_folder(folder))

@@ -1,4 +1,4 @@
-"""``simrun train``: make training data, and train the networks of a fixer."""
+"""``simrun train``: training data and networks."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli import train_pairs
-from alpasim_plugin.cli.train_decoder import EPILOG as PAINTER_EXAMPLE
-from alpasim_plugin.cli.train_decoder import painter
+from alpasim_plugin.cli.train_decoder import EPILOG as DECODER_EXAMPLE
+from alpasim_plugin.cli.train_decoder import decoder
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
@@ -38,7 +38,8 @@ WIDTH, HEIGHT = 256, 144
 
 EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
-app.command("painter", epilog=PAINTER_EXAMPLE)(painter)
+app.command("decoder", epilog=DECODER_EXAMPLE)(decoder)
+app.command("painter", hidden=True)(decoder)  # former name
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)
 app.command("policy-data", epilog=POLICY_DATA_EPILOG)(policy_data)
 app.command("policy", epilog=POLICY_EPILOG)(policy)
@@ -59,13 +60,13 @@ def train() -> None:
 @app.command("scenes", epilog="Example: `simrun train scenes --out data/scenes --split train --count 120`")
 def scenes(
     out: RunFolder,
-    split: Annotated[Literal["train", "val", "test"], typer.Option("--split", help="Which split.")] = "train",
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Scenes; by default 120, 20 and 60.")] = None,
-    duration_s: Annotated[float, typer.Option("--duration-s", min=1.0, help="Length of every drive.")] = 9.9,
+    split: Annotated[Literal["train", "val", "test"], typer.Option("--split", help="Split to write.")] = "train",
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Number of scenes; by default 120, 20 and 60.")] = None,
+    duration_s: Annotated[float, typer.Option("--duration-s", min=1.0, help="Length of every drive, seconds.")] = 9.9,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Draw scenarios; those of the test split come from other families of roads and traffic."""
+    """Sample scenarios; the test split has other families of roads and traffic."""
     del debug
     console, paths = Console(stderr=True), []
     for path in write_scenes(out, split, count or DEFAULT_COUNTS[split], duration_s):
@@ -79,12 +80,12 @@ def scenes(
 def vae(
     data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
     out: RunFolder,
-    video: Annotated[list[Path] | None, typer.Option("--video", help="Driving video to learn from as well. Repeatable.")] = None,
-    video_share: Annotated[float, typer.Option("--video-share", min=0.1, max=1.0, help="Only the first share of every video.")] = 1.0,
+    video: Annotated[list[Path] | None, typer.Option("--video", help="Further driving video. Repeatable.")] = None,
+    video_share: Annotated[float, typer.Option("--video-share", min=0.1, max=1.0, help="Use only this first share of every video.")] = 1.0,
     steps: Steps = 4000,
     seed: Seed = 0,
-    init: Annotated[Path | None, typer.Option("--init", help="Weights to start from: an autoencoder, or a fixer's bundle.")] = None,
-    fixer: Annotated[str, typer.Option("--fixer", help="Fixer whose autoencoder sizes are trained.")] = "onefixer-tiny",
+    init: Annotated[Path | None, typer.Option("--init", help="Initial weights: an autoencoder, or a fixer's bundle.")] = None,
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the autoencoder's sizes.")] = "onefixer-tiny",
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
@@ -110,12 +111,12 @@ def vae_quality(
     weights: Annotated[str, typer.Argument(help="Weights of an autoencoder, a fixer's bundle, or 'untrained'.")],
     data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "val",
-    video: Annotated[list[Path] | None, typer.Option("--video", help="Driving video to measure on as well. Repeatable.")] = None,
+    video: Annotated[list[Path] | None, typer.Option("--video", help="Further driving video. Repeatable.")] = None,
     first_share: Annotated[float, typer.Option("--first-share", min=0.0, max=0.9, help="Skip this share of every video.")] = 0.0,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Measure a tiny autoencoder on held-out frames; prints one JSON document, with or without --json."""
+    """Measure a tiny autoencoder on held-out frames; prints one JSON document (--json has no effect)."""
     del as_json, debug
     model = TinyVAE.random() if weights == "untrained" else load_tiny_vae(weights)
     console, rows = Console(stderr=True), []

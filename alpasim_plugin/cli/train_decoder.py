@@ -1,4 +1,4 @@
-"""``simrun train painter``: adapt a trained fixer's decoder to its generator."""
+"""``simrun train decoder``: fine-tune a trained fixer's decoder on its generator."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli import training_options as options
-from alpasim_plugin.training.decoder_finetune import PainterRecipe
-from alpasim_plugin.training.decoder_finetune_run import train_painter
+from alpasim_plugin.training.decoder_finetune import DecoderRecipe
+from alpasim_plugin.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.trainer import Schedule
 
-EPILOG = "Example: `simrun train painter data/pairs --init runs/v9/fixer.safetensors --out runs/v9-painter`"
+EPILOG = "Example: `simrun train decoder data/pairs --init runs/v9/fixer.safetensors --out runs/v9-decoder`"
 
 
-def painter(
+def decoder(
     data: options.Pairs,
     init: Annotated[Path, typer.Option("--init", help="Trained fixer: the fixer.safetensors of 'simrun train fixer'.")],
     out: options.RunFolder,
@@ -28,20 +28,20 @@ def painter(
     columns: Annotated[int, typer.Option("--columns", min=2, help="Width of a crop, in latents.")] = 16,
     stride: options.Stride = 24,
     lr: options.PeakLr = 5e-4,
-    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual distance; 0 switches it off.")] = 0.1,
+    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual distance; 0 disables it.")] = 0.1,
     threads: options.Threads = None,
     seed: options.Seed = 0,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:
-    """Train the decoder on the generator's own rollouts; generator and encoder stay. Writes OUT/fixer.safetensors and its card."""
+    """Fine-tune the decoder on the generator's rollouts; generator and encoder are frozen. Writes OUT/fixer.safetensors and its card."""
     del debug
     options.use_threads(threads)
     progress = options.Progress(steps)
     distance = progress.perceptual_term(metric_weights) if perceptual else None
-    recipe = PainterRecipe(clips, rows, columns, perceptual_weight=perceptual, seed=seed)
+    recipe = DecoderRecipe(clips, rows, columns, perceptual_weight=perceptual, seed=seed)
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=0.99, save_every=max(steps // 20, 5))
     prepared = partial(progress.prepared, every=50)
-    path = train_painter(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update)
+    path = finetune_decoder(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update)
     progress.wrote(path, as_json)

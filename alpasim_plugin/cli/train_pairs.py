@@ -1,4 +1,4 @@
-"""``simrun train reconstructions | pairs | pairs-sheet | import-pairs``: what a fixer learns from."""
+"""``simrun train reconstructions | pairs | pairs-sheet | import-pairs``: training data of a fixer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
 from alpasim_plugin.training.pair_import import PairSources, import_sequence
 from alpasim_plugin.training.pair_sheet import contact_sheet, measure_sequence, sheet, write_sheet
 from alpasim_plugin.training.pair_store import PairDataset
-from alpasim_plugin.training.pairs import Draw, PairRecipe, make_sequence
+from alpasim_plugin.training.pairs import DegradationMode, PairRecipe, make_sequence
 from alpasim_plugin.training.scenes import SPLITS
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand
@@ -40,11 +40,11 @@ def reconstructions(
     scenarios: Annotated[list[str], typer.Argument(metavar="SCENARIO...", help="Scenarios, suites or folders of them.")],
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
     jobs: Jobs = 1,
-    again: Annotated[bool, typer.Option("--again", help="Fit those that are there as well.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Fit existing ones again.")] = False,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Fit the reconstructions that the renderer 3dgs shows of scenarios, so that no run has to wait for them."""
+    """Fit and cache the reconstructions of scenarios for the renderer 3dgs before runs."""
     del debug
     refs = [ref for item in scenarios for ref in expand(item, overrides or ())]
     console, rows = Console(stderr=True), []
@@ -74,20 +74,21 @@ class _Fitted:
 
 def pairs(
     scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")],
     split: Annotated[str, typer.Option("--split", help="Splits, comma-separated.")] = ",".join(SPLITS),
-    source: Annotated[str, typer.Option("--source", help="Renderer of the damaged frames.")] = "3dgs",
+    source: Annotated[str, typer.Option("--source", help="Renderer of the degraded frames.")] = "3dgs",
     degradation: Annotated[
-        Draw, typer.Option("--degradation", help="mixed: reconstruction or cycle render, drawn; as-set: what each scenario says.")
+        DegradationMode,
+        typer.Option("--degradation", help="mixed: reconstruction or cycle render, at random; as-set: as in the scenario."),
     ] = "mixed",
-    wander_m: Annotated[float, typer.Option("--wander-m", min=0.0, help="Largest distance from the logged path.")] = 1.5,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the degradation and of the path beside the log.")] = 0,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first so many scenes of each split.")] = None,
+    max_offset_m: Annotated[float, typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres.")] = 1.5,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the degradation and of the lateral offset.")] = 0,
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")] = None,
     jobs: Jobs = 1,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Render pairs of damaged and clean frames with opacity, semantic map and poses; finished sequences are kept."""
+    """Render pairs of degraded and clean frames with opacity, semantic map and poses; complete sequences are kept."""
     del debug
     work: list[_Scene] = []
     for name in (s.strip() for s in split.split(",")):
@@ -95,11 +96,11 @@ def pairs(
     if not work:
         raise InputError("making training pairs", str(scenes), f"no scenario in {split}", "make some with 'simrun train scenes'")
     console, began = Console(stderr=True), time.perf_counter()
-    maker = _Maker(out, PairRecipe(source=source, degradation=degradation, wander_m=wander_m), seed)
+    maker = _Maker(out, PairRecipe(source=source, degradation=degradation, max_offset_m=max_offset_m), seed)
     rows = []
     for number, (scene, made) in enumerate(spread(maker, work, jobs), start=1):
         rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})
-        note = "" if made else " (was there)"
+        note = "" if made else " (exists)"
         line = f"[{number}/{len(work)}] {scene.split}/{scene.path.stem}{note}, {time.perf_counter() - began:.0f} s"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if as_json:
@@ -128,12 +129,12 @@ class _Maker:
 
 def pairs_sheet(
     data: Annotated[Path, typer.Argument(help="Folder of pairs: SPLIT/SEQUENCE.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.md and sheet.jpg; none writes neither.")] = None,
-    split: Annotated[str | None, typer.Option("--split", help="Splits, comma-separated; by default all there are.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for sheet.md and sheet.jpg; by default neither is written.")] = None,
+    split: Annotated[str | None, typer.Option("--split", help="Splits, comma-separated; by default all.")] = None,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Measure pairs: counts, error, holes, light and map, and a picture of some; prints one JSON document, with or without --json."""
+    """Measure pairs: counts, PSNR, SSIM, holes, luminance and map; prints one JSON document (--json has no effect)."""
     del as_json, debug
     names = [s.strip() for s in split.split(",")] if split else sorted(p.name for p in data.glob("*") if any(p.glob("*/sequence.json")))
     if not names:
@@ -152,23 +153,23 @@ def pairs_sheet(
 
 def import_pairs(
     out: Annotated[Path, typer.Argument(help="Folder of pairs to add to.")],
-    rgb_input: Annotated[Path, typer.Option("--rgb-input", help="Damaged renders: video, folder of pictures, or .npy.")],
-    rgb_gt: Annotated[Path, typer.Option("--rgb-gt", help="What there is to see, likewise.")],
+    rgb_input: Annotated[Path, typer.Option("--rgb-input", help="Degraded renders: video, folder of images, or .npy.")],
+    rgb_gt: Annotated[Path, typer.Option("--rgb-gt", help="Clean frames, likewise.")],
     opacity: Annotated[Path, typer.Option("--opacity", help="Opacity with the sky filled, white is opaque, likewise.")],
     sdmap: Annotated[Path, typer.Option("--sdmap", help="Semantic map, likewise.")],
     poses: Annotated[Path, typer.Option("--poses", help="T_world_camera of every frame, OpenCV axes: .npy (T, 4, 4) or JSON.")],
     name: Annotated[str, typer.Option("--name", help="Name of the sequence.")],
     split: Annotated[str, typer.Option("--split", help="train, val or test.")] = "train",
-    fps: Annotated[float, typer.Option("--fps", help="Frames per second, where the poses carry no times.")] = 10.0,
-    size: Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Scale all pictures to this size.")] = None,
+    fps: Annotated[float, typer.Option("--fps", help="Frames per second, for poses without times.")] = 10.0,
+    size: Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Scale all images to this size.")] = None,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Turn renders of your own reconstruction into a sequence of pairs, as long as its shortest channel."""
+    """Import renders of your own reconstruction as a sequence of pairs, as long as its shortest channel."""
     del debug
     if split not in SPLITS or not name or Path(name).name != name or name.startswith("."):
         asked = f"--split {split} --name {name}"
-        raise InputError("importing training pairs", asked, "no place for a sequence", "give train, val or test, and a plain name")
+        raise InputError("importing training pairs", asked, "not a valid split and name", "give train, val or test, and a plain name")
     sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)
     folder = out / split / name
     frames = import_sequence(sources, folder, fps=fps, size=_size(size), facts={"split": split})
@@ -182,5 +183,5 @@ def _size(text: str | None) -> tuple[int, int] | None:
         return None
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-        raise InputError("importing training pairs", f"--size {text}", "no size", "give WIDTHxHEIGHT, for example 256x144")
+        raise InputError("importing training pairs", f"--size {text}", "not a size", "give WIDTHxHEIGHT, for example 256x144")
     return int(parts[0]), int(parts[1])

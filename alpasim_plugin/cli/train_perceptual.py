@@ -22,10 +22,10 @@ EPILOG = "Example: `simrun train perceptual data/pairs --out runs/perceptual --s
 
 
 def perceptual(
-    data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames and maps of its split train are learned from.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
+    data: Annotated[Path, typer.Argument(help="Folder of pairs; clean frames and maps of the split train are used.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")],
     steps: Steps = 1500,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and draws.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of weights and sampling.")] = 0,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads.")] = 1,
     as_json: AsJson = False,
     debug: Debug = False,

@@ -1,4 +1,4 @@
-"""``simrun train perceptual-check``: does a distance of pictures order damage as it should, on frames it has not seen."""
+"""``simrun train perceptual-check``: validate a perceptual distance on distorted held-out frames."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import typer
 
 from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.image_distance import ImageDistance, load_distance
 from alpasim_plugin.nets.perceptual import load_perceptual
-from alpasim_plugin.nets.picture_distance import PictureDistance, load_distance
 from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.perceptual_check import ArrayDistance, check, check_frames
 from alpasim_plugin.types import F32, F64, U8
@@ -32,13 +32,13 @@ def perceptual_check(
     name: Annotated[str, typer.Argument(help="perceptual-syn, lpips_alex, lpips_vgg, ssim (one minus it), or a file of weights.")],
     data: Annotated[Path, typer.Argument(help="Folder of pairs.")],
     split: Annotated[str, typer.Option("--split", help="Split to take frames from.")] = "val",
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Clean frames, evenly from all sequences.")] = 12,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of clean frames, evenly from all sequences.")] = 12,
     examples: Annotated[Path | None, typer.Option("--examples", help="Folder with LPIPS's ex_ref.png, ex_p0.png, ex_p1.png.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the damage.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the distortions.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Measure a distance on damaged frames; prints one JSON document, with or without --json."""
+    """Validate a distance on distorted frames; prints one JSON document (--json has no effect)."""
     del as_json, debug
     torch.set_num_threads(1)
     distance = named_distance(name)
@@ -51,10 +51,10 @@ def perceptual_check(
 
 
 def named_distance(name: str) -> ArrayDistance:
-    """Return a distance of arrays by name, or by file of weights."""
+    """Return a distance on arrays by name, or by a file of weights."""
     if name == "ssim":
         return lambda a, b: 1 - ssim(_u8(a), _u8(b))
-    net: PictureDistance = load_perceptual(name) if name.endswith(".safetensors") else load_distance(name)
+    net: ImageDistance = load_perceptual(name) if name.endswith(".safetensors") else load_distance(name)
 
     def distance(a: F32, b: F32) -> F64:
         return picture_distances(net, _u8(a), _u8(b))
@@ -62,12 +62,12 @@ def named_distance(name: str) -> ArrayDistance:
     return distance
 
 
-def _u8(pictures: F32) -> U8:
-    return np.rint(pictures * 255).astype(np.uint8)
+def _u8(images: F32) -> U8:
+    return np.rint(images * 255).astype(np.uint8)
 
 
 def _read(path: Path) -> F32:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise InputError("reading example pictures", str(path), "no picture", f"give a folder with {', '.join(EXAMPLES)} as PNG")
+        raise InputError("reading example images", str(path), "not an image", f"give a folder with {', '.join(EXAMPLES)} as PNG")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[None], dtype=np.float32) / np.float32(255)

@@ -31,23 +31,23 @@ from alpasim_plugin.types import Scenario
 from scenarios.load import load_scenario
 
 EPILOG = "Example: `simrun train splat smoke/curve --out runs/curve-3dgs`"
-ASIDE_M, ASIDE_VIEWS = 2.0, 8  # where a reconstruction of a single drive is judged beside it
+ASIDE_M, ASIDE_VIEWS = 2.0, 8  # held-out views at a lateral offset from the drive
 LINE_EVERY = 50
 RECIPES: dict[str, Callable[[], SplatRecipe]] = {"full": SplatRecipe.full, "under-trained": SplatRecipe.under_trained}
 
 
 def splat(
     scenario: Annotated[str, typer.Argument(help="Scenario: its log, cameras and tracks.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command continues there.")],
-    recipe: Annotated[Literal["full", "under-trained"], typer.Option("--recipe", help="Amounts and schedule to begin from.")] = "full",
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Updates; the schedule stretches with them.")] = None,
-    gaussians: Annotated[int | None, typer.Option("--gaussians", min=1, help="Gaussians at which densification stops.")] = None,
-    views: Annotated[int | None, typer.Option("--views", min=1, help="Views rendered along the log, held-out ones included.")] = None,
-    width: Annotated[int | None, typer.Option("--width", min=16, help="Pixels across of rendered views.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")],
+    recipe: Annotated[Literal["full", "under-trained"], typer.Option("--recipe", help="Default amounts and schedule.")] = "full",
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Updates; the schedule scales with them.")] = None,
+    gaussians: Annotated[int | None, typer.Option("--gaussians", min=1, help="Number of Gaussians at which densification stops.")] = None,
+    views: Annotated[int | None, typer.Option("--views", min=1, help="Views rendered along the log, including held-out ones.")] = None,
+    width: Annotated[int | None, typer.Option("--width", min=16, help="Width of rendered views, pixels.")] = None,
     images: Annotated[
         Path | None, typer.Option("--images", help="Folder of posed images (transforms.json) instead of rendered views.")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of start, order and splits.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of initialisation, order and splits.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="cuda needs gsplat.")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores.")] = None,
     as_json: AsJson = False,
@@ -55,11 +55,11 @@ def splat(
 ) -> None:
     """Fit 3D Gaussians to posed views of a scenario: background, actors as rigid nodes, sky.
 
-    Writes background.ply, actors/*.ply, sky.png, reconstruction.json, metrics.json and pictures of held-out views (truth left).
+    Writes background.ply, actors/*.ply, sky.png, reconstruction.json, metrics.json and images of held-out views (ground truth left).
     --json prints metrics.json.
     """
     del debug
-    # Tensors here are small: threads of torch gain little and, where other work shares the cores, wait for each other most of the time.
+    # Tensors are small: torch threads gain little and mostly wait for each other on shared cores.
     torch.set_num_threads(1)
     chosen = _recipe(recipe, steps, gaussians, views, width, seed)
     loaded = load_scenario(scenario)
@@ -139,7 +139,7 @@ def _tell(model: Reconstruction, metrics: Mapping[str, Any], fitted_s: float, ou
 
 @contextmanager
 def _progress(steps: int) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """Show a bar on a terminal, a line every 50 steps on a pipe."""
+    """Show a progress bar on a terminal, a line every 50 steps otherwise."""
     if not sys.stderr.isatty():
 
         def line(step: int, numbers: Mapping[str, float]) -> None:

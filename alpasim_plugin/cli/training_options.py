@@ -1,4 +1,4 @@
-"""What the commands of ``simrun train`` share: options, the perceptual term, and how they tell how far they are and what they made."""
+"""Shared options, progress and summary of the ``simrun train`` commands."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from rich.console import Console
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import file_sha256
-from alpasim_plugin.nets.picture_distance import distance_for_training
+from alpasim_plugin.nets.image_distance import distance_for_training
 from alpasim_plugin.training.model_card import curves
 from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.trainer import LOG_FILE
 
-Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; its split 'train' is learned from.")]
-RunFolder = Annotated[Path, typer.Option("--out", help="Folder of the run; the same command continues there.")]
-Steps = Annotated[int, typer.Option("--steps", min=1, help="Updates in all: the budget.")]
-Clips = Annotated[int, typer.Option("--clips", min=1, help="Clips of a batch.")]
+Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; the split 'train' is used.")]
+RunFolder = Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")]
+Steps = Annotated[int, typer.Option("--steps", min=1, help="Total updates.")]
+Clips = Annotated[int, typer.Option("--clips", min=1, help="Clips per batch.")]
 Latents = Annotated[int, typer.Option("--latents", min=2, help="Latents of a clip: 12 are 45 frames, 24 are 93.")]
 Stride = Annotated[int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")]
-PeakLr = Annotated[float, typer.Option("--lr", min=1e-7, help="Highest learning rate.")]
+PeakLr = Annotated[float, typer.Option("--lr", min=1e-7, help="Peak learning rate.")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, draws and noise.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, sampling and noise.")]
 MetricWeights = Annotated[
     Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
 ]
@@ -36,35 +36,35 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
 
 def use_threads(threads: int | None) -> None:
-    """Set torch's threads where a number is given."""
+    """Set the number of torch threads, if given."""
     if threads is not None:
         torch.set_num_threads(threads)
 
 
 def scene_files(scenes: Path, split: str) -> list[Path]:
-    """Return the scenarios of a split as 'simrun train scenes' numbered them, so that the first few are of all families."""
+    """Return the scenarios of a split in order of number, so that the first few cover all families."""
     return sorted((scenes / split).glob("*.yaml"), key=lambda path: (path.stem.rsplit("_", 1)[-1], path.stem))
 
 
 def whole_numbers(option: str, text: str, least: int) -> list[int]:
-    """Return the numbers of a comma-separated option.
+    """Parse a comma-separated list of integers.
 
     Raises:
-        InputError: Anything but whole numbers of at least ``least``.
+        InputError: Other values than integers of at least ``least``.
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) >= least for part in parts):
-        found = f"not a list of whole numbers of at least {least}"
+        found = f"not a list of integers of at least {least}"
         raise InputError(f"reading {option}", f"{option} {text}", found, f"write for example {option} {least + 1},{least + 3}")
     return [int(part) for part in parts]
 
 
 class Progress:
-    """Tells on standard error what a training command does and how long it will take.
+    """Report progress and remaining time of a training command on standard error.
 
     Args:
-        steps: Updates in all.
-        every: Updates between two lines; by default a hundred lines in all.
+        steps: Total updates.
+        every: Updates between two lines; by default a hundred lines in total.
     """
 
     def __init__(self, steps: int, every: int | None = None) -> None:
@@ -72,34 +72,34 @@ class Progress:
         self.every = every or max(steps // 100, 1)
 
     def perceptual_term(self, metric_weights: Path | None) -> tuple[str, Distance]:
-        """Choose the perceptual distance to train with, and say which one it is.
+        """Select the perceptual distance of the loss, and print its name.
 
         Raises:
-            InputError: A folder is named that holds no LPIPS weights.
+            InputError: The named folder has no LPIPS weights.
         """
         name, measure = distance_for_training(metric_weights)
         self.console.print(f"perceptual term: {name}")
         return name, measure.distance
 
     def prepared(self, what: str, done: int, count: int, every: int = 10) -> None:
-        """Tell of work ahead of the first update."""
+        """Report preparation before the first update."""
         if done == count or done % every == 0:
             self.console.print(f"{what}: {done}/{count}, {time.time() - self.began:.0f} s")
 
     def update(self, step: int, numbers: Mapping[str, float]) -> None:
-        """Tell of an update; ``numbers["s"]`` are its seconds."""
+        """Report an update; ``numbers["s"]`` is its duration in seconds."""
         if step % self.every == 0 or step == self.steps:
             values = ", ".join(f"{key} {value:.4g}" for key, value in numbers.items())
             left = (self.steps - step) * numbers["s"]
             self.console.print(f"{step}/{self.steps} {values}; about {left / 60:.0f} min left", highlight=False)
 
     def wrote(self, path: Path, as_json: bool, card: Path | None = None) -> None:
-        """Name the weights that were made; with ``as_json`` one document on standard output says more of them.
+        """Print the path of the weights; with ``as_json`` also one JSON document on standard output.
 
         Args:
             path: The file of weights, in the folder of its run.
             as_json: Print ``weights``, ``sha256``, ``bytes``, ``card``, ``steps``, ``hours`` and ``last``, the log's last means.
-            card: What is told about them, where that is a file; by default what `ModelCard` wrote beside them, if it did.
+            card: Path of the model card; by default the one that `ModelCard` writes, if it exists.
         """
         self.console.print(f"wrote {path}", highlight=False, markup=False, soft_wrap=True)
         if not as_json:

@@ -142,7 +142,7 @@ class BlockPipeline:
         if self.stage is not no_clock:
             return function.eagerly(*args)
         history.cache.begin(self.settings.block_latents)
-        return function(*args, key=history.cache.in_sight)
+        return function(*args, key=history.cache.visible)
 
     def _fix(
         self,

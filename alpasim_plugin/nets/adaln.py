@@ -1,12 +1,12 @@
-"""Adaptive layer norm with low-rank modulation, and its exact removal for one fixed time step.
+"""Adaptive layer norm (adaLN) with low-rank modulation, and its exact folding into the weights for one fixed time step.
 
 A sub-layer ``f`` (self-attention, cross-attention, MLP) acts as ``x + gate * f(LN(x) * (1 + scale) + shift)`` where ``(shift, scale,
-gate) = B A SiLU(e) + lora`` depends on time alone. For one fixed time step the three vectors are constants: with ``W`` the first and
+gate) = B A SiLU(e) + lora`` depends on time only. For one fixed time step the three vectors are constants: with ``W`` the first and
 ``V`` the last linear of ``f``,
 
     W (n * (1 + scale) + shift) = (W diag(1 + scale)) n + W shift         and         gate * (V y) = (diag(gate) V) y,
 
-so they move into the weights and a plain pre-norm transformer remains.
+so they are folded into the weights and a plain pre-norm transformer remains.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Modulation = tuple[Tensor, Tensor, Tensor]  # shift, scale, gate: (B, T, 1, widt
 
 
 class LowRankModulation(nn.Sequential):
-    """Make shift, scale (and gate) from the time embedding; keys ``1.weight`` and ``2.weight``."""
+    """Compute shift, scale (and gate) from the time embedding; keys ``1.weight`` and ``2.weight``."""
 
     def __init__(self, width: int, rank: int, parts: int) -> None:
         super().__init__(nn.SiLU(), Float32Linear(width, rank), Float32Linear(rank, parts * width))
@@ -40,12 +40,12 @@ class LowRankModulation(nn.Sequential):
 
 
 def residual(x: Tensor, f: Callable[[Tensor], Tensor], modulation: Modulation | None) -> Tensor:
-    """Add one modulated sub-layer to the stream; None means that the modulation is folded into ``f``.
+    """Apply one modulated sub-layer with a residual connection; modulation None: it is folded into ``f``.
 
     Args:
         x: ``(B, T, N, width)``.
         f: The sub-layer, same shape out.
-        modulation: Shift, scale and gate in float32; cast to the stream's dtype here.
+        modulation: Shift, scale and gate in float32; cast to the dtype of ``x``.
     """
     if modulation is None:
         return x + f(layer_norm(x))
@@ -67,7 +67,7 @@ def fold_output(linear: nn.Linear, gate: Tensor) -> nn.Linear:
 
 
 def stack_rows(linears: list[nn.Linear]) -> nn.Linear:
-    """Join linears of one input into a single one, outputs one after another."""
+    """Concatenate linears of one input into a single one."""
     weights, biases = zip(*(_wide(linear) for linear in linears), strict=True)
     return _linear(torch.cat(weights), torch.cat(biases), linears[0].weight)
 

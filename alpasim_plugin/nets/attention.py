@@ -1,13 +1,12 @@
 """Attention over latents: block-causal over a whole clip, over a cache, and over the text.
 
-What a token may see (block-causal rule): every token of its own block in both directions, and every token of earlier blocks. A window
-narrows this to the last ``window - sink`` latents up to the end of the own block, plus the first ``sink`` latents of the rollout; the
-own block is always seen whole, also when the window is smaller than it.
+Block-causal mask: a token attends to every token of its own block and of earlier blocks. A sliding window restricts this to the last
+``window - sink`` latents up to the end of the own block, plus the first ``sink`` latents of the rollout (attention sink); the own block
+is always visible, even when the window is smaller.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
@@ -21,7 +20,7 @@ Attend = Callable[[Tensor, Tensor, Tensor], Tensor]  # q, k, v (B, L, heads, hea
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Let every query see every key.
+    """Attend from every query to every key, without a mask.
 
     Args:
         q: ``(B, Lq, heads, head_width)``.
@@ -35,7 +34,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 
 
 def visible_latents(start: int, end: int, window: int | None, sink: int) -> list[int]:
-    """Return the latents that the block ``[start, end)`` sees, oldest first.
+    """Return the latents that are visible to the block ``[start, end)``, oldest first.
 
     Example:
         >>> visible_latents(8, 10, 6, 2)
@@ -52,13 +51,13 @@ def visible_latents(start: int, end: int, window: int | None, sink: int) -> list
 def block_causal_attention(
     q: Tensor, k: Tensor, v: Tensor, tokens: int, block_latents: int, window: int | None = None, sink: int = 0
 ) -> Tensor:
-    """Attend block by block without ever building a mask.
+    """Attend block by block without building a mask.
 
     Args:
         q, k, v: ``(B, T * tokens, heads, head_width)``.
         tokens: Tokens of one latent.
         block_latents: Latents of a block; the last block may be shorter.
-        window, sink: See the module text; None sees all of the past.
+        window, sink: See the module text; None for the whole past.
 
     Returns:
         ``(B, T * tokens, heads * head_width)``.
@@ -69,26 +68,11 @@ def block_causal_attention(
         end = min(start + block_latents, frames)
         first = 0 if window is None else max(0, min(start, end - (window - sink)))
         keys, values = (part[:, first * tokens : end * tokens] for part in (k, v))
-        kept = min(sink, first) if window is not None else 0  # sink latents not already in the run
+        kept = min(sink, first) if window is not None else 0  # sink latents outside the contiguous range
         if kept:
             keys, values = (torch.cat([part[:, : kept * tokens], run], dim=1) for part, run in ((k, keys), (v, values)))
         out.append(attend(q[:, start * tokens : end * tokens], keys, values))
     return torch.cat(out, dim=1)
-
-
-def block_causal_reference(
-    q: Tensor, k: Tensor, v: Tensor, tokens: int, block_latents: int, window: int | None = None, sink: int = 0
-) -> Tensor:
-    """Do the same with one explicit mask and a written-out softmax: the slow twin of `block_causal_attention`."""
-    frames = q.shape[1] // tokens
-    mask = torch.zeros(frames, frames, dtype=torch.bool, device=q.device)
-    for start in range(0, frames, block_latents):
-        end = min(start + block_latents, frames)
-        mask[start:end, visible_latents(start, end, window, sink)] = True
-    mask = mask.repeat_interleave(tokens, 0).repeat_interleave(tokens, 1)
-    scores = torch.einsum("bqhd,bkhd->bhqk", q, k) / math.sqrt(q.shape[-1])
-    weights = scores.masked_fill(~mask, -torch.inf).softmax(dim=-1)
-    return torch.einsum("bhqk,bkhd->bqhd", weights, v).flatten(2)
 
 
 class SelfAttention(nn.Module):
@@ -119,16 +103,16 @@ class SelfAttention(nn.Module):
         q, k, v = (part.unflatten(-1, (-1, self.head_width)) for part in parts)
         return self.q_norm(q), self.k_norm(k), v
 
-    def forward(self, x: Tensor, table: RopeTable, look: Attend) -> Tensor:
-        """Attend as ``look`` says.
+    def forward(self, x: Tensor, table: RopeTable, attention: Attend) -> Tensor:
+        """Apply self-attention.
 
         Args:
             x: ``(B, T, N, width)``.
             table: Rotation of the ``T * N`` tokens.
-            look: Attention of the block's q, k, v, with whatever past it holds.
+            attention: Attention of the block's q, k, v and the cached past.
         """
         q, k, v = self.project(x.flatten(1, 2))
-        out: Tensor = self.output_proj(look(rotate(q, table), rotate(k, table), v))
+        out: Tensor = self.output_proj(attention(rotate(q, table), rotate(k, table), v))
         return out.view(x.shape)
 
 
@@ -153,12 +137,12 @@ class CrossAttention(nn.Module):
     def forward(self, x: Tensor, keys_values: tuple[Tensor, Tensor]) -> Tensor:
         """Attend from ``x (B, T, N, width)`` to the text.
 
-        With a single text token the softmax is one whatever the query, so the token's value is the answer for every query.
+        With a single text token the softmax is 1, so the output is that token's value for every query.
         """
         k, v = (part.expand(x.shape[0], *part.shape[1:]) for part in keys_values)
         if k.shape[1] == 1:
-            alone: Tensor = self.output_proj(v.flatten(2))
-            return alone[:, :, None].expand(x.shape)
+            value: Tensor = self.output_proj(v.flatten(2))
+            return value[:, :, None].expand(x.shape)
         q = self.q_norm(self.q_proj(x.flatten(1, 2)).unflatten(-1, (-1, self.head_width)))
         out: Tensor = self.output_proj(attend(q, k, v))
         return out.view(x.shape)

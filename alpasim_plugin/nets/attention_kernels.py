@@ -1,7 +1,7 @@
-"""Which of torch's attention kernels runs. Nothing in the networks needs a choice: this is for measuring one against another.
+"""Select torch's attention kernel, for benchmarks; the networks work with any.
 
-No mask is ever built (`attention`), so every kernel applies: flash, cuDNN's, the memory-efficient one, and plain products (`math`), which
-hold all scores and are the twin of the others.
+No mask is built (`attention`), so every kernel applies: flash, cuDNN, memory-efficient, and `math` (plain matrix products that hold all
+scores), which is the reference of the others.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def attention_kernel(
 
     Args:
         name: The kernel.
-        device, dtype, head_width: What it will be used on; tried once before anything runs, for a kernel that cannot is an error.
+        device, dtype, head_width: Of the inputs; the kernel is tried on them once.
 
     Raises:
-        InputError: A kernel that is unknown or not there for these.
+        InputError: The kernel is unknown or does not support these inputs.
     """
     if name not in get_args(Kernel):
         raise InputError("choosing an attention kernel", name, "no such kernel", f"take one of {', '.join(get_args(Kernel))}")

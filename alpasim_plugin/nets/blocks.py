@@ -1,20 +1,34 @@
-"""One transformer block and the final layer, each with its modulation or with the modulation folded into its weights."""
+"""The transformer block and the final layer, with adaLN modulation or with the modulation folded into the weights."""
 
 from __future__ import annotations
 
 from typing import cast
 
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from alpasim_plugin.nets.adaln import LowRankModulation, Modulation, fold_input, fold_output, residual, stack_rows
 from alpasim_plugin.nets.attention import Attend, CrossAttention, SelfAttention
 from alpasim_plugin.nets.layers import PATCH, layer_norm
-from alpasim_plugin.nets.mlp import Mlp
 from alpasim_plugin.nets.rope import RopeTable
 from alpasim_plugin.nets.sizes import DiTSizes
 
 TimeSignal = tuple[Tensor, Tensor]  # emb (B, T, width), lora (B, T, 3 * width), both float32
 KeysValues = tuple[Tensor, Tensor]
+
+
+class Mlp(nn.Module):
+    """Linear, exact GELU, linear; without biases unless modulation is folded in."""
+
+    def __init__(self, width: int, inner: int) -> None:
+        super().__init__()
+        self.layer1 = nn.Linear(width, inner, bias=False)
+        self.layer2 = nn.Linear(inner, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., width)`` to ``(..., width)``."""
+        out: Tensor = self.layer2(F.gelu(self.layer1(x)))
+        return out
 
 
 class Block(nn.Module):
@@ -29,30 +43,30 @@ class Block(nn.Module):
         self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
         self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
 
-    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, look: Attend) -> Tensor:
-        """Advance the stream by one block.
+    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend) -> Tensor:
+        """Apply the block.
 
         Args:
             x: ``(B, T, N, width)``.
             time: Time signal; None once folded.
             text: Cross-attention keys and values of this block.
             table: Rotation of the block's tokens.
-            look: Self-attention with whatever past it holds.
+            attention: Self-attention with the cached past.
         """
-        x = residual(x, lambda n: self.self_attn(n, table, look), _modulation(self.adaln_modulation_self_attn, time))
+        x = residual(x, lambda n: self.self_attn(n, table, attention), _modulation(self.adaln_modulation_self_attn, time))
         x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
         return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
 
     def fold(self, time: TimeSignal) -> None:
-        """Move the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
+        """Fold the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
         attn, cross, mlp = self.self_attn, self.cross_attn, self.mlp
-        shift, scale, gate = _due(self.adaln_modulation_self_attn, time)
+        shift, scale, gate = _require(self.adaln_modulation_self_attn, time)
         attn.fuse(fold_input(stack_rows([attn.q_proj, attn.k_proj, attn.v_proj]), shift, scale))
         attn.output_proj = fold_output(attn.output_proj, gate)
-        shift, scale, gate = _due(self.adaln_modulation_cross_attn, time)
+        shift, scale, gate = _require(self.adaln_modulation_cross_attn, time)
         cross.q_proj = fold_input(cross.q_proj, shift, scale)
         cross.output_proj = fold_output(cross.output_proj, gate)
-        shift, scale, gate = _due(self.adaln_modulation_mlp, time)
+        shift, scale, gate = _require(self.adaln_modulation_mlp, time)
         mlp.layer1 = fold_input(mlp.layer1, shift, scale)
         mlp.layer2 = fold_output(mlp.layer2, gate)
         self.adaln_modulation_self_attn = self.adaln_modulation_cross_attn = self.adaln_modulation_mlp = None
@@ -75,7 +89,7 @@ class FinalLayer(nn.Module):
         return cast(Tensor, self.linear(layer_norm(x) * (1 + scale) + shift))
 
     def fold(self, time: TimeSignal) -> None:
-        """Move the modulation of one time step into the weights, in place."""
+        """Fold the modulation of one time step into the weights, in place."""
         assert self.adaln_modulation is not None, "folded twice"
         shift, scale = self.adaln_modulation.split(*time)
         self.linear = fold_input(self.linear, shift, scale)
@@ -83,10 +97,10 @@ class FinalLayer(nn.Module):
 
 
 def _modulation(layer: LowRankModulation | None, time: TimeSignal | None) -> Modulation | None:
-    return None if layer is None else _due(layer, time)
+    return None if layer is None else _require(layer, time)
 
 
-def _due(layer: LowRankModulation | None, time: TimeSignal | None) -> Modulation:
+def _require(layer: LowRankModulation | None, time: TimeSignal | None) -> Modulation:
     assert layer is not None, "folded twice"
     assert time is not None, "a network that is not folded needs its time signal"
     shift, scale, gate = layer.split(*time)

@@ -1,6 +1,6 @@
-"""Weights on disk: safetensors first, pickles only as far as they hold nothing but tensors.
+"""Read weights: safetensors, or pickles that hold only tensors.
 
-Precision: by default tensors come back as they are stored; ``dtype`` converts the floating ones on request.
+Tensors keep their stored precision by default; ``dtype`` converts the floating ones.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -22,6 +22,7 @@ StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")
 RECOMPUTED = ("pos_embedder.seq", "pos_embedder.dim_spatial_range", "pos_embedder.dim_temporal_range")
 CHECKPOINT_INFIX = "_checkpoint_wrapped_module."
+LISTED = 8  # keys named in one error message; the rest is counted
 ZIP_MAGIC, PICKLE_MAGIC = b"PK\x03\x04", b"\x80"
 
 
@@ -29,7 +30,7 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     """Read a checkpoint file.
 
     Args:
-        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (nothing but tensors and plain containers).
+        path: A ``.safetensors`` file, or a torch file that loads with ``weights_only`` (only tensors and plain containers).
         dtype: Precision for floating tensors; None keeps each as stored.
         device: Where the tensors go.
         sha256: Expected digest, in hexadecimal; checked before anything is read.
@@ -38,7 +39,7 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         Tensors by key, taken out of an outer ``{"model": ...}`` or ``{"state_dict": ...}``.
 
     Raises:
-        InputError: No file, wrong digest, truncated or foreign file, or a pickle with anything but tensors.
+        InputError: No file, wrong digest, truncated or foreign file, or a pickle with other objects than tensors.
     """
     path = Path(path)
     doing = "reading network weights"
@@ -49,14 +50,14 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
         raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
     with path.open("rb") as file:
         head = file.read(9)
-    # A safetensors file is a length of 8 bytes and a JSON object; that length may itself begin like a pickle.
+    # A safetensors file begins with a length of 8 bytes and a JSON object; the length may look like the start of a pickle.
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path, device)
     else:
         try:
             content = load_file(path, device=device)
         except (SafetensorError, ValueError) as error:
-            found = f"not a whole safetensors file of {path.stat().st_size} bytes: {error}"
+            found = f"not a complete safetensors file of {path.stat().st_size} bytes: {error}"
             raise InputError(doing, str(path), found, "download or copy the file again; it is truncated or of another format") from error
     tensors = unwrap(content, str(path))
     if dtype is None:
@@ -71,7 +72,7 @@ def file_sha256(path: str | Path) -> str:
 
 
 def unwrap(content: object, source: str) -> StateDict:
-    """Take the tensors out of an outer dictionary; entries of the training framework are left behind.
+    """Take the tensors out of an outer dictionary; entries of the training framework are dropped.
 
     Raises:
         InputError: No dictionary, no tensors, or something else under a key that should hold a tensor.
@@ -92,7 +93,7 @@ def unwrap(content: object, source: str) -> StateDict:
 def clean(tensors: Mapping[str, Tensor]) -> StateDict:
     """Return the network's own tensors under their plain keys.
 
-    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights, optimiser) is left behind. Also left behind:
+    A prefix ``net.`` is stripped; where it is used, everything without it (averaged weights, optimiser) is dropped. Also dropped:
     rotary buffers (recomputed), training counters, transformer-engine states, the infix of activation checkpointing.
     """
     prefixed = any(key.startswith("net.") for key in tensors)
@@ -107,7 +108,7 @@ def clean(tensors: Mapping[str, Tensor]) -> StateDict:
 
 
 def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
-    """Return a floating tensor in another precision, always as a copy; others as they are.
+    """Return a floating tensor in another precision, always as a copy; others unchanged.
 
     Raises:
         InputError: A finite value that overflows the new precision.
@@ -122,10 +123,10 @@ def convert(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
 
 
 def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
-    """Return a copy of one weight in the precision a network wants, after checking that it can be one.
+    """Return a copy of one weight in the precision a network wants, after validation.
 
     Raises:
-        InputError: An integer tensor, or values that are not finite, or not finite any more.
+        InputError: An integer tensor, or values that are not finite before or after the conversion.
     """
     doing = "loading network weights"
     if not value.is_floating_point():
@@ -136,13 +137,19 @@ def weight(key: str, value: Tensor, dtype: torch.dtype, source: str) -> Tensor:
     return convert(key, value, dtype, source)
 
 
+def listed(what: str, keys: Sequence[str]) -> str:
+    """Return keys for an error message, the first `LISTED` by name; empty without keys."""
+    rest = f" and {len(keys) - LISTED} more" if len(keys) > LISTED else ""
+    return f"{what}: {', '.join(keys[:LISTED])}{rest}" if keys else ""
+
+
 def _is_bookkeeping(key: str) -> bool:
     return key.split(".")[-1].startswith("accum_") or key.endswith("_extra_state")
 
 
 def _load_pickle(path: Path, device: str) -> object:
     try:
-        # As an open file, for torch would choose its reader by the suffix. Byte buffers hold transformer-engine states, which are dropped.
+        # Pass an open file, since torch chooses its reader by the suffix. Byte buffers hold transformer-engine states, which are dropped.
         with path.open("rb") as file, torch.serialization.safe_globals([io.BytesIO]):
             return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:

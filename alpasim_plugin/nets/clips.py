@@ -1,7 +1,6 @@
-"""The grid that video autoencoders work on: 1 + 4k frames, sides that are multiples of 8, and the explicit way onto it.
+"""Valid clip sizes of video autoencoders (1 + 4k frames, sides in multiples of 8), and padding to them.
 
-Nothing is padded or dropped behind the caller's back. `pad_clip` repeats the last frame and the right and bottom edges, and says what to
-crop after decoding.
+Padding is explicit: `pad_clip` repeats the last frame and the right and bottom edges, and returns the size to crop to after decoding.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 
-GROUP = 4  # frames of every latent but the first
-SIDE = 8  # pixels of a latent's side
+GROUP = 4  # temporal compression: frames of every latent but the first
+SIDE = 8  # spatial compression: pixels per latent along a side
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def pass_ends(latents: int, size: int | None = 1) -> list[int]:
 
 
 def pad_clip(video: Tensor, group: int = GROUP, side: int = SIDE) -> tuple[Tensor, ClipSize]:
-    """Repeat the last frame and the last row and column until the clip is on the grid.
+    """Pad a clip to a valid size by repeating the last frame, row and column.
 
     Args:
         video: ``(B, C, T, H, W)``, T at least 1.
@@ -84,18 +83,18 @@ def crop_clip(video: Tensor, size: ClipSize) -> Tensor:
 
 
 def check_frames(video: Tensor, doing: str, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3) -> None:
-    """Refuse frames that are off the grid.
+    """Refuse clips of an invalid size.
 
     Args:
         video: Meant to be ``(B, channels, T, H, W)`` floating point.
         doing: For the message.
         first: Whether these frames start the video (1 + group * k) or continue it (group * k).
-        group: Frames of a latent.
+        group: Frames of a latent after the first.
         side: What height and width must be a multiple of.
         channels: Colour channels.
 
     Raises:
-        InputError: Naming the offending size and the nearest good one.
+        InputError: The found size, with the nearest valid one.
     """
     shape = list(video.shape)
     if video.ndim != 5 or shape[1] != channels or not video.is_floating_point():
@@ -126,10 +125,10 @@ def check_frames(video: Tensor, doing: str, first: bool, group: int = GROUP, sid
 
 
 def check_latents(z: Tensor, doing: str, channels: int) -> None:
-    """Refuse anything but ``(B, channels, t, h, w)`` floating point with at least one latent.
+    """Refuse other tensors than ``(B, channels, t, h, w)`` floating point with at least one latent.
 
     Raises:
-        InputError: Naming the shape met.
+        InputError: Another shape or dtype.
     """
     if z.ndim != 5 or z.shape[1] != channels or not z.is_floating_point() or 0 in z.shape:
         do = f"give (B, {channels}, t, h, w) floating point, t at least 1"

@@ -1,4 +1,4 @@
-"""Fill a video codec with weights: from a checkpoint, every key and shape checked, or at random from a keyed stream."""
+"""Load the weights of a video codec from a checkpoint, with every key and shape checked, or initialise them at random."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from torch import Tensor, nn
 
 from alpasim_plugin import seeding
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.checkpoints import convert
-
-LISTED = 6  # keys named in one error before the rest is only counted
+from alpasim_plugin.nets.checkpoints import convert, listed
 
 
 def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dtype, doing: str, source: str, do: str) -> None:
     """Give ``net`` (built on the meta device) copies of ``tensors`` in one precision.
 
     Args:
-        net: Its state dict names every key and shape that is due.
+        net: Its state dict gives the expected keys and shapes.
         tensors: Half, single or double precision, also mixed.
         dtype: Precision of the network's parameters; its constants are float32.
         doing, source, do: For the message.
@@ -27,24 +25,21 @@ def load_checked(net: nn.Module, tensors: Mapping[str, Tensor], dtype: torch.dty
         InputError: Missing, unexpected, mis-shaped (also transposed), non-floating keys, all in one message; or a value that
             overflows ``dtype``.
     """
-    due = {key: tuple(value.shape) for key, value in net.state_dict().items()}
-    wrong = [_describe(key, tensors[key], due[key]) for key in sorted(due.keys() & tensors.keys()) if tuple(tensors[key].shape) != due[key]]
+    expected = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+    shared = sorted(expected.keys() & tensors.keys())
+    wrong = [_describe(key, tensors[key], expected[key]) for key in shared if tuple(tensors[key].shape) != expected[key]]
     other = [f"{key} ({tensors[key].dtype})" for key in sorted(tensors) if not tensors[key].is_floating_point()]
-    found = [
-        *_listing("missing", sorted(due.keys() - tensors.keys())),
-        *_listing("unexpected", sorted(tensors.keys() - due.keys())),
-        *_listing("wrong shape", wrong),
-        *_listing("not floating point", other),
-    ]
-    if found:
-        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(due)} due)", "; ".join(found), do)
+    missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    groups = {"missing": missing, "unexpected": unexpected, "wrong shape": wrong, "not floating point": other}
+    if found := [listed(what, keys) for what, keys in groups.items() if keys]:
+        raise InputError(doing, f"{source} ({len(tensors)} tensors, {len(expected)} expected)", "; ".join(found), do)
     constants = {key for key, _ in net.named_buffers()}
-    precision = {key: torch.float32 if key in constants else dtype for key in due}
-    net.load_state_dict({key: _packed(convert(key, tensors[key], precision[key], source)) for key in due}, assign=True)
+    precision = {key: torch.float32 if key in constants else dtype for key in expected}
+    net.load_state_dict({key: _packed(convert(key, tensors[key], precision[key], source)) for key in expected}, assign=True)
 
 
 def fill_random(net: nn.Module, seed: int, component: str) -> None:
-    """Fill ``net`` with weights that depend on nothing but the key names, the seed and the component.
+    """Initialise ``net`` with weights that depend on the key names, the seed and the component only.
 
     Matrices are normal with standard deviation 1/sqrt(fan-in), vectors that multiply (``gamma``) are 1, biases 0.
     """
@@ -59,20 +54,13 @@ def fill_random(net: nn.Module, seed: int, component: str) -> None:
 
 
 def _packed(value: Tensor) -> Tensor:
-    """Lay a kernel out in memory as the convolutions read it: input channels innermost, taps outermost; shape and values unchanged."""
+    """Return a kernel in channels-last memory format; shape and values unchanged."""
     if value.ndim == 4:
         return value.contiguous(memory_format=torch.channels_last)
     return value.permute(2, 0, 3, 4, 1).contiguous().permute(1, 4, 0, 2, 3) if value.ndim == 5 else value
 
 
-def _describe(key: str, value: Tensor, due: tuple[int, ...]) -> str:
+def _describe(key: str, value: Tensor, expected: tuple[int, ...]) -> str:
     shape = tuple(value.shape)
-    hint = ", transposed" if sorted(shape) == sorted(due) else ""
-    return f"{key} is {list(shape)} for {list(due)}{hint}"
-
-
-def _listing(what: str, items: list[str]) -> list[str]:
-    if not items:
-        return []
-    rest = f" and {len(items) - LISTED} more" if len(items) > LISTED else ""
-    return [f"{what}: {', '.join(items[:LISTED])}{rest}"]
+    hint = ", transposed" if sorted(shape) == sorted(expected) else ""
+    return f"{key} is {list(shape)} for {list(expected)}{hint}"

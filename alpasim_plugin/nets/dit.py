@@ -1,7 +1,7 @@
-"""The causal one-step generator: a diffusion transformer over latents that sees its own block and the past.
+"""The causal one-step generator: a diffusion transformer (DiT) over latents with block-causal attention.
 
-One set of weights, two ways to run it. ``net(...)`` takes a whole clip under the block-causal rule (training, reference);
-``net.step(...)`` takes one block and a cache (streaming). They agree wherever the window covers the history.
+One set of weights, two entry points. ``net(...)`` takes a whole clip with a block-causal mask (training, reference); ``net.step(...)``
+takes one block and a KV cache (streaming). They agree where the window covers the history.
 
 Conventions: ``x`` and ``hdmap`` are ``(B, C, T, H, W)`` normalised latents, time steps run from 0 to 1000, the output is the velocity
 ``noise - clean`` (source minus target) in the shape and dtype of ``x``. Keys, shapes and order of operations are those of OmniDreams
@@ -18,7 +18,6 @@ from typing import Self, cast
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import checkpoints
@@ -36,7 +35,7 @@ FLOAT32_KEYS = ("t_embedder.", "t_embedding_norm.", "adaln_modulation")
 
 @dataclass(frozen=True)
 class TextContext:
-    """A prompt, ready for every block: made once by `CosmosCausalDiT.encode_text` and given in place of the text."""
+    """Cross-attention keys and values of a prompt: computed once by `CosmosCausalDiT.encode_text`, passed in place of the text."""
 
     keys_values: tuple[KeysValues, ...]  # per block: k, v (B or 1, tokens, heads, head_width)
 
@@ -47,11 +46,10 @@ class CosmosCausalDiT(nn.Module):
     Args:
         sizes: All sizes; `DiTSizes()` is OmniDreams single view.
         rope_ratios: NTK stretch of the rotary positions: height, width, time.
-        time_rounding: ``torch.bfloat16`` rounds time steps as the original's training code does; float32 leaves them exact.
+        time_rounding: ``torch.bfloat16`` rounds time steps as the original training code does; float32 does not round.
 
     Attributes:
-        checkpoint_blocks: Recompute blocks in the backward pass to save memory; whole clips only, for a cache has moved on by then.
-        folded_t: The one time step that this network is good for, when it came from `folded`.
+        folded_t: The only valid time step of a network from `folded`.
     """
 
     def __init__(
@@ -63,7 +61,6 @@ class CosmosCausalDiT(nn.Module):
         super().__init__()
         self.sizes, self.rope_ratios, self.time_rounding = sizes, rope_ratios, time_rounding
         self.rope = Rope3D(sizes.head_width, rope_ratios)
-        self.checkpoint_blocks = False
         self.folded_t: float | None = None
         self.x_embedder = PatchEmbed(sizes.latent_channels + MASK_CHANNELS, sizes.width)
         self.additional_patch_embedding = PatchEmbed(sizes.map_channels, sizes.width)
@@ -83,7 +80,7 @@ class CosmosCausalDiT(nn.Module):
         time_rounding: torch.dtype = torch.float32,
         source: str = "state dict",
     ) -> Self:
-        """Build the network whose sizes the tensors show, with a copy of them.
+        """Build a network with sizes read from the tensors, and copy them.
 
         Args:
             sd: Tensors under the original's keys (docs/nets.md), with or without the prefix ``net.`` and an outer
@@ -91,10 +88,10 @@ class CosmosCausalDiT(nn.Module):
             rope_ratios: Height, width, time; not stored in checkpoints.
             dtype: Precision of the weights; half-precision tensors are widened by the default. Time embedding and modulation stay float32.
             time_rounding: See the class.
-            source: Named in errors.
+            source: Name for error messages.
 
         Raises:
-            InputError: Missing, unexpected, mis-shaped or transposed, non-floating or non-finite tensors, each named.
+            InputError: Missing, unexpected, mis-shaped or transposed, non-floating or non-finite tensors, all listed.
         """
         tensors = checkpoints.clean(checkpoints.unwrap(sd, source))
         sizes = read_sizes({key: tuple(value.shape) for key, value in tensors.items()}, source)
@@ -102,14 +99,14 @@ class CosmosCausalDiT(nn.Module):
             net = cls(sizes, rope_ratios, time_rounding)
         kept = {}
         for key, value in tensors.items():
-            island = any(part in key for part in FLOAT32_KEYS)
-            kept[key] = checkpoints.weight(key, value, torch.float32 if island else dtype, source)
+            pinned = any(part in key for part in FLOAT32_KEYS)
+            kept[key] = checkpoints.weight(key, value, torch.float32 if pinned else dtype, source)
         net.load_state_dict(kept, strict=True, assign=True)
         return net
 
     @property
     def dtype(self) -> torch.dtype:
-        """Precision of everything outside the float32 islands."""
+        """Precision of the layers that are not pinned to float32."""
         return self.x_embedder.linear.weight.dtype
 
     @property
@@ -131,7 +128,7 @@ class CosmosCausalDiT(nn.Module):
         sink: int = 0,
         start: int = 0,
     ) -> Tensor:
-        """Predict the velocity of a whole clip; block ``i`` sees itself and the blocks before it.
+        """Predict the velocity of a whole clip; block ``i`` attends to itself and earlier blocks.
 
         Args:
             x: ``(B, C, T, H, W)`` noised latents, H and W even.
@@ -139,9 +136,9 @@ class CosmosCausalDiT(nn.Module):
             text: ``(B or 1, tokens, text_width)`` features, or a `TextContext`.
             hdmap: ``(B, map_channels, T, H, W)`` latents of the semantic map.
             condition_mask: ``(B, 1, T, H, W)``, 1 where the latent is given; None is 0 everywhere.
-            block_latents: Latents of a causal block (the last may be shorter); None lets all see all, as the bidirectional teacher does.
+            block_latents: Latents of a causal block (the last may be shorter); None for bidirectional attention, as in the teacher.
             padding_mask: ``(B, 1, h, w)`` at any resolution; None is 0 everywhere.
-            window, sink: Narrow the past as a cache would (in latents); None sees all of it, as in training.
+            window, sink: Sliding window and attention sink in latents, as in a cache; None for the whole past, as in training.
             start: Absolute latent index of the first frame.
 
         Returns:
@@ -150,10 +147,10 @@ class CosmosCausalDiT(nn.Module):
         self._check(x, t, text, hdmap, block_latents)
         frames, rows, columns = x.shape[2], x.shape[3] // 2, x.shape[4] // 2
         table = self.rope.table(start, frames, rows, columns, x.device)
-        look = functools.partial(
+        attention = functools.partial(
             block_causal_attention, tokens=rows * columns, block_latents=block_latents or frames, window=window, sink=sink
         )
-        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: look, self.checkpoint_blocks)
+        return self._run(x, t, text, hdmap, condition_mask, padding_mask, table, lambda layer: attention)
 
     def step(
         self,
@@ -169,8 +166,8 @@ class CosmosCausalDiT(nn.Module):
     ) -> Tensor:
         """Predict the velocity of one block from its cached past.
 
-        A block may take several forwards (denoising steps, then the cache write): all but the last with ``write=False``. They share a
-        place in the cache, and only the last one's keys and values stay.
+        A block may take several forwards (denoising steps, then the cache write): all but the last with ``write=False``. They use the same
+        cache slots, and the last one's keys and values are kept.
 
         Args:
             x_block, t_block, text, hdmap_block, condition_mask, padding_mask: As in `forward`, for the T latents of the block.
@@ -185,10 +182,10 @@ class CosmosCausalDiT(nn.Module):
         with torch.set_grad_enabled(torch.is_grad_enabled() and cache.keeps_graph):
             table = cache.begin(x_block.shape[2])
 
-            def look(layer: int) -> Attend:
+            def attention(layer: int) -> Attend:
                 return functools.partial(cache.attend, layer)
 
-            v = self._run(x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, look)
+            v = self._run(x_block, t_block, text, hdmap_block, condition_mask, padding_mask, table, attention)
         if write:
             cache.commit()
         return v
@@ -201,9 +198,9 @@ class CosmosCausalDiT(nn.Module):
         Args:
             batch: Sequences (or camera views) side by side.
             height, width: Latent size, even.
-            window: Latents that a token may see, with its own block and the sink; None (all) needs ``keeps_graph``.
-            sink: First latents of the rollout that stay visible.
-            keeps_graph: Grow a list with gradients (training) instead of rolling over a fixed buffer (inference).
+            window: Latents that a token attends to, own block and sink included; None (all) needs ``keeps_graph``.
+            sink: First latents of the rollout that stay visible (attention sink).
+            keeps_graph: Use a growing list with gradients (training) instead of a fixed rolling buffer (inference).
         """
         if keeps_graph:
             return GraphCache(self.rope, batch, height, width, window, sink, self.device)
@@ -213,7 +210,7 @@ class CosmosCausalDiT(nn.Module):
         return RollingCache(self.rope, self.sizes.blocks, self.sizes.heads, batch, height, width, window, sink, self.device, self.dtype)
 
     def encode_text(self, text: Tensor) -> TextContext:
-        """Project a prompt ``(B or 1, tokens, text_width)`` and make every block's keys and values of it, once."""
+        """Project a prompt ``(B or 1, tokens, text_width)`` to the cross-attention keys and values of every block."""
         self._check_text(text)
         context = self.crossattn_proj(text.to(self.dtype))
         return TextContext(tuple(cast(Block, block).cross_attn.keys_values(context) for block in self.blocks))
@@ -221,8 +218,8 @@ class CosmosCausalDiT(nn.Module):
     def folded(self, t: float) -> Self:
         """Return a copy for one time step, with shift, scale and gate folded into the neighbouring linears.
 
-        An exact rewrite (see `adaln`): the result is a plain pre-norm transformer without the modulation's work. It takes the same caches.
-        The copy does not follow later changes of these weights.
+        Exact (see `adaln`): the result is a plain pre-norm transformer without modulation. It takes the same caches. Later changes of
+        these weights do not reach the copy.
         """
         if self.folded_t is not None:
             raise InputError("folding a time step", f"t={t}", f"already folded for t={self.folded_t}", "fold the original network")
@@ -245,16 +242,14 @@ class CosmosCausalDiT(nn.Module):
         condition_mask: Tensor | None,
         padding_mask: Tensor | None,
         table: RopeTable,
-        look: Callable[[int], Attend],
-        recompute: bool = False,
+        attention: Callable[[int], Attend],
     ) -> Tensor:
         time = self._time(t)
         text = text if isinstance(text, TextContext) else self.encode_text(text)
         tokens = embed_latents(self.x_embedder.linear, x.to(self.dtype), condition_mask, padding_mask)
-        tokens = tokens + self.additional_patch_embedding.linear.part(hdmap.to(self.dtype))
+        tokens = tokens + self.additional_patch_embedding.linear.embed(hdmap.to(self.dtype))
         for layer, block in enumerate(self.blocks):
-            args = (tokens, time, text.keys_values[layer], table, look(layer))
-            tokens = checkpoint(block, *args, use_reentrant=False) if recompute and torch.is_grad_enabled() else block(*args)
+            tokens = block(tokens, time, text.keys_values[layer], table, attention(layer))
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal | None:
@@ -276,9 +271,9 @@ class CosmosCausalDiT(nn.Module):
         if x.ndim != 5 or x.shape[1] != sizes.latent_channels or x.shape[2] < 1 or x.shape[3] % 2 or x.shape[4] % 2 or 0 in x.shape:
             do = f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)"
             raise InputError(doing, "x", f"shape {list(x.shape)}", do)
-        due = [x.shape[0], sizes.map_channels, *x.shape[2:]]
-        if list(hdmap.shape) != due:
-            raise InputError(doing, "hdmap", f"shape {list(hdmap.shape)}", f"give {due}, the map at the latents of x")
+        expected = [x.shape[0], sizes.map_channels, *x.shape[2:]]
+        if list(hdmap.shape) != expected:
+            raise InputError(doing, "hdmap", f"shape {list(hdmap.shape)}", f"give {expected}, the map at the latents of x")
         if isinstance(t, Tensor) and (t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])):
             do = f"give one step per latent, [{x.shape[0]}, {x.shape[2]}], or one number"
             raise InputError(doing, "t", f"shape {list(t.shape)}", do)
@@ -295,13 +290,13 @@ class CosmosCausalDiT(nn.Module):
 
     def _check_cache(self, x: Tensor, cache: BlockCache) -> None:
         made: tuple[object, ...] = (cache.batch, cache.height, cache.width, cache.rope.head_width, cache.rope.ratios)
-        due: tuple[object, ...] = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
+        expected: tuple[object, ...] = (x.shape[0], x.shape[3], x.shape[4], self.sizes.head_width, self.rope_ratios)
         if isinstance(cache, RollingCache):
-            made, due = (*made, *cache.layout), (*due, self.sizes.blocks, self.sizes.heads, self.dtype)
-        if made != due:
+            made, expected = (*made, *cache.layout), (*expected, self.sizes.blocks, self.sizes.heads, self.dtype)
+        if made != expected:
             do = "make the cache with this network's new_cache for this batch and latent size"
             names = "batch, height, width, head width, rope ratios, layers, heads, dtype"
-            raise InputError("running one block with a cache", names, f"cache {made}, block and network {due}", do)
+            raise InputError("running one block with a cache", names, f"cache {made}, block and network {expected}", do)
 
 
 __all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext"]

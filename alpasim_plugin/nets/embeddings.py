@@ -1,4 +1,4 @@
-"""What the transformer sees: patch tokens, semantic-map tokens, time and text.
+"""Embeddings of the transformer: patch tokens, semantic-map tokens and time.
 
 Source: OmniDreams single view (causal HD-map network). Channel order at the input is latent, condition mask, padding mask; the map has
 its own patch embedding and is added to the tokens. The time sinusoid is cosine first; its RMS norm feeds the modulation layers
@@ -25,8 +25,8 @@ def sinusoid(t: Tensor, width: int, rounding: torch.dtype = torch.float32) -> Te
     Args:
         t: ``(...)`` time steps, 0 to 1000.
         width: Channels, even.
-        rounding: Precision that the original's training code would pass time through: with ``torch.bfloat16``, the step, its scaled
-            value and the result are each rounded (937.5 is then seen as 936).
+        rounding: Precision in which the original training code holds time: with ``torch.bfloat16``, the step, its scaled value and the
+            result are each rounded (937.5 becomes 936).
 
     Returns:
         ``(..., width)`` float32.
@@ -70,7 +70,7 @@ class PatchEmbed(nn.Module):
 def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None) -> Tensor:
     """Embed latents together with their masks.
 
-    A mask that is None is zero everywhere, so its columns of the embedding are skipped.
+    A mask that is None is zero, so its columns of the embedding are skipped.
 
     Args:
         embed: Embedding of C + 2 channels.
@@ -82,10 +82,10 @@ def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, 
         ``(B, T, N, width)``.
     """
     b, c, t, h, w = x.shape
-    tokens = embed.part(x)
+    tokens = embed.embed(x)
     if condition_mask is not None:
-        tokens = tokens + embed.part(condition_mask.to(x.dtype).expand(b, 1, t, h, w), c)
+        tokens = tokens + embed.embed(condition_mask.to(x.dtype).expand(b, 1, t, h, w), c)
     if padding_mask is not None:
         resized = F.interpolate(padding_mask.to(x.dtype), size=(h, w), mode="nearest")
-        tokens = tokens + embed.part(resized[:, :, None].expand(b, 1, t, h, w), c + 1)
+        tokens = tokens + embed.embed(resized[:, :, None].expand(b, 1, t, h, w), c + 1)
     return tokens

@@ -1,4 +1,4 @@
-"""Layers that treat every frame alone, on videos ``(B, T, H, W, C)``, and the loop over a mix of such layers and causal ones.
+"""Per-frame layers on videos ``(B, T, H, W, C)``, and the loop over a mix of per-frame and causal layers.
 
 Channels last: norms and 1x1 convolutions act on contiguous vectors, a frame is a contiguous slice, and a CPU's 2D convolutions are fast.
 """
@@ -12,31 +12,31 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.nets.streaming_state import Carry
+from alpasim_plugin.nets.streaming_state import StreamingState
 
 
 @runtime_checkable
 class Causal(Protocol):
-    """A layer that looks back."""
+    """A layer that sees past frames."""
 
-    def next(self, x: Tensor, carry: Carry) -> Tensor:
-        """Map the next frames, taking the past from ``carry`` and leaving there what the frames after will need."""
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map the next frames; past frames are read from ``streaming`` and updated there."""
 
 
-def run(layers: Iterable[nn.Module], x: Tensor, carry: Carry) -> Tensor:
-    """Apply layers one after another, causal ones with their past."""
+def run_layers(layers: Iterable[nn.Module], x: Tensor, streaming: StreamingState) -> Tensor:
+    """Apply layers in sequence; causal layers use the streaming state."""
     for layer in layers:
-        x = layer.next(x, carry) if isinstance(layer, Causal) else layer(x)
+        x = layer.next(x, streaming) if isinstance(layer, Causal) else layer(x)
     return x
 
 
-def to_layers(video: Tensor) -> Tensor:
+def channels_last(video: Tensor) -> Tensor:
     """Map ``(B, C, T, H, W)`` to contiguous ``(B, T, H, W, C)``."""
     return video.permute(0, 2, 3, 4, 1).contiguous()
 
 
-def from_layers(x: Tensor) -> Tensor:
-    """Undo `to_layers`."""
+def channels_first(x: Tensor) -> Tensor:
+    """Undo `channels_last`."""
     return x.permute(0, 4, 1, 2, 3).contiguous()
 
 
@@ -45,8 +45,8 @@ def split_last(x: Tensor, parts: int) -> Tensor:
     return x.view(*x.shape[:-1], parts, x.shape[-1] // parts)
 
 
-def halves_to_frames(x: Tensor, parts: int) -> Tensor:
-    """Lay ``parts`` groups of channels out as consecutive frames: ``(B, T, H, W, parts * C)`` to ``(B, parts * T, H, W, C)``."""
+def channels_to_frames(x: Tensor, parts: int) -> Tensor:
+    """Rearrange ``parts`` groups of channels as consecutive frames: ``(B, T, H, W, parts * C)`` to ``(B, parts * T, H, W, C)``."""
     return split_last(x, parts).movedim(-2, 2).flatten(1, 2)
 
 
@@ -59,7 +59,7 @@ def conv_frames(x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1,
 
 
 class Float32Buffers(nn.Module):
-    """A module whose constants stay float32, and exact, when the network around it changes precision (``net.to(torch.bfloat16)``)."""
+    """A module whose buffers stay float32 when the network changes precision (``net.to(torch.bfloat16)``)."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         before = dict(self._buffers)
@@ -82,8 +82,8 @@ class FrameConv(nn.Conv2d):
         return conv_frames(input, self.weight, self.bias, padding=1)
 
 
-class HalvingConv(nn.Conv2d):
-    """3x3 convolution with stride 2; the zero row and column are at the bottom and right only."""
+class DownsampleConv(nn.Conv2d):
+    """3x3 convolution with stride 2; zero padding at the bottom and right only."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__(inputs, outputs, 3, stride=2)
@@ -93,7 +93,7 @@ class HalvingConv(nn.Conv2d):
         return conv_frames(F.pad(input, (0, 0, 0, 1, 0, 1)), self.weight, self.bias, stride=2)
 
 
-class DoublingConv(FrameConv):
+class UpsampleConv(FrameConv):
     """Repeat every pixel 2x2, then a 3x3 convolution."""
 
     def forward(self, input: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ class DoublingConv(FrameConv):
         return super().forward(input.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3))
 
 
-class Pointwise(nn.Module):
+class PointwiseConv(nn.Module):
     """1x1 convolution whose stored kernel has ``axes`` trailing axes of size 1."""
 
     def __init__(self, inputs: int, outputs: int, axes: int, bias: bool = True) -> None:

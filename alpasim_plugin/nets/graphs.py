@@ -1,11 +1,11 @@
-"""Record a function of tensors once and replay it: CUDA graphs, one per shape of the arguments.
+"""Capture a function of tensors once and replay it: CUDA graphs, one per shape of the arguments.
 
-A recorded function sees fixed addresses. Arguments are copied into buffers of the recording, the recording runs, results are copied out;
-so the caller's tensors stay his, and results stay valid after the next call. What the function reaches besides its arguments (weights, a
-rolling cache) must keep its address, and what Python does in it happens at recording only: open and close cache blocks around the call.
+A captured function uses fixed addresses. Arguments are copied into static buffers, the graph runs, results are copied out; so the caller's
+tensors are not written to, and results stay valid after the next call. Other tensors that the function uses (weights, a rolling cache)
+must keep their address. Python code in the function runs at capture only: open and close cache blocks around the call.
 
-Nothing falls back silently. A call runs eagerly while its shape is new (`warmups`) or when `limit` shapes have been recorded; `counts`
-says how often. A function that cannot be recorded is an error.
+There is no silent fallback. A call runs eagerly while its shape is new (`warmups`) or when `limit` shapes have been recorded; `counts`
+holds how often. A function that cannot be captured is an error.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ Function = Callable[..., Any]  # tensors in tuples, lists, dictionaries or None,
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What was recorded: where its results appear, and how to run it again."""
+    """A captured function: its static output buffers, and how to replay it."""
 
     outputs: Any
     replay: Callable[[], object]
 
 
 class Recorder(Protocol):
-    """Something that can run a function again on the same addresses."""
+    """Captures a function for replay on the same addresses."""
 
     def record(self, function: Callable[[], Any]) -> Recording:
-        """Record ``function``; its outputs hold nothing before the first replay."""
+        """Capture ``function``; its outputs are undefined before the first replay."""
         ...
 
 
 class CudaRecorder:
-    """Record CUDA graphs into one shared memory pool.
+    """Capture CUDA graphs into one shared memory pool.
 
     Args:
         device: Where the function runs.
@@ -52,18 +52,18 @@ class CudaRecorder:
         self._pool: Any = None  # torch's handle of a memory pool
 
     def record(self, function: Callable[[], Any]) -> Recording:
-        """Run ``function`` once beside the current stream, so that libraries make their workspaces, then capture it.
+        """Run ``function`` once on a side stream, so that libraries allocate their workspaces, then capture it.
 
         Raises:
-            InfrastructureError: It cannot be captured, for example because it waits for the device.
+            InfrastructureError: It cannot be captured, for example because it synchronises with the device.
         """
         try:
             with torch.cuda.device(self._device):
-                beside = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-                beside.wait_stream(torch.cuda.current_stream())
-                with torch.cuda.stream(beside):
+                side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+                side.wait_stream(torch.cuda.current_stream())
+                with torch.cuda.stream(side):
                     function()
-                torch.cuda.current_stream().wait_stream(beside)
+                torch.cuda.current_stream().wait_stream(side)
                 graph = torch.cuda.CUDAGraph()
                 with torch.cuda.graph(graph, pool=self._pool):
                     outputs = function()
@@ -75,24 +75,6 @@ class CudaRecorder:
         return Recording(outputs, graph.replay)
 
 
-class EagerRecorder:
-    """Run the function anew at every replay: the readable twin, which a CPU can run.
-
-    As with a graph, results appear at fixed places and are not there before the first replay.
-    """
-
-    def record(self, function: Callable[[], Any]) -> Recording:
-        """Prepare buffers like the function's results, full of NaN."""
-        outputs = tree_map_only(Tensor, lambda x: torch.full_like(x, torch.nan if x.is_floating_point() else 0), function())
-
-        def replay() -> None:
-            for kept, new in zip(tree_flatten(outputs)[0], tree_flatten(function())[0], strict=True):
-                if isinstance(kept, Tensor):
-                    kept.copy_(new)
-
-        return Recording(outputs, replay)
-
-
 @dataclass(frozen=True, eq=False)
 class _Entry:
     inputs: Any
@@ -100,21 +82,16 @@ class _Entry:
 
 
 class GraphedFunction:
-    """Call a function through recordings.
+    """Call a function through captured graphs.
 
     Args:
-        function: Takes and returns tensors, bare or in tuples, lists, dictionaries; reads its arguments only.
-        recorder: `CudaRecorder`, or `EagerRecorder` where there is no device.
-        warmups: Eager calls of a shape before it is recorded: kernels are chosen and caches filled in them.
-        limit: Shapes recorded at most; each holds its buffers for good.
+        function: Takes and returns tensors, bare or in tuples, lists, dictionaries; does not write to its arguments.
+        recorder: Captures it, such as `CudaRecorder`.
+        warmups: Eager calls of a shape before it is recorded, in which kernels are selected and caches filled.
+        limit: Maximum number of shapes recorded; each keeps its buffers.
 
     Attributes:
         counts: Calls so far that ran ``eager``, ``recorded`` (and replayed) or ``replayed``, those ``beyond limit`` and ``unrecorded``.
-
-    Example:
-        >>> double = GraphedFunction(lambda x: 2 * x, EagerRecorder(), warmups=1)
-        >>> [float(double(torch.tensor(float(i)))) for i in range(3)], dict(double.counts)
-        ([0.0, 2.0, 4.0], {'eager': 1, 'recorded': 1, 'replayed': 1})
     """
 
     def __init__(self, function: Function, recorder: Recorder, warmups: int = 2, limit: int = 4) -> None:
@@ -129,7 +106,7 @@ class GraphedFunction:
 
         Args:
             args: Tensors, bare or in tuples, lists, dictionaries.
-            key: Everything besides shapes that changes what the function does, such as how full a cache is.
+            key: Any other state that changes the computation, such as how full a cache is.
         """
         what = self._signature(args, key)
         entry = self._entries.get(what)
@@ -139,7 +116,7 @@ class GraphedFunction:
                 self._seen[what] += 1
                 self.counts["beyond limit" if full else "eager"] += 1
                 return self._function(*args)
-            # The copy keeps strides: kernels may be chosen by them.
+            # The copy keeps strides: kernel selection may depend on them.
             inputs = tree_map_only(Tensor, lambda x: x.clone(memory_format=torch.preserve_format), args)
             entry = self._entries[what] = _Entry(inputs, self._recorder.record(lambda: self._function(*inputs)))
             self.counts["recorded"] += 1
@@ -152,7 +129,7 @@ class GraphedFunction:
         return tree_map_only(Tensor, lambda x: x.clone(memory_format=torch.preserve_format), entry.recording.outputs)
 
     def eagerly(self, *args: Any) -> Any:
-        """Run the function as it is, on request; counted as ``unrecorded``."""
+        """Run the function eagerly; counted as ``unrecorded``."""
         self.counts["unrecorded"] += 1
         return self._function(*args)
 

@@ -1,4 +1,4 @@
-"""First weights of a network that is to be trained: truncated normal linears, unit gains, zero last modulation."""
+"""Initial weights for training: truncated normal linears, unit gains, zero last modulation."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ CUT = 3.0  # standard deviations
 def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> dict[str, Tensor]:
     """Draw a state dict.
 
-    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations; norm gains are one, the bias is zero, and
-    so is the final layer's second modulation (the original's initialisation).
+    Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations; norm gains are one, the bias and the
+    final layer's second modulation are zero (the original's initialisation).
 
     Args:
         sizes: The network.
         seed: Of the draw, for example from `alpasim_plugin.seeding.derive_seed`.
-        zero_velocity: Also zero the output layer: the network then predicts no motion, and one step returns its source unchanged.
+        zero_velocity: Also zero the output layer: the predicted velocity is then zero, and one step returns its source unchanged.
 
     Returns:
         Float32 tensors by key, for `CosmosCausalDiT.from_state_dict`.

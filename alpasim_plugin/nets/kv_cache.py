@@ -1,15 +1,14 @@
-"""Keys and values of the past, per layer: a fixed buffer for inference and a list with gradients for training.
+"""KV caches: a fixed rolling buffer for inference and a list with gradients for training.
 
-Both say what a block sees in the same way (see `attention`): the window counts the sink and the own block; keys are stored rotated to
-their absolute positions and are never rotated again.
+Both have the same visibility rule (see `attention`): the window includes the sink and the own block. Keys are stored after the rotary
+embedding at their absolute positions.
 
-`RollingCache` allocates once. Latent ``i`` lies in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so
-the newest latents overwrite the oldest and nothing is moved. Softmax does not care about the order of keys, so the buffer is used as it
-lies. `GraphCache` keeps every block's tensors as they are: slower, growing, readable, and it lets gradients through. It is the rolling
-cache's twin.
+`RollingCache` allocates once. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so the
+newest latents overwrite the oldest without moves. Attention is invariant to the order of keys, so the buffer is used unsorted.
+`GraphCache` keeps the tensors of every block with their gradients and grows. It is the reference implementation of the rolling cache.
 
-A block is a series of forwards at one position: `begin` opens it (again), `attend` answers one layer, `commit` keeps what the last
-forward wrote and moves on.
+A block is a series of forwards at one position: `begin` opens or reopens it, `attend` serves one layer, `commit` keeps the keys and values
+of the last forward and advances.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ from alpasim_plugin.nets.rope import Rope3D, RopeTable
 
 
 class BlockCache(ABC):
-    """Count latents and hold the rotation of the open block.
+    """Base class: position in the rollout and the rotary table of the open block.
 
     Args:
         rope: The network's rotary positions.
         batch: Sequences side by side.
         height, width: Latent size, even.
-        window: Latents that a token may see, own block and sink included; None for all.
-        sink: First latents of the rollout that stay visible.
-        device: Where keys and values live.
+        window: Latents that a token attends to, own block and sink included; None for all.
+        sink: First latents of the rollout that stay visible (attention sink).
+        device: Of keys and values.
     """
 
     keeps_graph: bool = False
@@ -51,23 +50,23 @@ class BlockCache(ABC):
         self.rows, self.columns = height // 2, width // 2
         self.tokens = self.rows * self.columns
         self.position = 0  # absolute index of the open block's first latent
-        self.filled = 0  # latents kept since the start; differs from position in a rollout that starts late
-        self.open_latents = 0  # length of the block whose forwards have begun; 0 between blocks
+        self.filled = 0  # latents committed since reset; differs from position in a rollout that does not start at 0
+        self.open_latents = 0  # length of the open block; 0 between blocks
         self._tables: dict[int, tuple[int, RopeTable]] = {}
 
     def reset(self, position: int = 0) -> None:
-        """Forget the past and start at an absolute latent index."""
+        """Clear the cache and start at an absolute latent index."""
         self.position, self.filled, self.open_latents = position, 0, 0
 
     def begin(self, latents: int) -> RopeTable:
-        """Open the block at the current position, or open it again, and return the rotation of its tokens.
+        """Open or reopen the block at the current position, and return the rotary table of its tokens.
 
-        In a rolling cache the returned tensors keep their storage from block to block of one length.
+        In a rolling cache the returned tensors keep their storage for all blocks of one length.
         """
         self.open_latents = latents
         at, table = self._tables.get(latents, (-1, None))
-        with torch.inference_mode(False):  # what is made in inference mode could not be written to outside of it
-            if table is None or (at != self.position and self.keeps_graph):  # gradients of earlier blocks still need their own rotation
+        with torch.inference_mode(False):  # tensors created in inference mode cannot be written to outside of it
+            if table is None or (at != self.position and self.keeps_graph):  # the backward pass of earlier blocks needs their tables
                 table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
             elif at != self.position:
                 self.rope.move(table, self.position, latents)
@@ -75,13 +74,13 @@ class BlockCache(ABC):
         return table
 
     def commit(self) -> None:
-        """Keep the keys and values of the last forward and move on by its block.
+        """Keep the keys and values of the last forward and advance by its block.
 
         Raises:
-            InputError: When no forward has been made since the last commit or reset.
+            InputError: No forward since the last commit or reset.
         """
         if not self.open_latents:
-            do = "run the block first, with write=False to look before it is kept"
+            do = "run the block first, with write=False if it is not final"
             raise InputError("keeping a block in a cache", f"latent {self.position}", "no forward to keep", do)
         self.position += self.open_latents
         self.filled += self.open_latents
@@ -91,15 +90,11 @@ class BlockCache(ABC):
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Attend from the open block to itself and the visible past; see `attention.attend` for shapes."""
 
-    @abstractmethod
-    def history(self, layer: int) -> tuple[Tensor, Tensor]:
-        """Return a layer's kept keys and values, oldest first, ``(B, latents * tokens, heads, head_width)``."""
-
 
 class RollingCache(BlockCache):
-    """Hold at most ``window`` latents per layer in buffers that are allocated once.
+    """Hold at most ``window`` latents per layer in preallocated buffers.
 
-    Forwards through it run without gradients: its buffers are overwritten in place.
+    Forwards through it run without gradients, since its buffers are overwritten in place.
     """
 
     def __init__(
@@ -122,9 +117,9 @@ class RollingCache(BlockCache):
         with torch.inference_mode(False):
             self.keys = torch.zeros(shape, device=device, dtype=dtype)
             self.values = torch.zeros(shape, device=device, dtype=dtype)
-            self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows that the open block's tokens go to
-        self._source: Tensor | None = None  # which of the block's tokens those are; None for all
-        self._chosen = (0, 0)  # latents kept and length of the block that the rows were chosen for
+            self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows of the open block's tokens
+        self._source: Tensor | None = None  # the block's tokens in those rows; None for all
+        self._chosen = (0, 0)  # filled latents and block length that the rows belong to
         self._fits = True
 
     @property
@@ -133,15 +128,15 @@ class RollingCache(BlockCache):
         return 2 * self.keys.numel() * self.keys.element_size()
 
     @property
-    def in_sight(self) -> tuple[int, int, bool]:
-        """What of the buffer the open block attends to: latents, sinks, whether the block fits; settles once the window is full."""
+    def visible(self) -> tuple[int, int, bool]:
+        """Visible latents, visible sinks, and whether the block fits in the window; constant once the window is full."""
         return min(self.size, self.filled + self.open_latents), min(self.sink, self.filled), self._fits
 
     def begin(self, latents: int) -> RopeTable:
         """Open the block and choose the slots of its latents.
 
         Raises:
-            InputError: When a block is opened again with fewer latents after its first forward took the oldest latents' slots.
+            InputError: The block is reopened with fewer latents after its first forward overwrote the oldest latents.
         """
         overwritten = self.filled + self.open_latents > self.size
         if 0 < latents < self.open_latents and overwritten:
@@ -149,14 +144,14 @@ class RollingCache(BlockCache):
             do = "repeat a block with its first length (its forwards share slots), or write it, or reset the cache"
             raise InputError("opening a block of a rolling cache", f"window {self.window}, sink {self.sink}", found, do)
         table = super().begin(latents)
-        if self._chosen == (self.filled, latents):  # opened again: nothing goes to the device
+        if self._chosen == (self.filled, latents):  # reopened: no transfer to the device
             return table
         self._chosen = (self.filled, latents)
         ring = self.size - self.sink
         own = range(self.filled, self.filled + latents)
         rolling = [i for i in own if i >= self.sink]
         self._fits = len(rolling) <= ring
-        # A block longer than the ring sees itself whole but leaves only its newest latents behind.
+        # A block longer than the ring attends to all of itself; only its newest latents are cached.
         kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
         with torch.inference_mode(False):
@@ -165,27 +160,19 @@ class RollingCache(BlockCache):
         return table
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Write the block's keys and values into their slots and attend to the buffer as it lies."""
+        """Write the block's keys and values into their slots and attend to the buffer."""
         keys, values = self.keys[layer], self.values[layer]
         own_k, own_v = (part.to(keys.dtype) for part in (k, v))
         for buffer, own in ((keys, own_k), (values, own_v)):
             buffer.index_copy_(1, self._rows, own if self._source is None else own[:, self._source])
         if self._fits:
-            end = self.in_sight[0] * self.tokens
+            end = self.visible[0] * self.tokens
             return attend(q, keys[:, :end], values[:, :end])
-        past = self.in_sight[1] * self.tokens
+        past = self.visible[1] * self.tokens
         return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
 
-    def history(self, layer: int) -> tuple[Tensor, Tensor]:
-        """Return a copy of a layer's kept keys and values, oldest first."""
-        ring = self.size - self.sink
-        rolling = range(max(self.sink, self.filled - ring), self.filled)
-        slots = [*range(min(self.sink, self.filled)), *(self.sink + (i - self.sink) % ring for i in rolling)]
-        rows = self._token_rows(slots).to(self.device)
-        return self.keys[layer][:, rows], self.values[layer][:, rows]
-
     def _keep_in_place(self, old: Tensor | None, latents: list[int]) -> Tensor:
-        """Return the rows of these latents, in the old tensor's storage where they are as many."""
+        """Return the rows of these latents, in the old tensor's storage if the shape is equal."""
         rows = self._token_rows(latents)
         return rows.to(self.device) if old is None or old.shape != rows.shape else old.copy_(rows)
 
@@ -205,16 +192,16 @@ class GraphCache(BlockCache):
         self._open: dict[int, tuple[Tensor, Tensor]] = {}
 
     def reset(self, position: int = 0) -> None:
-        """Forget the past and start at an absolute latent index."""
+        """Clear the cache and start at an absolute latent index."""
         super().reset(position)
         self._kept, self._open = {}, {}
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Attend to the visible past and the block, joined anew."""
+        """Attend to the concatenation of the visible past and the block."""
         self._open[layer] = (k, v)
         kept = self._kept.get(layer, [])
-        seen = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
-        return attend(q, torch.cat([*(kept[i][0] for i in seen), k], dim=1), torch.cat([*(kept[i][1] for i in seen), v], dim=1))
+        visible = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
+        return attend(q, torch.cat([*(kept[i][0] for i in visible), k], dim=1), torch.cat([*(kept[i][1] for i in visible), v], dim=1))
 
     def commit(self) -> None:
         """Keep the tensors of the last forward."""
@@ -225,27 +212,15 @@ class GraphCache(BlockCache):
         super().commit()
 
     def fork(self) -> GraphCache:
-        """Return a cache with the same past, cut from its gradients; the two never meet again.
+        """Return an independent cache with the same, detached past.
 
         Raises:
-            InputError: In the middle of a block.
+            InputError: A block is open.
         """
         if self.open_latents:
-            do = "keep the block first, or reset the cache"
-            raise InputError("forking a cache", f"latent {self.position}", "a block with forwards that were not kept", do)
+            do = "commit the block first, or reset the cache"
+            raise InputError("forking a cache", f"latent {self.position}", "an open block with forwards that were not committed", do)
         copy = GraphCache(self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device)
         copy.position, copy.filled = self.position, self.filled
         copy._kept = {layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()}
         return copy
-
-    def detach(self) -> None:
-        """Cut the gradients of everything kept so far: blocks that follow send none beyond this point."""
-        for layer, kept in self._kept.items():
-            self._kept[layer] = [(k.detach(), v.detach()) for k, v in kept]
-
-    def history(self, layer: int) -> tuple[Tensor, Tensor]:
-        """Return a layer's kept keys and values, oldest first."""
-        kept = self._kept.get(layer, [])
-        newest = len(kept) - (self.window - self.sink) if self.window is not None else 0
-        seen = [pair for i, pair in enumerate(kept) if i < self.sink or i >= newest]
-        return torch.cat([k for k, _ in seen], dim=1), torch.cat([v for _, v in seen], dim=1)

@@ -1,7 +1,7 @@
-"""Per-channel mean and standard deviation of a video latent, and the two ways to use them.
+"""Per-channel mean and standard deviation of a video latent; normalisation and its inverse.
 
-A diffusion network works on normalised latents, ``(mu - mean) / std`` per channel. The Wan 2.1 numbers are the ones published with that
-autoencoder; LightVAE and the tiny decoders share its latent space and therefore its numbers.
+A diffusion network works on normalised latents, ``(mu - mean) / std`` per channel. The Wan 2.1 values are published with that
+autoencoder; LightVAE and the tiny decoders share its latent space and therefore its statistics.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ WAN_STD = (
 
 
 class LatentStats(Float32Buffers):
-    """Normalise and de-normalise latents; the numbers stay float32 whatever the precision of the latents.
+    """Normalise and de-normalise latents; the statistics stay float32 in every precision of the latents.
 
     Args:
         mean: One value a channel.
         std: One positive value a channel.
-        stored: Whether the numbers belong to the module's state dict (they do not in Wan checkpoints).
+        stored: Whether the statistics are in the state dict (they are not in Wan checkpoints).
 
     Raises:
         InputError: Lengths differ or a deviation is not positive.

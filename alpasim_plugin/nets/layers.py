@@ -47,7 +47,7 @@ def layer_norm(x: Tensor) -> Tensor:
 
 
 def patchify(video: Tensor) -> Tensor:
-    """Cut 2x2 patches, channel slowest: the order of the input embeddings.
+    """Split into 2x2 patches, channel slowest: the order of the input embeddings.
 
     Args:
         video: ``(B, C, T, H, W)``, H and W even.
@@ -61,7 +61,7 @@ def patchify(video: Tensor) -> Tensor:
 
 
 def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
-    """Lay 2x2 patches out, channel fastest: the order of the output layer, which differs from the input's.
+    """Join 2x2 patches, channel fastest: the order of the output layer, which differs from the input's.
 
     Args:
         tokens: ``(B, T, H/2 * W/2, 4 * C)`` with the last axis ordered (row, column, channel).
@@ -76,12 +76,12 @@ def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
 
 
 class PatchLinear(nn.Linear):
-    """Embed patches; parts of the input channels may be left out when they are known to be zero."""
+    """Patch embedding that can skip input channels which are zero."""
 
     def __init__(self, channels: int, width: int) -> None:
         super().__init__(channels * PATCH * PATCH, width, bias=False)
 
-    def part(self, video: Tensor, first_channel: int = 0) -> Tensor:
+    def embed(self, video: Tensor, first_channel: int = 0) -> Tensor:
         """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B, T, N, width)``."""
         patches = patchify(video)
         start = first_channel * PATCH * PATCH

@@ -1,8 +1,8 @@
-"""LPIPS v0.1 with an AlexNet or VGG-16 trunk; weights are the user's, never bundled, never downloaded.
+"""LPIPS v0.1 with an AlexNet or VGG-16 backbone; the user provides the weights, which are not bundled or downloaded.
 
-Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, Eq. 1. Pictures in [-1, 1] are shifted
+Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, Eq. 1. Images in [-1, 1] are shifted
 and scaled per channel; activations after five rectifiers are scaled to unit length over the channels; their squared differences are
-weighted by calibrated non-negative heads, averaged over the picture and summed. No resizing.
+weighted by calibrated non-negative heads, averaged over the image and summed. No resizing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import StateDict, file_sha256, load_weights, weight
-from alpasim_plugin.nets.perceptual import check_pictures
+from alpasim_plugin.nets.perceptual import check_images
 
 Kind = Literal["alex", "vgg"]
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -90,7 +90,7 @@ TRUNKS: dict[Kind, Trunk] = {
 
 
 class LPIPS(nn.Module):
-    """The distance; random until weights are loaded (`load_lpips`), and then good for tests of shapes only.
+    """The distance; randomly initialised, for tests, until weights are loaded (`load_lpips`).
 
     Args:
         kind: ``alex`` (evaluation) or ``vgg`` (training losses).
@@ -109,12 +109,12 @@ class LPIPS(nn.Module):
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1))
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return the distances ``(B,)`` of pictures ``(B, 3, H, W)`` in [-1, 1]; differentiable.
+        """Return the distances ``(B,)`` of images ``(B, 3, H, W)`` in [-1, 1]; differentiable.
 
         Raises:
             InputError: Shapes differ, are not ``(B, 3, H, W)``, or a side is below 32 pixels.
         """
-        check_pictures(a, b, SMALLEST_PX)
+        check_images(a, b, SMALLEST_PX)
         total = a.new_zeros(len(a))
         for x, y, head in zip(self.activations(a), self.activations(b), self.heads, strict=True):
             difference = (_unit(x) - _unit(y)) ** 2  # (B, C, h, w)
@@ -139,11 +139,11 @@ class LPIPS(nn.Module):
 def load_lpips(kind: Kind, folder: str | Path) -> LPIPS:
     """Load LPIPS v0.1 from a folder of weights, frozen.
 
-    The folder holds the trunk as PyTorch's model zoo publishes it and the heads as the ``lpips`` package does, under the names of `TRUNKS`.
+    The folder holds the backbone of PyTorch's model zoo and the heads of the ``lpips`` package, under the file names in `TRUNKS`.
     Digests are checked before anything is read.
 
     Raises:
-        InputError: A missing or changed file, or one without the expected tensors.
+        InputError: A missing or modified file, or one without the expected tensors.
     """
     if kind not in get_args(Kind):
         raise InputError(LOADING, f"kind {kind!r}", "no such trunk", f"choose one of {', '.join(get_args(Kind))}")
@@ -169,7 +169,7 @@ def missing_files(kind: Kind, folder: str | Path) -> list[str]:
 
 
 def _state(plan: Trunk, trunk: StateDict, heads: StateDict, source: str) -> StateDict:
-    """Rename published tensors to ours.
+    """Map published keys to the keys of `LPIPS`.
 
     Raises:
         InputError: One is missing or has another shape.

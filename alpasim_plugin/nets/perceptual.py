@@ -1,8 +1,8 @@
-"""`perceptual-syn`: a small frozen feature network and the distance over it. Not LPIPS: trained by us on synthetic scenes.
+"""`perceptual-syn`: a perceptual distance over a small frozen feature network. It is not LPIPS: it is trained on synthetic scenes.
 
-The form is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to unit length over the channels, squared
-difference, a non-negative weight per channel, mean over the picture, sum over the stages. Its values are its own: they cannot be compared
-with published LPIPS numbers. docs/video-metrics.md says how it was trained and what it was checked against.
+The definition is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to unit length over the channels, squared
+difference, a non-negative weight per channel, mean over the image, sum over the stages. Values cannot be compared with published LPIPS
+numbers. docs/video-metrics.md describes training and validation.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ NAME = "perceptual-syn"
 FORMAT = "simrun-perceptual-1"
 WIDTHS = (16, 32, 64, 96)  # channels of the stages, at 1/2, 1/4, 1/8 and 1/16 of the resolution
 SMALLEST_PX = 16
-HEAD_START = -3.0  # before softplus
-LENGTH_EPS = 1e-4  # added to the squared length of a feature: flat dark cells would be divided by nearly nothing
+HEAD_INIT = -3.0  # before softplus
+LENGTH_EPS = 1e-4  # added to the squared length of a feature, against division by nearly zero in flat dark cells
 DOING = "measuring a perceptual distance"
 
 
 class FeatureNet(nn.Module):
-    """Four stages of convolutions, each with half the resolution of the one before.
+    """Four convolution stages, each at half the resolution of the previous one.
 
     Args:
         widths: Channels of the stages.
@@ -41,10 +41,10 @@ class FeatureNet(nn.Module):
         self.widths = widths
         self.stages = nn.ModuleList(
             [
-                nn.Sequential(nn.Conv2d(3, one, 4, 2, 1), _bend()),
-                nn.Sequential(nn.Conv2d(one, two, 3, 2, 1), _bend()),
-                nn.Sequential(nn.Conv2d(two, three, 3, 2, 1), _bend()),
-                nn.Sequential(nn.Conv2d(three, four, 3, 2, 1), _bend(), nn.Conv2d(four, four, 3, 1, 1), _bend()),
+                nn.Sequential(nn.Conv2d(3, one, 4, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(one, two, 3, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(two, three, 3, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(three, four, 3, 2, 1), _activation(), nn.Conv2d(four, four, 3, 1, 1), _activation()),
             ]
         )
 
@@ -58,7 +58,7 @@ class FeatureNet(nn.Module):
 
 
 class PerceptualDistance(nn.Module):
-    """Distance of two pictures by their features.
+    """Distance of two images in feature space.
 
     Args:
         widths: Channels of the stages.
@@ -73,21 +73,21 @@ class PerceptualDistance(nn.Module):
     def __init__(self, widths: tuple[int, int, int, int] = WIDTHS) -> None:
         super().__init__()
         self.trunk = FeatureNet(widths)
-        # Before softplus: weights stay positive, so that no difference can make a picture count as nearer.
-        self.heads = nn.ParameterList([nn.Parameter(torch.full((c,), HEAD_START)) for c in widths])
+        # Before softplus, which keeps the weights positive.
+        self.heads = nn.ParameterList([nn.Parameter(torch.full((c,), HEAD_INIT)) for c in widths])
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return the distances ``(B,)`` of pictures ``(B, 3, H, W)`` in [-1, 1]; differentiable in both, zero for equal ones.
+        """Return the distances ``(B,)`` of images ``(B, 3, H, W)`` in [-1, 1]; differentiable in both, zero for equal ones.
 
         Raises:
             InputError: Shapes differ, are not ``(B, 3, H, W)``, or a side is below 16 pixels.
         """
-        check_pictures(a, b, SMALLEST_PX)
-        return self.between(self.trunk(a), self.trunk(b))
+        check_images(a, b, SMALLEST_PX)
+        return self.feature_distance(self.trunk(a), self.trunk(b))
 
     forward = distance
 
-    def between(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
+    def feature_distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """Return the distances ``(B,)`` of features as `FeatureNet` gives them."""
         parts = [_stage_distance(x, y, F.softplus(head)) for x, y, head in zip(a, b, self.heads, strict=True)]
         return torch.stack(parts).sum(0)
@@ -105,7 +105,7 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
         path: Weights that `simrun train perceptual` wrote; None takes those of the package.
 
     Raises:
-        InputError: No such file, or one of another network.
+        InputError: No such file, or weights of another network.
     """
     source = Path(path) if path is not None else shipped_weights()
     doing, do = "loading the perceptual network", "give a file that 'simrun train perceptual' wrote"
@@ -127,19 +127,19 @@ def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
 
 
 def shipped_weights() -> Path:
-    """Return the path of the weights that come with the package."""
+    """Return the path of the shipped weights."""
     return Path(str(resources.files("alpasim_plugin.nets"))) / "weights" / f"{NAME}.safetensors"
 
 
-def check_pictures(a: Tensor, b: Tensor, smallest_px: int) -> None:
-    """Refuse what is not two equal batches of pictures ``(B, 3, H, W)``.
+def check_images(a: Tensor, b: Tensor, smallest_px: int) -> None:
+    """Refuse other tensors than two batches of images ``(B, 3, H, W)`` of equal shape.
 
     Raises:
-        InputError: With both shapes.
+        InputError: Another shape.
     """
     if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < smallest_px:
         do = f"give two tensors (B, 3, H, W) of one shape, sides of at least {smallest_px}"
-        raise InputError(DOING, "two batches of pictures", f"shapes {tuple(a.shape)} and {tuple(b.shape)}", do)
+        raise InputError(DOING, "two batches of images", f"shapes {tuple(a.shape)} and {tuple(b.shape)}", do)
 
 
 def _stage_distance(a: Tensor, b: Tensor, head: Tensor) -> Tensor:
@@ -152,5 +152,5 @@ def unit(x: Tensor) -> Tensor:
     return x * torch.rsqrt((x * x).sum(1, keepdim=True) + LENGTH_EPS)
 
 
-def _bend() -> nn.Module:
-    return nn.LeakyReLU(0.1, inplace=True)  # under a plain ReLU units die, and what they saw goes unseen
+def _activation() -> nn.Module:
+    return nn.LeakyReLU(0.1, inplace=True)  # leaky, since units die under a plain ReLU

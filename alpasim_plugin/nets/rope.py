@@ -1,12 +1,12 @@
-"""Rotary position of a token in (time, height, width), with NTK-stretched frequencies and rotate-half pairing.
+"""3D rotary position embedding (RoPE) over (time, height, width), with NTK-scaled frequencies and rotate-half pairing.
 
 Each head's channels are split ``h = w = 2 * (head_width // 6)``, ``t = rest``. An axis of width ``d`` has the frequencies ``theta **
 (-2k / d)`` for ``k < d / 2`` with ``theta = 10000 * ratio ** (d / (d - 2))``. The angles of a token are concatenated in the order t, h,
 w and repeated twice; channel ``j`` is rotated together with channel ``j + head_width / 2``.
 
-Source: Cosmos-Predict2 rotary embedding as released with OmniDreams. The released table stops at 128 latents; here positions are
-unbounded. Tables are made on the CPU (so also under a default device of ``meta``) and then moved. Angles are made in float64: at
-position 10,000 float32 would already lose 6e-4 rad.
+Source: Cosmos-Predict2 rotary embedding as released with OmniDreams. The released table has 128 latents; here positions are
+unbounded. Tables are computed on the CPU, also under a default device of ``meta``, and then moved. Angles are float64: at position 10,000
+float32 has an error of 6e-4 rad.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ RopeTable = tuple[Tensor, Tensor]  # cos, sin: (L, head_width / 2) float32
 
 
 def axis_widths(head_width: int) -> tuple[int, int, int]:
-    """Return how many of a head's channels turn with time, height and width.
+    """Return the number of a head's channels for time, height and width.
 
     Example:
         >>> axis_widths(128)
@@ -38,19 +38,19 @@ def frequencies(width: int, ratio: float) -> Tensor:
 
     Args:
         width: Channels of the axis, even.
-        ratio: NTK stretch; 1 leaves the base at 10000.
+        ratio: NTK scaling; 1 leaves the base at 10000.
 
     Returns:
         ``(width / 2,)`` float64, radians per position.
     """
     exponent = torch.arange(0, width, 2, dtype=torch.float64, device="cpu") / max(width, 1)
-    # With two channels the only exponent is zero, so the base (and its singular NTK power) plays no part.
+    # With two channels the only exponent is zero, so the base (whose NTK power is singular) has no effect.
     theta = BASE * ratio ** (width / (width - 2)) if width > 2 else BASE
     return torch.pow(torch.tensor(theta, dtype=torch.float64, device="cpu"), -exponent)
 
 
 class Rope3D:
-    """Make rotation tables for blocks of latents.
+    """Compute rotary tables for blocks of latents.
 
     Args:
         head_width: Channels of one attention head, even.
@@ -83,9 +83,9 @@ class Rope3D:
         return half.cos().float().to(device), half.sin().float().to(device)
 
     def move(self, table: RopeTable, start: int, frames: int) -> None:
-        """Rewrite a table made by `table` for another start, in place: only the columns that turn with time change.
+        """Update a table of `table` to another start, in place: only the time columns change.
 
-        Equal to a new table bit for bit, at a fraction of its arithmetic and of what goes to the device.
+        Bit-identical to a new table, with less arithmetic and less data moved to the device.
         """
         angle = torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None] * self.freq_t
         for kept, new in zip(table, (angle.cos(), angle.sin()), strict=True):
@@ -101,7 +101,7 @@ class Rope3D:
 
 
 def rotate(x: Tensor, table: RopeTable) -> Tensor:
-    """Turn queries or keys by their positions, in float32.
+    """Apply the rotary embedding to queries or keys, in float32.
 
     Args:
         x: ``(B, L, heads, head_width)``.

@@ -1,6 +1,6 @@
-"""From a render's latents to clean latents: the paper's Eq. 1 and 2, and their extension to several steps.
+"""Sampling: from the latents of a render to clean latents (paper, Eq. 1 and 2), and the extension to several steps.
 
-Noise is always an argument. Everything works on normalised latents ``(B, C, T, H, W)`` and is differentiable.
+Noise is an argument. All functions take normalised latents ``(B, C, T, H, W)`` and are differentiable.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from alpasim_plugin.nets.schedule import NoiseLevel, context_level
 
 History = Literal["finalise", "last-forward", "none"]
 POOL = (4, 8, 8)  # frames, rows, columns of one latent
-RANGE_SLACK = 1e-3  # opacity beyond [0, 1] by rounding in a renderer is clipped; more is an error
+RANGE_SLACK = 1e-3  # opacity outside [0, 1] by rounding is clipped; more is an error
 
 
 class BlockNet(Protocol):
-    """What the sampler needs of a network; `CosmosCausalDiT` and its folded copies have it."""
+    """The network interface of the sampler; `CosmosCausalDiT` and its folded copies implement it."""
 
     def step(
         self,
@@ -40,15 +40,14 @@ class BlockNet(Protocol):
 
 
 def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = None) -> Tensor:
-    """Bring a renderer's opacity to latent size: the mask ``m`` of Eq. 1.
+    """Max-pool a renderer's opacity to latent size: the mask ``m`` of Eq. 1.
 
-    A latent covers 4 frames of 8 x 8 pixels and takes their largest opacity; the very first frame of a rollout is repeated three times, as
-    the first latent covers it alone.
+    A latent covers 4 frames of 8 x 8 pixels. The first frame of a rollout is repeated three times, since the first latent covers it alone.
 
     Args:
         opacity: ``(B, 1, frames, H, W)``, 0 to 1; ``1 + 4 n`` frames if ``first``, else ``4 n``; H and W in multiples of 8.
         first: Whether the rollout starts here.
-        nan_as: Value for opacities that are not numbers; None refuses them.
+        nan_as: Value that replaces NaN; None refuses NaN.
 
     Returns:
         ``(B, 1, latents, H / 8, W / 8)``.
@@ -70,12 +69,12 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
 
 
 def _without_nan(opacity: Tensor, nan_as: float | None, doing: str) -> Tensor:
-    """Replace opacities that are not numbers, if allowed, and refuse values outside [0, 1]."""
+    """Replace NaN, if allowed, and refuse values outside [0, 1]."""
     unknown = opacity.isnan()
     count = int(unknown.sum())
     if count and nan_as is None:
         found = f"{count} of {opacity.numel()} values are NaN"
-        do = "repair the renderer, or name the value to take with nan_as (0 leaves those places to the network)"
+        do = "repair the renderer, or give a replacement with nan_as (0 treats those pixels as empty)"
         raise InputError(doing, "opacity", found, do)
     if count:
         opacity = opacity.masked_fill(unknown, nan_as if nan_as is not None else 0.0)
@@ -86,7 +85,7 @@ def _without_nan(opacity: Tensor, nan_as: float | None, doing: str) -> Tensor:
 
 
 def mixed_source(z_r: Tensor, m: Tensor, eps: Tensor) -> Tensor:
-    """Keep the render where it is reliable and leave the rest to noise (Eq. 1).
+    """Mix the render where it is opaque with noise elsewhere (Eq. 1).
 
     Args:
         z_r: ``(B, C, T, H, W)`` latents of the render.
@@ -105,13 +104,13 @@ def interpolant(z_0: Tensor, z_1: Tensor, t: Tensor | float) -> Tensor:
 
 
 def flow_step(z_t: Tensor, v: Tensor, t: Tensor | float = 1.0) -> Tensor:
-    """Step along the velocity to the clean latents in one go (Eq. 2): ``z_0 = z_t - t v``; in float32 or wider."""
+    """Predict the clean latents in one Euler step along the velocity (Eq. 2): ``z_0 = z_t - t v``; in float32 or wider."""
     wide = torch.promote_types(z_t.dtype, torch.float32)
     return (z_t.to(wide) - t * v.to(wide)).to(z_t.dtype)
 
 
 def sources_needed(schedule: Sequence[NoiseLevel], history: History) -> int:
-    """Return how many noise draws one block takes: one per step, and one for the cache write."""
+    """Return the number of noise tensors for one block: one per step, and one for the cache write."""
     return len(schedule) + (history == "finalise")
 
 
@@ -127,27 +126,25 @@ def sample_block(
     finalise_net: BlockNet | None = None,
     commit: bool = True,
 ) -> Tensor:
-    """Make one block of clean latents and write it into the history.
+    """Sample one block of clean latents and write its keys and values into the cache.
 
     Each step predicts the clean latents; between steps they are noised again to the next level with a *fresh* source (stochastic, not
-    Euler). What the history holds of a block are the keys and values of its last forward: either an extra one over the clean latents,
-    slightly noised and told t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less). With ``none``
-    nothing is kept.
+    Euler). The cache keeps the keys and values of the block's last forward: either an extra one over the clean latents, slightly noised at
+    t = 128 (``finalise``), or the last denoising step itself (``last-forward``, one forward less). With ``none`` nothing is kept.
 
     Args:
-        net: The network; folded copies serve when ``schedule`` has their one step.
-        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each return to noise between steps (mixed
-            again with fresh noise, or noise), then the noise of the cache write. Each ``(B, C, T, H, W)``.
+        net: The network; a folded copy if ``schedule`` has its one step.
+        sources: As many as `sources_needed`: ``z_1`` at the start (Eq. 1, or noise), one for each renoising between steps (mixed again
+            with fresh noise, or noise), then the noise of the cache write. Each ``(B, C, T, H, W)``.
         text: Prompt, best as a `TextContext`.
         hdmap: ``(B, map_channels, T, H, W)``.
-        cache: This rollout's history.
+        cache: KV cache of this rollout.
         schedule: Noise levels, the first with sigma 1; see `schedule.steps`.
         history: What the cache keeps.
-        given: ``(B, C, n, H, W)`` clean latents that are known for the first n of the block: they replace the input before every forward,
-            the cache write included, and the prediction after it.
+        given: ``(B, C, n, H, W)`` known clean latents of the first n of the block: they replace the input of every forward, the cache
+            write included, and the prediction.
         finalise_net: Network for the cache write, when ``net`` is folded for another time step.
-        commit: False leaves the block open: run it again (for example once its true poses are known), or keep it as it is with
-            ``cache.commit()``, which costs nothing.
+        commit: False leaves the block open: run it again (for example with its true poses), or keep it with ``cache.commit()``.
 
     Returns:
         ``(B, C, T, H, W)`` clean latents.
@@ -182,7 +179,7 @@ def finalise(
     given: Tensor | None = None,
     commit: bool = True,
 ) -> None:
-    """Write clean latents into the history by a forward over them, slightly noised and told t = 128.
+    """Write clean latents into the cache by a forward over them, slightly noised, at t = 128.
 
     Args:
         net, text, hdmap, cache, given, commit: As in `sample_block`.
@@ -195,7 +192,7 @@ def finalise(
 
 
 def _given(given: Tensor | None, like: Tensor) -> tuple[Callable[[Tensor], Tensor], Tensor | None]:
-    """Return what puts known latents at the head of a block, and the condition mask that says where."""
+    """Return a function that overwrites the first latents of a block with known ones, and the condition mask."""
     if given is None:
         return lambda z: z, None
     n = given.shape[2]

@@ -1,8 +1,8 @@
-"""The noise schedule: which time steps a sampler visits and how much noise each stands for.
+"""The noise schedule: time steps of a sampler and their noise levels.
 
-With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network is told ``1000 sigma``. A *named*
-step, as in "1000, 750, 500, 250", is ``1000 u`` and so passes through the shift. The cache write at 128 does not: it is the time told to
-the network as it stands, and its noise level is that of the nearest entry in the table (0.12993).
+With shift 5, ``sigma(u) = 5 u / (1 + 4 u)`` for ``u`` in (0, 1], tabulated at 1000 points; the network takes ``1000 sigma``. A *named*
+step, as in "1000, 750, 500, 250", is ``1000 u``, before the shift. The cache write at 128 is after the shift: it is the network's time
+input, and its noise level is that of the nearest entry in the table (0.12993).
 
 Source: OmniDreams' flow-matching scheduler and self-forcing sampler.
 """
@@ -26,8 +26,8 @@ CONTEXT_STEP = 128.0
 class NoiseLevel:
     """One point of the schedule."""
 
-    t: float  # what the network is told, 0 to 1000
-    sigma: float  # share of noise in the interpolant, 0 to 1
+    t: float  # time input of the network, 0 to 1000
+    sigma: float  # noise weight of the interpolant, 0 to 1
 
 
 def shifted(u: float) -> float:
@@ -53,7 +53,7 @@ def named(step: float) -> NoiseLevel:
 
 
 def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
-    """Return the noise level of the cache write: told ``t`` itself, noised like the table's nearest entry.
+    """Return the noise level of the cache write: time input ``t``, sigma of the table's nearest entry.
 
     Example:
         >>> round(context_level().sigma, 5)

@@ -1,13 +1,14 @@
-"""Sizes of the causal transformer, the checkpoint keys that follow from them, and the way back from tensors to sizes."""
+"""Sizes of the causal transformer, the checkpoint keys and shapes that follow, and reading sizes from a checkpoint."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.checkpoints import listed
 from alpasim_plugin.nets.layers import PATCH
 
 Shape = tuple[int, ...]
@@ -15,7 +16,6 @@ AREA = PATCH * PATCH
 MASK_CHANNELS = 2  # condition mask, padding mask
 ATTENTIONS = ("self_attn", "cross_attn")
 SUBLAYERS = (*ATTENTIONS, "mlp")
-LISTED = 8  # keys named in one error before the rest is only counted
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,10 @@ class DiTSizes:
 
 
 def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
-    """Read all sizes off the tensors of a checkpoint and check every key against them.
+    """Read all sizes from the tensors of a checkpoint and check every key against them.
 
-    Each size is voted for by all tensors that show it, so that one bad tensor is blamed instead of all others. A square matrix
-    that was transposed cannot be told from a right one.
+    Each size is the majority vote of the tensors that depend on it, so that a single wrong tensor is reported, not all others. A
+    transposed square matrix cannot be detected.
 
     Args:
         shapes: Shape of every tensor by key, already cleaned (see `checkpoints.clean`).
@@ -89,7 +89,7 @@ def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
     names = set(DiTSizes(blocks=depth).shapes())
     missing, extra = sorted(names - set(shapes)), sorted(set(shapes) - names)
     if missing or extra:
-        raise _refusal(source, len(shapes), [_listing("missing", missing), _listing("unexpected", extra)])
+        raise _refusal(source, len(shapes), [listed("missing", missing), listed("unexpected", extra)])
     sizes = _vote_sizes(shapes, depth, source)
     wrong = []
     for key, expected in sizes.shapes().items():
@@ -98,68 +98,48 @@ def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
             hint = ", transposed" if len(found) == 2 and found == expected[::-1] else ""
             wrong.append(f"{key} is {list(found)} for {list(expected)}{hint}")
     if wrong:
-        raise _refusal(source, len(shapes), [_listing("wrong shape", wrong)])
+        raise _refusal(source, len(shapes), [listed("wrong shape", wrong)])
     return sizes
 
 
 def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSizes:
     blocks = range(depth)
 
-    def dims(*keys: str) -> list[int]:
-        return [n for key in keys for n in shapes[key]]
+    def mode(values: Iterable[int]) -> int:
+        return Counter(values).most_common(1)[0][0]
 
-    def votes(keys: list[str], known: int, divisor: int = 1, minus: int = 0) -> list[int]:
-        """Return what each matrix says about its other side, given one."""
-        matrices = [shapes[key] for key in keys if len(shapes[key]) == 2 and known in shapes[key]]
-        rests = [sum(shape) - known for shape in matrices]
-        return [rest // divisor - minus for rest in rests if rest % divisor == 0 and rest // divisor > minus]
-
-    def winner(keys: list[str], cast: list[int], about: str) -> int:
-        if not cast:
-            shown = "; ".join(f"{key} is {list(shapes[key])}" for key in keys[:LISTED])
-            raise _refusal(source, len(shapes), [f"wrong shape: {shown}, where {about}"])
-        return Counter(cast).most_common(1)[0][0]
+    def other_side(keys: Iterable[str], known: int) -> list[int]:
+        """Return the second side of matrices of which one side is known; transposition does not matter."""
+        return [math.prod(shapes[key]) // known for key in keys]
 
     squares = [f"blocks.{i}.self_attn.{part}_proj.weight" for i in blocks for part in ("q", "k", "v", "output")]
-    width = winner(squares, dims("t_embedding_norm.weight", *squares), "[width, width] is due")
+    width = mode(n for key in ("t_embedding_norm.weight", *squares) for n in shapes[key])
     gains = [f"blocks.{i}.{name}.{part}_norm.weight" for i in blocks for name in ATTENTIONS for part in "qk"]
-    head_width = winner(gains, dims(*gains), "[head width] is due")
+    head_width = mode(n for key in gains for n in shapes[key])
     if width < 2 or head_width < 2 or width % head_width or head_width % 2:
         found = f"width {width} (self_attn) with head width {head_width} (q_norm, k_norm): no whole number of even heads"
         raise _refusal(source, len(shapes), [found])
     contexts = [f"blocks.{i}.cross_attn.{part}_proj.weight" for i in blocks for part in "kv"]
-    context_votes = dims("crossattn_proj.0.bias") + [n for n in dims(*contexts) if n != width]
-    context_width = winner(["crossattn_proj.0.bias"], context_votes, "[context width] is due")
-
-    def side(keys: list[str], known: int, divisor: int = 1) -> int:
-        return winner(keys, votes(keys, known, divisor), f"one side should be {known}")
-
-    latents = ["final_layer.linear.weight", "x_embedder.proj.1.weight"]
-    latent_votes = votes(latents[:1], width, AREA) + votes(latents[1:], width, AREA, MASK_CHANNELS)
+    context_width = max(mode([*shapes["crossattn_proj.0.bias"], *other_side(contexts, width)]), 1)
     ranks = [f"blocks.{i}.adaln_modulation_{name}.1.weight" for i in blocks for name in SUBLAYERS]
+    (of_output,) = other_side(["final_layer.linear.weight"], width * AREA)
+    (of_input,) = other_side(["x_embedder.proj.1.weight"], width * AREA)
     return DiTSizes(
         width=width,
         blocks=depth,
         head_width=head_width,
-        mlp_width=side([f"blocks.{i}.mlp.layer{n}.weight" for i in blocks for n in (1, 2)], width),
-        adaln_rank=side([*ranks, "final_layer.adaln_modulation.1.weight"], width),
-        text_width=side(["crossattn_proj.0.weight"], context_width),
+        mlp_width=mode(other_side([f"blocks.{i}.mlp.layer{n}.weight" for i in blocks for n in (1, 2)], width)),
+        adaln_rank=mode(other_side([*ranks, "final_layer.adaln_modulation.1.weight"], width)),
+        text_width=mode(other_side(["crossattn_proj.0.weight"], context_width)),
         context_width=context_width,
-        latent_channels=winner(latents, latent_votes, f"one side should be {width}"),
-        map_channels=side(["additional_patch_embedding.proj.1.weight"], width, AREA),
+        latent_channels=mode([of_output, of_input - MASK_CHANNELS]),
+        map_channels=mode(other_side(["additional_patch_embedding.proj.1.weight"], width * AREA)),
     )
 
 
 def _is_block(key: str) -> bool:
     parts = key.split(".")
     return len(parts) > 2 and parts[0] == "blocks" and parts[1].isdigit()
-
-
-def _listing(what: str, items: list[str]) -> str:
-    if not items:
-        return ""
-    rest = f" and {len(items) - LISTED} more" if len(items) > LISTED else ""
-    return f"{what}: {', '.join(items[:LISTED])}{rest}"
 
 
 def _refusal(source: str, count: int, parts: list[str]) -> InputError:

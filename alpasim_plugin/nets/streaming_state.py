@@ -1,8 +1,8 @@
-"""What a causal network keeps of the past: explicit, immutable, handed in and handed out.
+"""Streaming state of causal networks: explicit, immutable, passed in and returned.
 
-A causal layer looks back one or two frames. In a stream those frames come from the call before. `Carry` walks the layers of one pass in
-their fixed order, gives each the frames that it kept and collects what it keeps now. A state is a tuple of tensors that nobody writes to,
-so remembering a state is remembering a reference: a stream can be forked, or rolled back to before a speculative block.
+A causal layer sees one or two past frames; in a stream they come from the previous call. `StreamingState` serves the layers of one pass in
+their fixed order: each layer takes its cached frames and leaves those for the next pass. A `State` is a tuple of tensors that are never
+written to, so a copy is a reference: a stream can be forked, or rolled back to before a speculative block.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ State = tuple[Tensor, ...]
 Step = Callable[..., tuple[Tensor, State]]
 
 
-class Carry:
-    """Serve one pass over a network.
+class StreamingState:
+    """Cached frames of every causal layer during one pass over a network.
 
     Args:
-        state: What the pass before kept, or None before the first frame.
+        state: State after the previous pass, or None before the first frame.
         detach: Cut gradients at the pass boundary.
     """
 
@@ -39,18 +39,18 @@ class Carry:
 
     @property
     def state(self) -> State:
-        """What the layers visited so far keep for the next pass."""
+        """Cached frames of the layers visited so far, for the next pass."""
         return tuple(self._new)
 
     def extend(self, x: Tensor, frames: int) -> Tensor:
-        """Put the kept frames before ``x`` and keep the last ``frames`` of both.
+        """Prepend the cached frames to ``x`` and cache the last ``frames`` of the result.
 
         Args:
             x: ``(B, T, ...)``.
-            frames: How far the layer looks back.
+            frames: Past frames that the layer sees.
 
         Returns:
-            ``(B, k + T, ...)`` with ``0 <= k <= frames``; frames that the video does not have are not made up here.
+            ``(B, k + T, ...)`` with ``0 <= k <= frames``; no padding is added at the start of a video.
 
         Raises:
             InputError: Batch or frame size changed in the middle of a stream.
@@ -65,7 +65,7 @@ class Carry:
             )
         joined = torch.cat([past, x], dim=1) if past.shape[1] else x
         kept = joined[:, max(0, joined.shape[1] - frames) :]
-        self._new.append((kept.detach() if self._detach else kept).clone())  # a view would keep the whole pass alive
+        self._new.append((kept.detach() if self._detach else kept).clone())  # a view would keep the memory of the whole pass
         return joined
 
     def shift(self, x: Tensor) -> Tensor:
@@ -75,7 +75,7 @@ class Carry:
 
 
 class Stream:
-    """Feed a pure step function block by block and hold nothing but its state.
+    """Feed a pure step function block by block and hold its state.
 
     Args:
         step: ``step(x, state, ...) -> (y, state)``.
@@ -87,20 +87,20 @@ class Stream:
         self.state = state
 
     def push(self, x: Tensor, *args: Any, **options: Any) -> Tensor:
-        """Take the next frames or latents and return what they complete."""
+        """Take the next frames or latents and return the outputs that they complete."""
         out, self.state = self._step(x, self.state, *args, **options)
         return out
 
     def fork(self) -> Stream:
-        """Return a second stream at the same point; the two never meet again."""
+        """Return an independent stream at the same point."""
         return Stream(self._step, self.state)
 
 
 def in_passes(step: Step, x: Tensor, state: State | None, ends: Sequence[int]) -> tuple[Tensor, State]:
     """Apply a pure step to consecutive parts of ``x (B, C, T, H, W)`` along time and join the results.
 
-    One latent a pass bounds memory, and makes the result the same bit for bit however a video is cut into calls: the same sums
-    are done in the same order.
+    One latent a pass bounds memory and makes the result bit-identical for any division of a video into calls: the order of
+    summation is the same.
 
     Args:
         step: ``step(part, state) -> (y, state)``.

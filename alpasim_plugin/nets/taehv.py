@@ -1,10 +1,10 @@
-"""The tiny decoder for Wan latents (TAEHV, LightTAE): 2D convolutions with one frame of memory.
+"""The tiny decoder for Wan latents (TAEHV, LightTAE): 2D convolutions with one past frame.
 
-Three stages, each: three memory blocks, height and width doubled, frames multiplied by 1, 2 and 2. A latent therefore becomes 4 frames, and
-the first three frames of a video are dropped so that the first latent is 1 frame, as in the Wan autoencoder.
+Three stages, each: three memory blocks, spatial upsampling by 2, temporal upsampling by 1, 2 and 2. A latent becomes 4 frames, and the
+first three frames of a video are dropped so that the first latent is 1 frame, as in the Wan autoencoder.
 
 Two families of weights share the graph. TAEHV's own Wan weights take the normalised latent; LightTAE's take the de-normalised one
-(``scaled=True``). Nothing in the tensors tells them apart, and the wrong choice gives a washed-out picture, so the caller must say.
+(``scaled=True``). The tensors do not show which; the wrong choice gives a washed-out image, so the caller must state it.
 
 Source: madebyollin/taehv ``taehv.py``; ModelTC/LightX2V ``vae_tiny.py`` for the scaling.
 """
@@ -22,13 +22,22 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import StateDict, unwrap
 from alpasim_plugin.nets.clips import GROUP, check_latents, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
-from alpasim_plugin.nets.frame_layers import DoublingConv, FrameConv, Pointwise, from_layers, halves_to_frames, run, to_layers
+from alpasim_plugin.nets.frame_layers import (
+    FrameConv,
+    PointwiseConv,
+    UpsampleConv,
+    channels_first,
+    channels_last,
+    channels_to_frames,
+    run_layers,
+)
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
-from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
+from alpasim_plugin.nets.streaming_codec import StreamingDecoder
+from alpasim_plugin.nets.streaming_state import State, StreamingState, in_passes
 
-GROWTH = (1, 2, 2)  # frames made of one, by stage
+GROWTH = (1, 2, 2)  # temporal upsampling factor of each stage
 COLOURS = 3
-DROPPED = GROUP - 1  # frames at the start of a video
+DROPPED = GROUP - 1  # frames dropped at the start of a video
 STAGE = 6  # entries of one stage: three memory blocks, upsampling, growth, convolution
 FIRST = 3  # entry of the first stage
 DOING = "loading tiny decoder weights"
@@ -43,30 +52,30 @@ class SoftClamp(nn.Module):
         return 3 * torch.tanh(x / 3)
 
 
-class Grow(nn.Module):
-    """Make ``growth`` frames of one by a 1x1 convolution."""
+class TemporalUpsample(nn.Module):
+    """Upsample in time by ``growth`` with a 1x1 convolution (TGrow)."""
 
     def __init__(self, width: int, growth: int) -> None:
         super().__init__()
         self.growth = growth
-        self.conv = Pointwise(width, growth * width, axes=2, bias=False)
+        self.conv = PointwiseConv(width, growth * width, axes=2, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(B, T, H, W, C)`` to ``(B, growth * T, H, W, C)``."""
-        return halves_to_frames(self.conv(x), self.growth)
+        return channels_to_frames(self.conv(x), self.growth)
 
 
-class MemoryBlock(nn.Module):
-    """Three convolutions over a frame and the one before it, added to the frame."""
+class MemBlock(nn.Module):
+    """Residual block of three convolutions over a frame and its predecessor."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         convs = [FrameConv(inputs, width) for inputs in (2 * width, width, width)]
         self.conv = nn.ModuleList([convs[0], nn.ReLU(inplace=True), convs[1], nn.ReLU(inplace=True), convs[2]])
 
-    def next(self, x: Tensor, carry: Carry) -> Tensor:
-        """Map ``(B, T, H, W, C)`` to the same shape; before the first frame is a zero one."""
-        out = run(self.conv, torch.cat([x, carry.shift(x)], dim=-1), carry)
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map ``(B, T, H, W, C)`` to the same shape; the first frame's predecessor is zero."""
+        out = run_layers(self.conv, torch.cat([x, streaming.shift(x)], dim=-1), streaming)
         return out.add_(x).relu_()
 
 
@@ -74,17 +83,15 @@ def decoder_layers(latent: int, widths: Sequence[int]) -> nn.ModuleList:
     """Return the decoder's layers under their checkpoint positions 0 to 22."""
     layers: list[nn.Module] = [SoftClamp(), FrameConv(latent, widths[0]), nn.ReLU(inplace=True)]
     for inputs, outputs, growth in zip(widths[:-1], widths[1:], GROWTH, strict=True):
-        layers += [MemoryBlock(inputs) for _ in range(3)]
-        # The original repeats pixels at the first of these positions; growing acts on each pixel alone, so repeating after it is the same
-        # at a quarter of the work.
-        layers += [nn.Identity(), Grow(inputs, growth), DoublingConv(inputs, outputs, bias=False)]
+        layers += [MemBlock(inputs) for _ in range(3)]
+        # The original repeats pixels at the first of these positions. Temporal upsampling is pointwise, so repeating after it is equal
+        # at a quarter of the cost.
+        layers += [nn.Identity(), TemporalUpsample(inputs, growth), UpsampleConv(inputs, outputs, bias=False)]
     return nn.ModuleList([*layers, nn.ReLU(inplace=True), FrameConv(widths[-1], COLOURS)])
 
 
-class TinyDecoder(nn.Module):
+class TinyDecoder(StreamingDecoder):
     """Decode normalised Wan latents with a small network; weights are frozen, gradients with respect to the input flow.
-
-    ``latents_per_pass`` (1; None for all) is how many latents are decoded at once: it bounds memory and changes results by rounding only.
 
     Args:
         latent: Channels of the latent.
@@ -103,7 +110,6 @@ class TinyDecoder(nn.Module):
         self.scaled = scaled
         self.decoder = decoder_layers(latent, widths)
         self.stats: LatentStats | None = None
-        self.latents_per_pass: int | None = 1
         self.eval().requires_grad_(False)
 
     @classmethod
@@ -120,8 +126,8 @@ class TinyDecoder(nn.Module):
         """Build the decoder that ``sd`` holds, at whatever widths it has (256, 128, 64, 64 as published).
 
         Args:
-            sd: Original keys, alone or under ``model`` or ``state_dict``; ``encoder.*`` is left behind. A growth layer with more rows
-                than needed gives its last ones.
+            sd: Original keys, alone or under ``model`` or ``state_dict``; ``encoder.*`` is ignored. Of a temporal upsampling layer
+                with more rows than needed, the last ones are used.
             scaled: True for LightTAE, whose weights expect ``z * std + mean``.
             dtype: Precision of the network.
             mean, std: Latent statistics, used when ``scaled``.
@@ -149,36 +155,12 @@ class TinyDecoder(nn.Module):
         net.stats = LatentStats() if scaled else None
         return net
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the weights, and of every result."""
-        return next(self.parameters()).dtype
-
-    def forward(self, z: Tensor, *, clamp: bool = True) -> Tensor:
-        """Decode a whole clip.
-
-        Args:
-            z: ``(B, 16, t, h, w)``, normalised.
-            clamp: Whether to cut the result to [-1, 1].
-
-        Returns:
-            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1].
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.decode_next(z, None, clamp=clamp)[0]
-
-    def decode(self, z: Tensor, *, clamp: bool = True) -> Tensor:
-        """Do the same under the name that all decoders share."""
-        return self.decode_next(z, None, clamp=clamp)[0]
-
     def decode_next(self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function.
 
         Args:
             z: ``(B, 16, m, h, w)``, any m.
-            state: What the call before returned, None at the start of the video.
+            state: State after the previous call, None at the start of the video.
             clamp: Whether to cut the result to [-1, 1].
             detach: Whether to cut gradients after every pass.
 
@@ -193,13 +175,11 @@ class TinyDecoder(nn.Module):
         return (video.clamp(0, 1) if clamp else video) * 2 - 1, state
 
     def _pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        frames = run(self.decoder, to_layers(z if self.stats is None else self.stats.denormalise(z)), carry)
-        return from_layers(frames[:, DROPPED if carry.first else 0 :]), carry.state
+        streaming = StreamingState(state, detach)
+        frames = run_layers(self.decoder, channels_last(z if self.stats is None else self.stats.denormalise(z)), streaming)
+        return channels_first(frames[:, DROPPED if streaming.first else 0 :]), streaming.state
 
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents) -> frames`` as `decode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.decode_next, detach=detach))
+    forward = StreamingDecoder.decode
 
 
 def _read_widths(tensors: Mapping[str, Tensor], source: str) -> tuple[int, tuple[int, ...]]:

@@ -1,19 +1,19 @@
 """A causal video autoencoder for CPUs: 4x8x8 compression to 16 channels, as the Wan autoencoder, at a small part of its work.
 
-What makes it fast: 2D convolutions only, with one frame of memory; none above a quarter of the resolution (pixels are folded into
-channels); the encoder and half of the decoder run once per latent, not once per frame; channels last throughout.
+Cost: 2D convolutions only, with one past frame; none above a quarter of the resolution (space-to-depth); the encoder and half of the
+decoder run once per latent, not once per frame; channels last throughout.
 
-What makes it faithful from the start: around the networks runs a fixed transform (`CosineTransform`). The latent is 16 cosine components of
-each 4x8x8 group plus what the encoder adds; the picture is their synthesis plus what the decoder adds. Untrained, both additions are zero
-and the round trip is a blurred copy.
+The networks predict residuals of a fixed transform (`CosineTransform`). The latent is 16 cosine components of each 4x8x8 group plus the
+encoder's correction; the image is their synthesis plus the decoder's correction. Untrained, both corrections are zero and the round trip is
+a blurred copy.
 
-The decoder may see the render's own frames. With P the projection on the components, s the synthesised picture, r the render and a its
+The decoder can be conditioned on the render. With P the projection on the components, s the synthesised image, r the render and a its
 opacity, it starts from
 
     s + g (1 - P) a (r - s),
 
-the latent's picture with the detail of the render where the render is opaque; the gate g (a number a pixel, 1 when untrained) and an
-additive correction are learned. If the latent is the render's own, untrained decoding returns an opaque render exactly.
+the decoded image with the detail of the render where the render is opaque; the gate g (one value a pixel, 1 when untrained) and an
+additive correction are learned. If the latent encodes the render, untrained decoding returns an opaque render exactly.
 
 Frames: 1 + 4k, as Wan's. The first latent's group is the first frame four times; decoding it gives one frame.
 """
@@ -33,20 +33,19 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import load_weights, unwrap
 from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
-from alpasim_plugin.nets.frame_layers import from_layers, halves_to_frames, split_last, to_layers
+from alpasim_plugin.nets.frame_layers import channels_first, channels_last, channels_to_frames, split_last
 from alpasim_plugin.nets.latent_stats import LatentStats
-from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
-from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinyEncoder, TinyPainter, TinySizes
+from alpasim_plugin.nets.streaming_codec import StreamingCodec
+from alpasim_plugin.nets.streaming_state import State, StreamingState, in_passes
+from alpasim_plugin.nets.tiny_vae_nets import DROPPED, LATENT, TinySizes, TinyVAEDecoder, TinyVAEEncoder
 from alpasim_plugin.nets.tiny_vae_transform import CELL, COLOURS, CosineTransform, from_grid, to_grid
 
 DOING = "loading tiny VAE weights"
 DO = "give a file that TinyVAE.save wrote (keys encoder.*, decoder.*, stats.*)"
 
 
-class TinyVAE(nn.Module):
+class TinyVAE(StreamingCodec):
     """Encode video to latents of about unit variance and back, on a CPU in a few milliseconds a frame.
-
-    ``latents_per_pass`` (1; None for all) is how many latents are made at once: it bounds memory and changes results by rounding only.
 
     Example:
         >>> vae = TinyVAE.random()
@@ -59,17 +58,16 @@ class TinyVAE(nn.Module):
     def __init__(self, sizes: TinySizes = TinySizes()) -> None:
         super().__init__()
         self.sizes = sizes
-        self.encoder = TinyEncoder(sizes)
-        self.decoder = TinyPainter(sizes)
+        self.encoder = TinyVAEEncoder(sizes)
+        self.decoder = TinyVAEDecoder(sizes)
         self.stats = _untrained_stats()
         self.transform = CosineTransform()
-        self.latents_per_pass: int | None = 1
         self.eval()
 
     @classmethod
     def random(cls, sizes: TinySizes = TinySizes(), seed: int = 0) -> Self:
         """Build an untrained, trainable network whose round trip is the cosine transform's blurred copy."""
-        with torch.device("meta"):  # layers draw their own initial values from the global generator otherwise
+        with torch.device("meta"):  # layers would draw initial values from the global generator
             vae = cls(sizes)
         for name, part in (("encoder", vae.encoder), ("decoder", vae.decoder)):
             fill_random(part, seed, f"tiny_vae.{name}")
@@ -103,44 +101,8 @@ class TinyVAE(nn.Module):
         return cls.from_state_dict(load_weights(path), dtype=dtype, source=str(path))
 
     def save(self, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
-        """Write a safetensors file, whole or not at all."""
+        """Write a safetensors file atomically."""
         write_safetensors(path, self.state_dict(), metadata)
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the learned parts and of every result; the fixed transform always works in float32."""
-        return self.encoder.stem.weight.dtype
-
-    def encode(self, video: Tensor) -> Tensor:
-        """Encode a whole clip.
-
-        Args:
-            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` brings any clip there).
-
-        Returns:
-            ``(B, 16, 1 + k, H/8, W/8)``, normalised.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.encode_next(video, None)[0]
-
-    def decode(self, z: Tensor, *, render: Tensor | None = None, opacity: Tensor | None = None, clamp: bool = True) -> Tensor:
-        """Decode a whole clip.
-
-        Args:
-            z: ``(B, 16, t, h, w)``, normalised.
-            render: ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1]: frames whose detail may be used, or None.
-            opacity: ``(B, 1, ...)`` of the render's size, 0 to 1: where the render shows something; None is everywhere.
-            clamp: Whether to cut the result to [-1, 1].
-
-        Returns:
-            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)``.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.decode_next(z, None, render=render, opacity=opacity, clamp=clamp)[0]
 
     def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function, with the same rules as `WanVAE.encode_next`."""
@@ -163,7 +125,8 @@ class TinyVAE(nn.Module):
         Args:
             z: ``(B, 16, m, h, w)``, any m.
             state: What the call before returned, None at the start of the video.
-            render, opacity: See `decode`; as many frames as are returned.
+            render: ``(B, 3, n, 8h, 8w)`` in [-1, 1]: frames whose detail the decoder uses, or None.
+            opacity: ``(B, 1, n, 8h, 8w)``, 0 to 1: coverage of the render; None is opaque everywhere.
             clamp: Whether to cut the result to [-1, 1].
             detach: Whether to cut gradients after every pass.
 
@@ -176,59 +139,51 @@ class TinyVAE(nn.Module):
         check_latents(z, "decoding latents with the tiny VAE", LATENT)
         b, _, m, h, w = z.shape
         frames = GROUP * m - (DROPPED if state is None else 0)
-        _check_seen(render, opacity, (b, frames, h * SIDE, w * SIDE))
+        _check_condition(render, opacity, (b, frames, h * SIDE, w * SIDE))
         latent_ends, frame_ends = pass_ends(m, self.latents_per_pass), group_ends(frames, state is None, self.latents_per_pass)
         parts, start, first = [], 0, 0
         for end, last in zip(latent_ends, frame_ends, strict=True):
-            seen = [None if x is None else x[:, :, first:last].float() for x in (render, opacity)]
-            part, state = self._decode_pass(z[:, :, start:end].float(), seen[0], seen[1], state, detach)
+            condition = [None if x is None else x[:, :, first:last].float() for x in (render, opacity)]
+            part, state = self._decode_pass(z[:, :, start:end].float(), condition[0], condition[1], state, detach)
             parts.append(part)
             start, first = end, last
         assert state is not None
         video = torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
         return video.clamp(-1, 1) if clamp else video, state
 
-    def encoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.encode_next, detach=detach))
-
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents, render=...) -> frames`` as `decode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.decode_next, detach=detach))
-
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        grid = to_grid(_whole_groups(frames, carry.first))
-        mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), carry)
-        return self.stats.normalise(from_layers(mu)).to(self.dtype), carry.state
+        streaming = StreamingState(state, detach)
+        grid = to_grid(_whole_groups(frames, streaming.first))
+        mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), streaming)
+        return self.stats.normalise(channels_first(mu)).to(self.dtype), streaming.state
 
     def _decode_pass(
         self, z: Tensor, render: Tensor | None, opacity: Tensor | None, state: State | None, detach: bool
     ) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        mu = to_layers(self.stats.denormalise(z))
+        streaming = StreamingState(state, detach)
+        mu = channels_last(self.stats.denormalise(z))
         grid = self.transform.synthesise(mu)
-        skipped = DROPPED if carry.first else 0
+        skipped = DROPPED if streaming.first else 0
 
         def as_frames(x: Tensor) -> Tensor:
-            return halves_to_frames(x, GROUP)[:, skipped:]
+            return channels_to_frames(x, GROUP)[:, skipped:]
 
         frames = as_frames(grid)
         if render is None:
-            correction, _ = self.decoder.next(mu.to(self.dtype), None, carry)
-            return from_grid(frames + correction).to(self.dtype), carry.state
-        shown = to_grid(_whole_groups(render, carry.first))
+            correction, _ = self.decoder.next(mu.to(self.dtype), None, streaming)
+            return from_grid(frames + correction).to(self.dtype), streaming.state
+        shown = to_grid(_whole_groups(render, streaming.first))
         if opacity is None:
-            cover, difference = None, shown  # the synthesised picture has no detail to subtract
+            cover, difference = None, shown  # the synthesised image has no detail to subtract
         else:
-            cover = to_grid(_whole_groups(opacity, carry.first))
+            cover = to_grid(_whole_groups(opacity, streaming.first))
             shown, difference = _per_pixel(shown, cover), _per_pixel(shown - grid, cover)
-        seen = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
-        correction, gate = self.decoder.next(mu.to(self.dtype), seen, carry)
+        condition = as_frames(shown.to(self.dtype)), None if cover is None else as_frames(cover.to(self.dtype))
+        correction, gate = self.decoder.next(mu.to(self.dtype), condition, streaming)
         assert gate is not None
         detail = split_last(as_frames(self.transform.residue(difference)), CELL)
-        picture = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
-        return from_grid(picture.flatten(-2)).to(self.dtype), carry.state
+        image = torch.addcmul(split_last(frames + correction, CELL), detail, gate.float()[..., None])
+        return from_grid(image.flatten(-2)).to(self.dtype), streaming.state
 
 
 def _untrained_stats() -> LatentStats:
@@ -241,12 +196,12 @@ def _per_pixel(colours: Tensor, factor: Tensor) -> Tensor:
 
 
 def _whole_groups(frames: Tensor, first: bool) -> Tensor:
-    """Put three copies of the video's first frame before it, so that the first latent has a group of four as well."""
+    """Repeat the video's first frame three times before it, so that the first latent has a group of four frames."""
     return torch.cat([frames[:, :, :1].expand(-1, -1, DROPPED, -1, -1), frames], dim=2) if first else frames
 
 
-def _check_seen(render: Tensor | None, opacity: Tensor | None, due: tuple[int, int, int, int]) -> None:
-    b, *size = due
+def _check_condition(render: Tensor | None, opacity: Tensor | None, expected: tuple[int, int, int, int]) -> None:
+    b, *size = expected
     for name, given, channels in (("render", render, COLOURS), ("opacity", opacity, 1)):
         if given is not None and tuple(given.shape) != (b, channels, *size):
             raise InputError(

@@ -1,4 +1,4 @@
-"""The fixed part of the tiny autoencoder: frames as quarter-resolution grids, and the 16 strongest cosine components of 4x8x8 pixel groups.
+"""The fixed transform of the tiny autoencoder: frames as quarter-resolution grids, and 16 DCT components of 4x8x8 pixel groups.
 
 A group is 4 frames of one 8x8 pixel square. Its orthonormal discrete cosine transform over colour, time, row and column has 768 components;
 the 16 kept ones are those with the most energy in driving video at 256x144 (eleven clips of eight cameras, 10 and 30 frames per second).
@@ -17,7 +17,7 @@ from alpasim_plugin.nets.clips import GROUP, SIDE
 from alpasim_plugin.nets.frame_layers import Float32Buffers, conv_frames
 
 COLOURS = 3
-QUARTER = 4  # pixels of a grid cell's side
+QUARTER = 4  # side of a grid cell, pixels
 CELL = QUARTER * QUARTER  # pixels of a cell
 
 # (colour, time, row, column) frequency and standard deviation over driving video in [-1, 1]
@@ -38,7 +38,7 @@ def to_grid(video: Tensor) -> Tensor:
 
 
 def from_grid(grid: Tensor) -> Tensor:
-    """Lay single frames ``(B, T, H/4, W/4, 16 * C)`` out as ``(B, C, T, H, W)``."""
+    """Rearrange single frames ``(B, T, H/4, W/4, 16 * C)`` out as ``(B, C, T, H, W)``."""
     b, frames, rows, columns, depth = grid.shape
     cells = grid.reshape(b, frames, rows, columns, QUARTER, QUARTER, depth // CELL)
     return cells.permute(0, 6, 1, 2, 4, 3, 5).reshape(b, depth // CELL, frames, rows * QUARTER, columns * QUARTER)
@@ -48,7 +48,7 @@ class CosineTransform(Float32Buffers):
     """Analyse grids of 4 frames into the 16 components of every 8x8 square, and synthesise them back.
 
     Both directions use the same fixed orthonormal kernel, computed in code and not stored in weights. Everything here
-    is float32: half precision would cost a grey level.
+    is float32: half precision has an error of one grey level.
     """
 
     kernel: Tensor
@@ -70,7 +70,7 @@ class CosineTransform(Float32Buffers):
         return self._sum(components * self.std + self.mean)
 
     def residue(self, grid: Tensor) -> Tensor:
-        """Return what the components leave of ``(B, t, H/4, W/4, 192)``: the detail that a latent alone cannot carry."""
+        """Return the residual of the projection on the components, ``(B, t, H/4, W/4, 192)``: detail that the latent lacks."""
         return grid - self._sum(self._coefficients(grid))
 
     def _coefficients(self, grid: Tensor) -> Tensor:

@@ -17,20 +17,21 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import unwrap
 from alpasim_plugin.nets.clips import check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
-from alpasim_plugin.nets.frame_layers import Pointwise, from_layers, run, to_layers
+from alpasim_plugin.nets.frame_layers import PointwiseConv, channels_first, channels_last, run_layers
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD, LatentStats
-from alpasim_plugin.nets.streaming_state import Carry, State, Stream, in_passes
-from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Down, FrameAttention, ResidualBlock, Up
+from alpasim_plugin.nets.streaming_codec import StreamingCodec
+from alpasim_plugin.nets.streaming_state import State, StreamingState, in_passes
+from alpasim_plugin.nets.wan_vae_blocks import CausalConv, ChannelNorm, Downsample, FrameAttention, ResidualBlock, Upsample
 from alpasim_plugin.nets.wan_vae_layout import DECODER_TIME, DO, DOING, ENCODER_TIME, WanLayout, read_layout
 
 
 def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:
-    """Return one stage's blocks; the first changes the width."""
+    """Return the residual blocks of one stage; the first changes the width."""
     return [ResidualBlock(inputs if i == 0 else outputs, outputs) for i in range(count)]
 
 
 class Coder(nn.Module):
-    """What encoder and decoder share: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
+    """Common part of encoder and decoder: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
 
     def __init__(self, stem: tuple[int, int], middle: int, head: tuple[int, int]) -> None:
         super().__init__()
@@ -49,12 +50,12 @@ class Encoder(Coder):
         for stage, (inputs, outputs) in enumerate(zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)):
             blocks += residual_blocks(inputs, outputs, layout.blocks)
             if stage < len(ENCODER_TIME):
-                blocks.append(Down(outputs, ENCODER_TIME[stage]))
+                blocks.append(Downsample(outputs, ENCODER_TIME[stage]))
         self.downsamples = nn.ModuleList(blocks)
 
-    def next(self, x: Tensor, carry: Carry) -> Tensor:
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map frames ``(B, T, H, W, 3)`` to ``(B, t, H/8, W/8, 2 * latent)``."""
-        return run((self.conv1, *self.downsamples, *self.middle, *self.head), x, carry)
+        return run_layers((self.conv1, *self.downsamples, *self.middle, *self.head), x, streaming)
 
 
 class Decoder(Coder):
@@ -67,19 +68,18 @@ class Decoder(Coder):
         for stage, (inputs, outputs) in enumerate(zip(layout.decoder_in, layout.decoder_out, strict=True)):
             blocks += residual_blocks(inputs, outputs, layout.blocks + 1)
             if stage < len(DECODER_TIME):
-                blocks.append(Up(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
+                blocks.append(Upsample(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
         self.upsamples = nn.ModuleList(blocks)
 
-    def next(self, x: Tensor, carry: Carry) -> Tensor:
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
         """Map ``(B, t, h, w, latent)`` to frames ``(B, T, 8h, 8w, 3)``."""
-        return run((self.conv1, *self.middle, *self.upsamples, *self.head), x, carry)
+        return run_layers((self.conv1, *self.middle, *self.upsamples, *self.head), x, streaming)
 
 
-class WanVAE(nn.Module):
+class WanVAE(StreamingCodec):
     """Encode video to normalised latents and back.
 
-    Weights are frozen; gradients with respect to the input flow. ``latents_per_pass`` (1; None for all) is how many latents are made at
-    once: it bounds memory and changes results by rounding only.
+    Weights are frozen; gradients with respect to the input flow.
 
     Example:
         >>> vae = WanVAE.random(WanLayout.of_base(8))
@@ -92,11 +92,10 @@ class WanVAE(nn.Module):
         super().__init__()
         self.layout = layout
         self.encoder = Encoder(layout)
-        self.conv1 = Pointwise(2 * layout.latent, 2 * layout.latent, axes=3)
-        self.conv2 = Pointwise(layout.latent, layout.latent, axes=3)
+        self.conv1 = PointwiseConv(2 * layout.latent, 2 * layout.latent, axes=3)
+        self.conv2 = PointwiseConv(layout.latent, layout.latent, axes=3)
         self.decoder = Decoder(layout)
         self.stats = LatentStats(mean, std)
-        self.latents_per_pass: int | None = 1
         self.eval().requires_grad_(False)
 
     @classmethod
@@ -140,53 +139,19 @@ class WanVAE(nn.Module):
         vae.stats = LatentStats(WAN_MEAN, WAN_STD)
         return vae
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of the weights, and of every result."""
-        return self.conv1.weight.dtype
-
-    def encode(self, video: Tensor) -> Tensor:
-        """Encode a whole clip.
-
-        Args:
-            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` brings any clip there).
-
-        Returns:
-            ``(B, 16, 1 + k, H/8, W/8)``, normalised means; nothing is sampled.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.encode_next(video, None)[0]
-
-    def decode(self, z: Tensor, *, clamp: bool = True) -> Tensor:
-        """Decode a whole clip.
-
-        Args:
-            z: ``(B, 16, t, h, w)``, normalised.
-            clamp: Whether to cut the result to [-1, 1], as the original does; off for losses.
-
-        Returns:
-            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)``.
-
-        Raises:
-            InputError: Another shape.
-        """
-        return self.decode_next(z, None, clamp=clamp)[0]
-
     def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function.
 
         Args:
             frames: ``(B, 3, n, H, W)``: n = 1 + 4k if ``state`` is None (the video starts here), else 4k.
-            state: What the call before returned.
+            state: State after the previous call.
             detach: Whether to cut gradients after every pass.
 
         Returns:
             Latents ``(B, 16, m, H/8, W/8)`` and the state for the next call.
 
         Raises:
-            InputError: A number of frames or a size that is not due.
+            InputError: An invalid number of frames or size.
         """
         check_frames(frames, "encoding video frames", first=state is None, channels=self.layout.colours)
         ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
@@ -197,7 +162,7 @@ class WanVAE(nn.Module):
 
         Args:
             z: ``(B, 16, m, h, w)``, any m.
-            state: What the call before returned, None at the start of the video.
+            state: State after the previous call, None at the start of the video.
             clamp: Whether to cut the result to [-1, 1].
             detach: Whether to cut gradients after every pass (one latent a pass is a truncation distance of 1).
 
@@ -212,19 +177,11 @@ class WanVAE(nn.Module):
         video, state = in_passes(partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends)
         return video.clamp(-1, 1) if clamp else video, state
 
-    def encoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.encode_next, detach=detach))
-
-    def decoder_stream(self, *, detach: bool = True) -> Stream:
-        """Start a stream: ``push(latents) -> frames`` as `decode_next`; its ``state`` is all it holds."""
-        return Stream(partial(self.decode_next, detach=detach))
-
     def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        moments = self.conv1(self.encoder.next(to_layers(frames), carry))
-        return self.stats.normalise(from_layers(moments[..., : self.layout.latent])), carry.state
+        streaming = StreamingState(state, detach)
+        moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
+        return self.stats.normalise(channels_first(moments[..., : self.layout.latent])), streaming.state
 
     def _decode_pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
-        carry = Carry(state, detach)
-        return from_layers(self.decoder.next(self.conv2(to_layers(self.stats.denormalise(z))), carry)), carry.state
+        streaming = StreamingState(state, detach)
+        return channels_first(self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)), streaming.state

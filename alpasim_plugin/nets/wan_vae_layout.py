@@ -1,8 +1,8 @@
-"""Sizes of a Wan 2.1 autoencoder, read off its tensors.
+"""Sizes of a Wan 2.1 autoencoder, read from its tensors.
 
 The graph is fixed: four stages, one residual block more per stage in the decoder than in the encoder, time halved after the second and
-third encoder stage. What varies is the width of each stage (96, 192, 384, 384 in the published network, a quarter of that in LightVAE)
-and, in principle, the number of blocks (2).
+third encoder stage. The widths of the stages vary (96, 192, 384, 384 in the published network, a quarter of that in LightVAE)
+and so may the number of blocks (2).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class WanLayout:
 
 
 def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLayout:
-    """Read the widths off vectors (biases and norm gains), which a transposed matrix cannot falsify.
+    """Read the widths from vectors (biases and norm gains), which cannot be transposed.
 
     Raises:
         InputError: A key that gives a width is missing.

@@ -1,4 +1,4 @@
-"""Draw clips for training: from pairs, and from any driving videos. The clip of draw i depends on i and the seed alone."""
+"""Sample training clips from pairs and from driving videos. Clip i depends on i and the seed only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOING = "drawing a training clip"
 
 
 @dataclass(frozen=True)
-class ClipSize:
+class CropSize:
     """Frames, and the height and width of the crop, pixels; sides are multiples of 16."""
 
     frames: int
@@ -31,7 +31,7 @@ class ClipSize:
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip as tensors ``(C, T, H, W)``: pictures in [-1, 1], opacity 0 to 1 with one channel. None: the source has no such channel."""
+    """A clip as tensors ``(C, T, H, W)``: images in [-1, 1], opacity 0 to 1 with one channel. None: the source has no such channel."""
 
     target: Tensor
     render: Tensor | None = None
@@ -39,8 +39,8 @@ class Clip:
     sdmap: Tensor | None = None
 
 
-def draw_pair_clip(sequences: Sequence[PairSequence], size: ClipSize, seed: int, index: int) -> Clip:
-    """Draw a clip from pairs: a sequence, a start, a crop, and whether it is mirrored left to right."""
+def draw_pair_clip(sequences: Sequence[PairSequence], size: CropSize, seed: int, index: int) -> Clip:
+    """Sample a clip from pairs: random sequence, start, crop and horizontal flip."""
     rng = stream("training", seed, "clips.pairs", index)
     clip = sequences[int(rng.integers(len(sequences)))].clip
     start, rows, columns = _window(rng, clip.rgb_gt.shape, size)
@@ -53,8 +53,8 @@ def draw_pair_clip(sequences: Sequence[PairSequence], size: ClipSize, seed: int,
     return Clip(tensor(cut.rgb_gt), tensor(cut.rgb_input), (tensor(cut.opacity[..., None]) + 1) / 2, tensor(cut.sdmap))
 
 
-def draw_video_clip(videos: Sequence[U8], size: ClipSize, seed: int, index: int) -> Clip:
-    """Draw a clip from videos ``(T, H, W, 3)``; played forwards or backwards, mirrored or not."""
+def draw_video_clip(videos: Sequence[U8], size: CropSize, seed: int, index: int) -> Clip:
+    """Sample a clip from videos ``(T, H, W, 3)``: random start, crop, time reversal and horizontal flip."""
     rng = stream("training", seed, "clips.videos", index)
     lengths = np.array([len(v) for v in videos], dtype=np.float64)
     video = videos[int(rng.choice(len(videos), p=lengths / lengths.sum()))]
@@ -64,7 +64,7 @@ def draw_video_clip(videos: Sequence[U8], size: ClipSize, seed: int, index: int)
 
 
 def read_video(path: Path, width: int, height: int, first: float = 0.0, last: float = 1.0) -> U8:
-    """Read a video's frames from share ``first`` to share ``last`` of its length, scaled to cover ``width x height`` and cut in the middle.
+    """Read a video's frames from share ``first`` to share ``last`` of its length, scaled to cover ``width x height`` and centre-cropped.
 
     Raises:
         InputError: Not a readable video, or no frame in that share.
@@ -82,12 +82,12 @@ def read_video(path: Path, width: int, height: int, first: float = 0.0, last: fl
 
 
 def to_tensor(frames: U8, flip: bool = False) -> Tensor:
-    """Map ``(T, H, W, C)`` uint8 to ``(C, T, H, W)`` float32 in [-1, 1], mirrored left to right if asked."""
-    array = np.array(frames[:, :, ::-1] if flip else frames)  # a copy: memory maps may not be written to
+    """Map ``(T, H, W, C)`` uint8 to ``(C, T, H, W)`` float32 in [-1, 1], flipped horizontally if asked."""
+    array = np.array(frames[:, :, ::-1] if flip else frames)  # a copy, since memory maps are read-only
     return torch.from_numpy(array).permute(3, 0, 1, 2).float() / 127.5 - 1
 
 
-def _window(rng: np.random.Generator, shape: tuple[int, ...], size: ClipSize) -> tuple[int, slice, slice]:
+def _window(rng: np.random.Generator, shape: tuple[int, ...], size: CropSize) -> tuple[int, slice, slice]:
     free = [shape[0] - size.frames, shape[1] - size.height, shape[2] - size.width]
     if min(free) < 0:
         raise InputError(DOING, f"frames {list(shape[:3])}", f"no room for {size}", "make larger sequences, or draw smaller clips")

@@ -1,8 +1,8 @@
-"""Adapt the decoder to the generator that feeds it.
+"""Fine-tune the decoder on the latents of its generator.
 
-The autoencoder learned to decode latents of clean frames. A generator's latents err in ways of their own: a small transformer's from token
-to token, which shows as a grid. The decoder sees the render beside them, so it can learn which of the two to believe. It is trained on the
-generator's own rollouts, with encoder and generator frozen, on the error of pictures and a perceptual distance.
+The autoencoder was trained on latents of clean frames. A generator's latents have their own errors: a small transformer's differ from token
+to token, which is visible as a grid. The decoder is conditioned on the render, so it can learn which input to trust. It is trained on the
+generator's own rollouts, with encoder and generator frozen, with a pixel loss and a perceptual distance.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from alpasim_plugin.nets.dit import CosmosCausalDiT
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
-from alpasim_plugin.training.perceptual_term import Distance, frames_of
+from alpasim_plugin.training.perceptual_term import Distance, flatten_frames
 from alpasim_plugin.training.shared_rollout import roll_out
 from alpasim_plugin.training.trainer import Loss
-from alpasim_plugin.training.vae import picture_error
+from alpasim_plugin.training.vae import reconstruction_loss
 
 
 @dataclass(frozen=True)
-class PainterRecipe:
-    """What a batch holds and what counts.
+class DecoderRecipe:
+    """Batch and loss weights.
 
     Args:
         clips: Clips of a batch, whole in time.
         rows, columns: Crop in latents of 8 pixels.
-        edge_weight: See `vae.picture_error`.
+        edge_weight: See `vae.reconstruction_loss`.
         perceptual_weight: Of the perceptual distance of one latent's frames.
-        seed: Of draws.
+        seed: Of sampling.
     """
 
     clips: int = 2
@@ -52,13 +52,13 @@ class PainterRecipe:
 
 
 class Rollouts:
-    """A generator's own predictions over training clips, made once and kept as float16: FOLDER/DIGEST/INDEX.npy.
+    """A generator's rollouts over training clips, computed once and cached as float16: FOLDER/DIGEST/INDEX.npy.
 
     Args:
         clips: Training clips.
         net: Frozen generator.
         block_latents, window, use_map: As at deployment.
-        folder: Keeps them; what is there already is read.
+        folder: Cache of the rollouts.
         report: Called with the number of clips done and in all.
     """
 
@@ -104,7 +104,7 @@ class Rollouts:
 
 
 @dataclass(frozen=True)
-class PainterBatch:
+class DecoderBatch:
     """Latents ``(B, C, N, h, w)``, the render, its opacity and the clean frames ``(B, c, 1 + 4 (N - 1), 8h, 8w)``, and a position."""
 
     z: Tensor
@@ -114,20 +114,20 @@ class PainterBatch:
     w: int
 
 
-class PainterTask:
-    """Batches and loss of the decoder, for `Trainer`; sets what of the autoencoder is trained.
+class DecoderTask:
+    """Batches and loss of the decoder, for `Trainer`; freezes the rest of the autoencoder.
 
     Args:
         vae: Its decoder is trained.
-        rollouts: What it decodes.
-        recipe: What a batch holds.
+        rollouts: Its input latents.
+        recipe: Batch and loss weights.
         distance: Frozen perceptual distance, with its name; None for none.
 
     Raises:
         InputError: A crop larger than the clips.
     """
 
-    def __init__(self, vae: TinyVAE, rollouts: Rollouts, recipe: PainterRecipe, distance: tuple[str, Distance] | None = None) -> None:
+    def __init__(self, vae: TinyVAE, rollouts: Rollouts, recipe: DecoderRecipe, distance: tuple[str, Distance] | None = None) -> None:
         size = tuple(rollouts[0][1].shape[2:])
         if recipe.rows > size[0] or recipe.columns > size[1]:
             found = f"a crop of {recipe.rows} x {recipe.columns} latents from {size[0]} x {size[1]}"
@@ -145,21 +145,21 @@ class PainterTask:
             "distance": self.distance[0] if self.distance else "none",
         }  # fmt: skip
 
-    def batch(self, index: int) -> PainterBatch:
-        """Make batch ``index``: a function of the index and the recipe's seed alone."""
+    def batch(self, index: int) -> DecoderBatch:
+        """Make batch ``index``: a function of the index and the recipe's seed only."""
         r = self.recipe
-        rng = stream("training", r.seed, "painter.clips", index)
+        rng = stream("training", r.seed, "painter.clips", index)  # a fixed stream name: it determines the draws
         drawn = [self._crop(rng) for _ in range(r.clips)]
         z, render, opacity, clean = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-        return PainterBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
+        return DecoderBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
 
-    def loss(self, batch: PainterBatch, index: int) -> Loss:
+    def loss(self, batch: DecoderBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         made = self.vae.decode(batch.z, render=batch.render, opacity=batch.opacity, clamp=False)
-        parts = {"picture": picture_error(made, batch.clean, self.recipe.edge_weight)}
+        parts = {"image": reconstruction_loss(made, batch.clean, self.recipe.edge_weight)}
         if self.distance is not None and self.recipe.perceptual_weight:
             frames = slice(max(1 + GROUP * (batch.w - 1), 0), 1 + GROUP * batch.w)
-            distance = self.distance[1](frames_of(made[:, :, frames]), frames_of(batch.clean[:, :, frames])).mean()
+            distance = self.distance[1](flatten_frames(made[:, :, frames]), flatten_frames(batch.clean[:, :, frames])).mean()
             parts["perceptual"] = self.recipe.perceptual_weight * distance
         numbers = {name: float(value.detach()) for name, value in parts.items()}
         decoded, render, clean = (x.detach().clamp(-1, 1).cpu().numpy() for x in (made, batch.render, batch.clean))

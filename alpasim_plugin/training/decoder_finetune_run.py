@@ -1,4 +1,4 @@
-"""Adapt the decoder of a trained bundle to its generator, in one folder: bundle in, bundle out."""
+"""Fine-tune the decoder of a trained bundle on its generator, in one run folder: bundle in, bundle out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
 from alpasim_plugin.nets.headers import read_metadata
-from alpasim_plugin.training.decoder_finetune import PainterRecipe, PainterTask, Rollouts
+from alpasim_plugin.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.model_card import ModelCard, curves
@@ -25,15 +25,15 @@ from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
-DOING = "adapting a decoder"
+DOING = "fine-tuning a decoder"
 
 
-def train_painter(
+def finetune_decoder(
     bundle: Path,
     data: Path,
     out: Path,
     form: ClipForm,
-    recipe: PainterRecipe,
+    recipe: DecoderRecipe,
     schedule: Schedule,
     distance: tuple[str, Distance] | None = None,
     prepared: Callable[[str, int, int], None] | None = None,
@@ -42,17 +42,17 @@ def train_painter(
     """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors and its card.
 
     Args:
-        bundle: A trained fixer whose decoder is the autoencoder's own and sees the render.
+        bundle: A trained fixer whose decoder belongs to its autoencoder and is conditioned on the render.
         data: Folder of pairs; its ``train`` split is used.
-        out: Folder of the run; latents and rollouts of the clips are kept beside it.
+        out: Folder of the run; latents and rollouts of the clips are cached in its parent folder.
         form, recipe, schedule: Clips, batches, optimisation.
         distance: Name and function of the perceptual term.
-        prepared: Called with what is being made (latents, rollouts), how many are done and in all.
-        report: Called after every update with its number and the log's numbers.
+        prepared: Called with the current item (latents, rollouts), the number done and the total.
+        report: Called after every update with its number and the logged values.
 
     Raises:
-        InputError: Not such a bundle, no data, or a crop that does not fit.
-        InfrastructureError: A loss that is not finite.
+        InputError: Another kind of bundle, no data, or a crop larger than the clips.
+        InfrastructureError: The loss is not finite.
     """
     settings = bundle_settings(bundle)
     tensors = load_weights(bundle, dtype=torch.float32)
@@ -65,7 +65,7 @@ def train_painter(
 
     clips = LatentClips(PairDataset(data, "train").sequences, vae, form, out.parent / "latents", tell("latents"))
     rollouts = Rollouts(clips, net, settings.block_latents, settings.window, settings.uses_map, out.parent / "rollouts", tell("rollouts"))
-    task = PainterTask(vae, rollouts, recipe, distance)
+    task = DecoderTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
     trainer.run(report)
@@ -78,7 +78,7 @@ def train_painter(
     save_bundle(path, made, settings, trained=True, note=note)
     rows, hours = curves(out / LOG_FILE)
     about = {"pairs": "rendered scenes, split train", "clips": len(clips), "form": asdict(form)}
-    training = {"what": "decoder alone, on the generator's rollouts", "schedule": asdict(schedule), **facts}
+    training = {"what": "decoder only, on the generator's rollouts", "schedule": asdict(schedule), **facts}
     ModelCard(f"OneFixer weights: {note}", about, training, rows, hours).write(path)
     return path
 
@@ -87,7 +87,7 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
     """Return the settings that a bundle was trained for.
 
     Raises:
-        InputError: Not a bundle whose generator rolls out and whose decoder can be adapted.
+        InputError: A bundle without a generator with history, or without a decoder that is conditioned on the render.
     """
     name, overrides = bundle_fixer(bundle)
     settings = fixer_settings(name, overrides)
@@ -99,7 +99,7 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
             ("its generator has no history", settings.history == "none"),
             ("its decoder does not see the render", settings.decoder.kind != "render"),
             (f"its autoencoder is {settings.vae.kind}", settings.vae.kind != "tiny"),
-            # The rollouts are made in one step on a finalised history from Eq. 1's source.
+            # Rollouts take one step from the source of Eq. 1, with a finalised history.
             (f"its history is {settings.history}", settings.history == "last-forward"),
             (f"it takes {len(settings.steps)} steps", len(settings.steps) != 1),
             (f"it keeps a sink of {settings.sink}", settings.sink != 0),

@@ -1,7 +1,7 @@
-"""Synthetic damage to pictures, by kind and strength, with everything random drawn before the strength is chosen.
+"""Synthetic image distortions, by kind and strength; all random numbers are drawn before the strength is chosen.
 
-A `Distortion` applied at two strengths to one picture is the same damage, twice as bad: what a perceptual distance must be monotone in.
-Strength 0 changes nothing; 1 is ruin.
+A `Distortion` at two strengths is the same distortion at two severities, in which a perceptual distance must be monotone. Strength 0 is the
+identity; 1 is the strongest.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ SHIFT_PX, WARP_PX = 4.0, 4.0  # displacement at strength 1
 
 @dataclass(frozen=True)
 class Distortion:
-    """One piece of damage: its kind, and what was drawn for it."""
+    """A distortion: its kind and its random parameters."""
 
     kind: str
     drawn: Mapping[str, Any]
 
     def __call__(self, image: F32, strength: float) -> F32:
-        """Damage a picture ``(H, W, 3)`` float32 in 0 to 1; strength 0 to 1."""
+        """Distort an image ``(H, W, 3)`` float32 in 0 to 1; strength 0 to 1."""
         out = KINDS[self.kind][1](image, strength, self.drawn) if strength > 0 else image
         return np.ascontiguousarray(np.clip(out, 0, 1), dtype=np.float32)
 
     def displacement_px(self, strength: float) -> float:
-        """Return how far pixels move, for kinds that only move them; else 0."""
+        """Return the displacement of pixels for geometric kinds; else 0."""
         return strength * {"shift": SHIFT_PX, "warp": WARP_PX}.get(self.kind, 0.0)
 
 
 def draw_distortion(rng: Draw, shape: tuple[int, ...], kind: str | None = None) -> Distortion:
-    """Draw damage for pictures of shape ``(H, W, 3)``, of a given kind or of any."""
+    """Draw a distortion for images of shape ``(H, W, 3)``, of a given kind or a random one."""
     chosen = kind if kind is not None else tuple(KINDS)[int(rng.integers(len(KINDS)))]
     return Distortion(chosen, KINDS[chosen][0](rng, shape))
 
@@ -122,7 +122,7 @@ def _draw_erase(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
 
 
 def _draw_splat(rng: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Ellipses with soft rims in colours found elsewhere in the picture: floaters and badly fitted Gaussians."""
+    """Soft ellipses in colours from elsewhere in the image: floaters and badly fitted Gaussians."""
     h, w = shape[:2]
     count = int(rng.integers(1, max(2, h * w // 120)))
     mask = np.zeros((h, w), dtype=np.float32)
@@ -163,7 +163,7 @@ def _jpeg(image: F32, s: float, drawn: Mapping[str, Any]) -> F32:
     quality = round(70 * (1 - s) ** 1.5) + 2
     done, data = cv2.imencode(".jpg", np.rint(image * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
-    share = np.float32(min(1.0, 8 * s))  # the mildest settings fade in, so that strength 0 changes nothing
+    share = np.float32(min(1.0, 8 * s))  # blended at low strengths, so that strength 0 is the identity
     return image * (1 - share) + share * (_f32(cv2.imdecode(data, cv2.IMREAD_COLOR)) / np.float32(255))
 
 
@@ -188,7 +188,7 @@ KINDS: Mapping[str, tuple[Callable[[Draw, tuple[int, ...]], Mapping[str, Any]], 
 
 
 def smooth_field(rng: Draw, shape: tuple[int, ...], channels: int, scale_px: float) -> F32:
-    """Draw ``(H, W, channels)`` that varies over about ``scale_px`` pixels, with unit root mean square."""
+    """Draw a smooth random field ``(H, W, channels)`` with a scale of ``scale_px`` pixels and unit root mean square."""
     h, w = shape[:2]
     knots = rng.standard_normal((max(2, round(h / scale_px) + 1), max(2, round(w / scale_px) + 1), channels), dtype=np.float32)
     field = cv2.resize(knots, (w, h), interpolation=cv2.INTER_CUBIC).reshape(h, w, channels)

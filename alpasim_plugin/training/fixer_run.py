@@ -1,4 +1,4 @@
-"""Train a variant of the fixer in one folder, from pairs and a trained autoencoder to a bundle with its card."""
+"""Train a variant of the fixer in one run folder: pairs and a trained autoencoder in, bundle and model card out."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ BUNDLE_FILE = "fixer.safetensors"
 
 @dataclass(frozen=True)
 class FixerRun:
-    """All that a training run is; equal runs give equal weights.
+    """Definition of a training run; equal runs give equal weights.
 
     Args:
-        settings: The fixer that is trained: sizes, block, window.
+        settings: Fixer to train: sizes, block, window.
         variant: Objectives.
         data: Folder of pairs; its ``train`` split is used.
         vae: Trained autoencoder's weights, or a bundle that holds them.
-        init: Weights of a transformer or bundle to start from; None starts from a network that changes nothing.
+        init: Weights of a transformer or bundle to start from; None initialises a network that returns its source unchanged.
         form: Clips.
         recipe: Batches.
         schedule: Optimisation.
@@ -63,19 +63,19 @@ def train_fixer(
     report: Callable[[int, Mapping[str, float]], None] | None = None,
     stop_at: int | None = None,
 ) -> Path:
-    """Train to the schedule's end or to ``stop_at``, from the last checkpoint if there is one; write OUT/fixer.safetensors and its card.
+    """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write OUT/fixer.safetensors and its card.
 
     Args:
-        run: What is trained.
-        out: Folder of the run; the latents of the clips are kept beside it, in ``latents``.
+        run: Definition of the run.
+        out: Folder of the run; the latents of the clips are cached in its parent folder, in ``latents``.
         distance: Name and function of the perceptual term.
-        encoded: Called with sequences encoded and in all.
-        report: Called after every update with its number and the log's numbers.
-        stop_at: Update after which to write what there is; a later call goes on from there.
+        encoded: Called with the number of encoded sequences and the total.
+        report: Called after every update with its number and the logged values.
+        stop_at: Update after which to stop and write the weights; a later call continues.
 
     Raises:
-        InputError: Data, weights or recipe that do not fit.
-        InfrastructureError: A loss that is not finite.
+        InputError: Invalid data, weights or recipe.
+        InfrastructureError: The loss is not finite.
     """
     if run.recipe.steps != run.schedule.steps or run.recipe.accumulate != run.schedule.accumulate:
         found = f"recipe {run.recipe.steps} x {run.recipe.accumulate}, schedule {run.schedule.steps} x {run.schedule.accumulate}"
@@ -92,7 +92,7 @@ def train_fixer(
 
 
 def start_weights(run: FixerRun) -> dict[str, Tensor]:
-    """Return the transformer's first weights; a variant that is also conditioned on the render gets zero weights for it."""
+    """Return the transformer's initial weights; a variant conditioned on the render gets zero weights for that input."""
     settings = run.settings
     if run.init is None:
         sizes = DiTSizes(**settings.dit.model_dump())
@@ -104,7 +104,7 @@ def start_weights(run: FixerRun) -> dict[str, Tensor]:
 
 
 def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyVAE, facts: Mapping[str, Any], updates: int) -> Path:
-    """Write what was trained in so many updates as one float16 file, with its card."""
+    """Write the weights after ``updates`` updates as one float16 bundle, with its card."""
     path = out / BUNDLE_FILE
     parts = {"dit": {k: half(v) for k, v in dit.items()}, "vae": {k: half(v) for k, v in vae.state_dict().items()}}
     history = run.settings.history if run.variant.history else "none"
@@ -123,10 +123,10 @@ def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyV
 
 
 def half(tensor: Tensor) -> Tensor:
-    """Round a floating tensor to float16, for shipping.
+    """Convert a floating tensor to float16.
 
     Raises:
-        InputError: A value that float16 cannot hold.
+        InputError: A value overflows float16.
     """
     if not tensor.is_floating_point():
         return tensor

@@ -1,4 +1,4 @@
-"""Batches and loss of the generator, for `Trainer`: the shared rollout on latents of clips, any variant, any autoencoder that is frozen."""
+"""Batches and loss of the generator, for `Trainer`: the shared rollout on latents of clips, for every variant."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
 from alpasim_plugin.training.perceptual_term import DecodedDistance, Distance
-from alpasim_plugin.training.shared_rollout import T_SOURCE, Objectives, Perceptual, Sample, losses, weighed
+from alpasim_plugin.training.shared_rollout import T_SOURCE, Objectives, Perceptual, Sample, channel_weighted, losses
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.training.vae import channel_amplitudes
 from alpasim_plugin.training.variants import BASE, Variant
 
 MAP_KEY = "additional_patch_embedding.proj.1.weight"
-PATCH = 2  # latents along a side of a token: crops are whole tokens
+PATCH = 2  # latents along a side of a token; crops consist of whole tokens
 AREA = PATCH * PATCH
 
 
 @dataclass(frozen=True)
 class GeneratorRecipe:
-    """What a batch holds.
+    """Batch and sampling of noise levels.
 
     Args:
         clips: Clips of a batch.
-        latents: Latents from a clip's start; None takes the whole clip.
-        columns: Width of the crop in latents, even; None takes the whole picture.
+        latents: Latents from a clip's start; None for the whole clip.
+        columns: Width of the crop in latents, even; None for the whole image.
         block_latents, window: As at deployment.
-        steps: Updates in all: a variant of several stages divides them.
+        steps: Total updates, which a variant of several stages divides.
         accumulate: Batches an update.
-        seed: Of draws and noise.
-        source_share: ``base`` only: share of positions that are trained at t = 1, where the deployed generator starts.
-        context_share: ``base`` only: share of positions that are trained at the level of a history.
-        channels: How channels weigh in flow matching: ``amplitude`` as `vae.channel_amplitudes` says, ``equal`` all alike, as in the paper.
+        seed: Of sampling and noise.
+        source_share: ``base`` only: share of positions at t = 1, where the deployed generator starts.
+        context_share: ``base`` only: share of positions at the noise level of the history.
+        channels: Channel weights of the flow-matching loss: ``amplitude`` (`vae.channel_amplitudes`), or ``equal`` as in the paper.
     """
 
     clips: int = 4
@@ -61,7 +61,7 @@ class GeneratorRecipe:
 
 @dataclass(frozen=True)
 class GeneratorBatch:
-    """Latents and noise of a batch, and the frames that the perceptual term's decoder sees (None: not needed)."""
+    """Latents and noise of a batch, and the render for the perceptual term's decoder (None: not needed)."""
 
     sample: Sample
     render: Tensor | None
@@ -69,18 +69,18 @@ class GeneratorBatch:
 
 
 class GeneratorTask:
-    """Make the batches of a variant and their loss.
+    """Batches and loss of a variant.
 
     Args:
-        net: The generator, trained.
-        vae: Frozen autoencoder whose decoder sees the render.
-        clips: Latents to draw from.
-        variant: What is trained.
-        recipe: What a batch holds.
-        distance: Frozen perceptual distance, with its name; needed where the variant has a perceptual term.
+        net: The generator to train.
+        vae: Frozen autoencoder whose decoder is conditioned on the render.
+        clips: Training latents.
+        variant: Variant to train.
+        recipe: Batch and noise levels.
+        distance: Frozen perceptual distance with its name; required by variants with a perceptual term.
 
     Raises:
-        InputError: A variant with a perceptual term and no distance, or a crop that does not fit.
+        InputError: A variant with a perceptual term and no distance, or a crop of half tokens.
     """
 
     def __init__(
@@ -113,17 +113,17 @@ class GeneratorTask:
         }  # fmt: skip
 
     def objectives(self, index: int) -> Objectives:
-        """Return what batch ``index`` is trained for."""
+        """Return the objectives of batch ``index``."""
         return self.variant.objectives(index // self.recipe.accumulate, self.recipe.steps)
 
     def batch(self, index: int) -> GeneratorBatch:
-        """Make batch ``index``: a function of the index and the recipe's seed alone."""
+        """Make batch ``index``: a function of the index and the recipe's seed only."""
         r = self.recipe
         rng = stream("training", r.seed, "generator.clips", index)
         drawn = [self.clips[int(i)] for i in rng.integers(len(self.clips), size=r.clips)]
         z_r, z_0, z_map, m = (torch.stack(z) for z in zip(*(clip.latents for clip in drawn), strict=True))
         columns = self._columns(rng, z_0.shape[-1])
-        latents = slice(0, r.latents if self.variant.history else 1)  # without a past, every clip is one frame
+        latents = slice(0, r.latents if self.variant.history else 1)  # without history, every clip is one frame
         w = int(rng.integers(len(range(z_0.shape[2])[latents])))
         z_r, z_0, z_map, m = (z[:, :, latents, :, columns] for z in (z_r, z_0, z_map, m))
         b, n = z_0.shape[0], z_0.shape[2]
@@ -177,10 +177,10 @@ class GeneratorTask:
 def diffusion_forcing(
     net: CosmosCausalDiT, s: Sample, text: Tensor, recipe: GeneratorRecipe, index: int, channel_weights: Tensor | None = None
 ) -> Tensor:
-    """Return the error of the velocity where every position has a noise level of its own and is history to those after it.
+    """Return the diffusion-forcing loss: every position has its own noise level and is history of later positions.
 
-    The levels are those that a deployed generator meets: the source (t = 1), the level of the cache write, and anything between. In three
-    of four clips the source is the mixed one (Eq. 1), in the fourth it is noise.
+    Levels are those of a deployed generator: the source (t = 1), the level of the cache write, and uniform between. In three of four clips
+    the source is mixed (Eq. 1), in the fourth it is noise.
     """
     rng = stream("training", recipe.seed, "generator.levels", index)
     kind = torch.from_numpy(rng.random(tuple(s.t.shape)))
@@ -191,14 +191,14 @@ def diffusion_forcing(
     z_t = interpolant(s.z_0, z_1, t[:, None, :, None, None])
     v = net(z_t, T_SOURCE * t, text, s.z_map, block_latents=recipe.block_latents, window=recipe.window)
     error: Tensor = v - (z_1 - s.z_0)
-    return weighed(error.square(), channel_weights).mean()
+    return channel_weighted(error.square(), channel_weights).mean()
 
 
 def widen_map(weights: Mapping[str, Tensor], channels: int, latent_channels: int = 16) -> dict[str, Tensor]:
-    """Return weights whose map input takes ``channels`` latents' channels; what is new starts at zero, so nothing changes at first.
+    """Return weights whose map input has ``channels`` channels; new columns are zero, so outputs do not change.
 
     Raises:
-        InputError: The weights already take more.
+        InputError: The weights have more channels already.
     """
     old = weights[MAP_KEY]
     width, have = old.shape[0], old.shape[1] // AREA
@@ -206,6 +206,6 @@ def widen_map(weights: Mapping[str, Tensor], channels: int, latent_channels: int
         found = f"they take {have} channels"
         raise InputError("widening a map input", f"to {channels} channels", found, "start from weights that take no more")
     new = torch.zeros(width, channels * AREA)
-    # A token's inputs are channel by channel, each with its patch (`embeddings.PatchEmbed`): old channels stay in front.
+    # Inputs of a token are channel-major (`embeddings.PatchEmbed`): existing channels come first.
     new[:, : have * AREA] = old
     return {**weights, MAP_KEY: new}

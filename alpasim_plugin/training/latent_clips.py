@@ -1,11 +1,10 @@
-"""Training clips as latents, encoded once and kept on disk: the autoencoder is frozen.
+"""Training clips as latents of a frozen autoencoder, encoded once and cached on disk.
 
     FOLDER/DIGEST/SEQUENCE-CONTENT.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
 
-Clips of a sequence start ``stride`` frames apart, once as they are and once mirrored, with another class's colours on the map's cars (see
-`map_colours`). Each is encoded from its own first frame on, as a
-rollout that starts there would be. DIGEST covers the autoencoder's weights and the form of the clips, CONTENT the
-sequence's arrays.
+Clips of a sequence start ``stride`` frames apart. Each is used as it is and mirrored; mirrored clips have class-colour augmentation (see
+`class_colours`). Each clip is encoded as a stream that starts at its first frame. DIGEST covers the autoencoder's weights and the form of
+the clips, CONTENT the sequence's arrays.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.sampling import opacity_mask
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.class_colours import OTHERS, recolour_boxes
+from alpasim_plugin.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.training.clips import to_tensor
 from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 
@@ -39,17 +38,17 @@ CHANNELS = 16
 
 @dataclass(frozen=True)
 class ClipForm:
-    """How sequences are cut into clips.
+    """Division of sequences into clips.
 
     Args:
         latents: N, latents of a clip: ``1 + 4 (N - 1)`` frames.
         stride: Frames between starts.
-        recolour: Whether the mirrored clips show the map's cars in another class's colours.
+        class_colour_augmentation: Whether mirrored clips show the map's cars in the colours of another class.
     """
 
     latents: int = 12
     stride: int = 24
-    recolour: bool = True
+    class_colour_augmentation: bool = True
 
     @property
     def frames(self) -> int:
@@ -58,7 +57,7 @@ class ClipForm:
 
 
 class LatentClip(NamedTuple):
-    """A clip's latents ``(C, N, H/8, W/8)`` float32, and where its frames are."""
+    """A clip's latents ``(C, N, H/8, W/8)`` float32, and the position of its frames."""
 
     z_r: Tensor
     z_0: Tensor
@@ -89,9 +88,9 @@ class LatentClips:
     Args:
         sequences: Pairs on disk.
         vae: Frozen autoencoder.
-        form: How they are cut.
-        folder: Keeps the latents; what is there already is read.
-        report: Called with the number of sequences done and in all.
+        form: Division into clips.
+        folder: Cache of the latents.
+        report: Called with the number of sequences done and the total.
 
     Attributes:
         digest: Of everything the latents depend on: autoencoder, form, and the sequences in their order.
@@ -138,7 +137,7 @@ class LatentClips:
 
 
 def encode_sequence(sequence: PairSequence, vae: TinyVAE, form: ClipForm) -> F16:
-    """Encode all clips of a sequence ``(clips, 49, N, H/8, W/8)``: every start, first as it is, then mirrored."""
+    """Encode all clips of a sequence ``(clips, 49, N, H/8, W/8)``: every start, unmirrored, then mirrored."""
     starts = range(0, len(sequence.clip) - form.frames + 1, form.stride)
     if not starts:
         found = f"{len(sequence.clip)} frames, a clip has {form.frames}"
@@ -150,9 +149,9 @@ def encode_sequence(sequence: PairSequence, vae: TinyVAE, form: ClipForm) -> F16
 def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mirrored: bool) -> F16:
     cut = sequence.clip.cut(start, form.frames)
     sdmap = cut.sdmap
-    if mirrored and form.recolour:
+    if mirrored and form.class_colour_augmentation:
         rng = stream(sequence.name, 0, "training.map_colours", start)
-        sdmap = recolour_boxes(sdmap, OTHERS[int(rng.integers(len(OTHERS)))])
+        sdmap = swap_class_colours(sdmap, OTHERS[int(rng.integers(len(OTHERS)))])
     videos = torch.stack([to_tensor(x, mirrored) for x in (cut.rgb_input, cut.rgb_gt, sdmap)])
     mask = opacity_mask((to_tensor(cut.opacity[..., None], mirrored)[None] + 1) / 2)
     z = vae.encode(videos)
@@ -160,7 +159,7 @@ def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mi
 
 
 def digest(vae: TinyVAE, form: ClipForm) -> str:
-    """Return what the latents depend on, besides the pairs, as a short digest."""
+    """Return a digest of the autoencoder and the form of the clips."""
     out = hashlib.blake2b(json.dumps(asdict(form)).encode(), digest_size=8)
     for key, value in sorted(vae.state_dict().items()):
         out.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())

@@ -1,4 +1,4 @@
-"""A model card: what a file of weights is, what it learned from, and the command and machine that made it."""
+"""Model cards: training data, schedule, command and machine of a file of weights."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from alpasim_plugin.atomic import write_json
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What ``NAME.card.json`` beside ``NAME.safetensors`` says.
+    """Model card of ``NAME.safetensors``, written as ``NAME.card.json``.
 
     Args:
         what: One sentence.
-        data: What it learned from.
+        data: Training data.
         training: Steps, batch, schedule, seed, starting point.
-        curves: Numbers of the log at some updates, first and last included.
+        curves: Logged values at some updates, first and last included.
         hours: Wall-clock time of the training.
     """
 
@@ -37,7 +37,7 @@ class ModelCard:
     hours: float
 
     def write(self, weights: Path) -> Path:
-        """Write the card of a file of weights beside it, with the file's digest, this machine and the command that runs."""
+        """Write the card next to the weights, with their digest, the machine and the command line."""
         path = weights.with_suffix(".card.json")
         card = {
             **asdict(self), "weights": weights.name, "sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
@@ -48,12 +48,12 @@ class ModelCard:
 
 
 def command() -> str:
-    """Return the command line of this process, as one would type it."""
+    """Return the command line of this process."""
     return shlex.join(["simrun", *sys.argv[1:]])
 
 
 def machine() -> dict[str, Any]:
-    """Return what the machine is, for judging times."""
+    """Return processor, GPU and torch version."""
     flags = torch.backends.cpu.get_cpu_capability()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {"cpu": platform.processor() or platform.machine(), "cores": os.cpu_count(), "vectors": flags, "gpu": gpu,
@@ -61,10 +61,10 @@ def machine() -> dict[str, Any]:
 
 
 def curves(log: Path, points: int = 25) -> tuple[list[Mapping[str, float]], float]:
-    """Return the averages of a `Trainer` log over ``points`` equal parts, and the hours its updates took.
+    """Return means of a `Trainer` log over ``points`` equal intervals, and the total hours of its updates.
 
     Returns:
-        Rows with ``step`` (the last of its part) and the means of all numbers; hours.
+        Rows with ``step`` (the last of the interval) and the means of all values; hours.
     """
     rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     size = max(len(rows) // points, 1)

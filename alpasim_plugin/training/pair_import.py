@@ -1,4 +1,4 @@
-"""Turn anyone's own renders into pairs: videos, folders of images or arrays of each channel, and the camera's poses."""
+"""Import training pairs from videos, image folders or arrays of each channel, and camera poses."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from alpasim_plugin.training.pair_store import Pair, write_sequence
 from alpasim_plugin.types import F64, U8
 
 DOING = "importing training pairs"
-PICTURES = (".png", ".jpg", ".jpeg")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 CHANNELS = ("rgb_input", "rgb_gt", "opacity", "sdmap")
-ORTHONORMAL = 1e-3  # how far from a rotation a pose may be, as files of few digits are
+ORTHONORMAL = 1e-3  # tolerance of rotation matrices, for files with few digits
 
 
 @dataclass(frozen=True)
 class PairSources:
-    """Where the channels of one sequence lie.
+    """Paths of the channels of one sequence.
 
     Args:
-        rgb_input: What the damaged reconstruction shows: an mp4 file, a folder of .png or .jpg (in order of name), or a .npy array.
-        rgb_gt: What there is to see, likewise.
+        rgb_input: Degraded renders: an mp4 file, a folder of .png or .jpg (in order of name), or a .npy array.
+        rgb_gt: Clean frames, likewise.
         opacity: Accumulated opacity with the sky filled (OneFixer, App. A), white is opaque, likewise.
         sdmap: Semantic map, likewise.
         poses: Camera poses in the world, OpenCV axes: a .npy array ``(T, 4, 4)``, or JSON: a list of 4 x 4 matrices, or of
@@ -51,20 +51,19 @@ def import_sequence(
     Args:
         sources: The files; frame i of each belongs to pose i.
         folder: ROOT/SPLIT/SEQUENCE; replaced if it exists.
-        fps: Frames per second, where the poses carry no times.
-        size: (width, height) to which every picture is scaled; None wants all channels of one size.
-        facts: Goes to sequence.json.
+        fps: Frames per second, for poses without times.
+        size: (width, height) to which every image is scaled; None requires channels of one size.
+        facts: Further entries of sequence.json.
 
     Returns:
         Frames written.
 
     Raises:
-        InputError: A file that cannot be read, poses that are none, a channel without frames, or channels of different size without
-            ``size``.
+        InputError: An unreadable file, invalid poses, a channel without frames, or channels of different size without ``size``.
     """
     T, t_us = read_poses(sources.poses, fps)
     named = {name: getattr(sources, name) for name in CHANNELS}
-    found = {name: (first, length) for name, path in named.items() for first, length in [_look(path)]}
+    found = {name: (first, length) for name, path in named.items() for first, length in [_first_and_count(path)]}
     if size is None:
         shapes = {name: first.shape[1::-1] for name, (first, _) in found.items()}
         if len(set(shapes.values())) > 1:
@@ -83,7 +82,7 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
     """Return camera poses ``(T, 4, 4)`` in the world and their times, microseconds.
 
     Raises:
-        InputError: Not a readable file of poses, or a matrix that is not rigid.
+        InputError: Not a readable file of poses, or a matrix that is not a rigid transform.
     """
     if fps <= 0:
         raise InputError(DOING, "--fps", f"{fps}", "give a positive rate")
@@ -103,31 +102,31 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
     off = np.abs(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     bad = ~np.isfinite(T).all(axis=(1, 2)) | ~(off < ORTHONORMAL) | (np.linalg.det(np.nan_to_num(T[:, :3, :3])) < 0)
     with np.errstate(invalid="ignore"):
-        bad |= ~(np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ORTHONORMAL)  # a transposed pose has its translation there
+        bad |= ~(np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ORTHONORMAL)  # a transposed pose has its translation in this row
     if bad.any():
-        found = f"pose {int(np.argmax(bad))} is no rotation and translation"
-        raise InputError(DOING, str(path), found, "give T_world_camera (columns are axes, the last one the place), metres, OpenCV axes")
+        found = f"pose {int(np.argmax(bad))} is not a rigid transform"
+        raise InputError(DOING, str(path), found, "give T_world_camera (columns: axes, then position), metres, OpenCV axes")
     if times is None:
         times = [round(i / fps * 1e6) for i in range(len(T))]
     if any(b <= a for a, b in pairwise(times)):
-        raise InputError(DOING, str(path), "times that do not increase", "sort the poses by time, or leave the times out")
+        raise InputError(DOING, str(path), "times that do not increase", "sort the poses by time, or remove the times")
     return T, times
 
 
-def frames_of(path: Path) -> Iterator[U8]:
-    """Yield a channel's pictures ``(H, W, 3)`` one at a time.
+def read_frames(path: Path) -> Iterator[U8]:
+    """Yield the images ``(H, W, 3)`` of a channel one at a time.
 
     Raises:
-        InputError: Nothing there, or not what this reads.
+        InputError: A missing path, or an unsupported format.
     """
     if path.is_dir():
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES)
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
-            raise InputError(DOING, str(path), "a folder without pictures", f"put {', '.join(PICTURES)} there, named in order")
+            raise InputError(DOING, str(path), "a folder without images", f"put {', '.join(IMAGE_SUFFIXES)} there, named in order")
         for file in files:
             image = cv2.imread(str(file), cv2.IMREAD_COLOR)
             if image is None:
-                raise InputError(DOING, str(file), "not a readable picture", "write it again")
+                raise InputError(DOING, str(file), "not a readable image", "write it again")
             yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
     elif path.suffix == ".npy":
         yield from _array_frames(path)
@@ -136,14 +135,14 @@ def frames_of(path: Path) -> Iterator[U8]:
             for frame in video:
                 yield frame.image
     else:
-        raise InputError(DOING, str(path), "no such file or folder", "give a video, a folder of pictures or a .npy array")
+        raise InputError(DOING, str(path), "no such file or folder", "give a video, a folder of images or a .npy array")
 
 
 def _array_frames(path: Path) -> Iterator[U8]:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:
-        raise InputError(DOING, str(path), str(error), "give a whole .npy array") from error
+        raise InputError(DOING, str(path), str(error), "give a complete .npy array") from error
     if array.dtype != np.uint8 or array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in (1, 3)):
         raise InputError(DOING, str(path), f"{array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)")
     for image in array:
@@ -151,17 +150,17 @@ def _array_frames(path: Path) -> Iterator[U8]:
         yield np.ascontiguousarray(np.broadcast_to(colour, (*colour.shape[:2], 3)))
 
 
-def _look(path: Path) -> tuple[U8, int]:
-    """Return the first picture and how many there are; videos are read to their end, because only that tells."""
-    frames = frames_of(path)
+def _first_and_count(path: Path) -> tuple[U8, int]:
+    """Return the first image and the number of images; videos are decoded to the end to count frames."""
+    frames = read_frames(path)
     first = next(frames, None)
     if first is None:
-        raise InputError(DOING, str(path), "no frame", "give a channel with pictures")
+        raise InputError(DOING, str(path), "no frame", "give a channel with images")
     return first, 1 + sum(1 for _ in frames)
 
 
 def _pairs(named: Mapping[str, Path], T: F64, t_us: list[int], length: int, size: tuple[int, int] | None) -> Iterator[Pair]:
-    streams = {name: frames_of(path) for name, path in named.items()}
+    streams = {name: read_frames(path) for name, path in named.items()}
     for i in range(length):
         images = {name: _scaled(next(stream), size) for name, stream in streams.items()}
         opacity = cv2.cvtColor(images["opacity"], cv2.COLOR_RGB2GRAY)

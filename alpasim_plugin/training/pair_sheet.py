@@ -1,4 +1,4 @@
-"""Measure a folder of pairs: how many of what, how damaged, how much of the map shows, and a picture to look at."""
+"""Statistics of a folder of training pairs, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from alpasim_plugin.image_metrics import psnr_db, ssim
 from alpasim_plugin.training.pair_store import PairSequence
 from alpasim_plugin.types import U8
 
-EVERY = 5  # frames are measured this far apart: neighbours hardly differ
+EVERY = 5  # every 5th frame is measured, since consecutive frames are similar
 PSNR_EDGES_DB = (0, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 100)
-HOLE_BELOW = 128  # of 255: more of such a pixel is missing than shown
+HOLE_BELOW = 128  # of 255: pixels with less opacity count as holes
 ROWS, THUMB_WIDTH = 24, 192
 
 
 @dataclass(frozen=True)
 class SequenceFacts:
-    """Numbers of one sequence; means over the measured frames.
+    """Statistics of one sequence; means over the measured frames.
 
     Attributes:
-        split, name, family, degradation: From its folder and sequence.json; ``imported`` where it says nothing.
+        split, name, family, degradation: From its folder and sequence.json; ``imported`` without an entry.
         frames: Frames that every channel has.
-        moving_actors: How many actors drive or walk; None where that is unknown.
+        moving_actors: Number of moving actors; None if unknown.
         psnr_db: Of rgb_input against rgb_gt, every measured frame.
         ssim: Structural similarity (`alpasim_plugin.image_metrics.ssim`).
-        hole_share: Share of pixels that the reconstruction shows less than half of.
+        hole_share: Share of pixels with opacity below one half.
         luminance: Mean of rgb_gt, 0..1.
-        map_share: Share of pixels on which the semantic map draws anything.
-        travel_m: Length of the camera's way.
+        map_share: Share of non-black pixels of the semantic map.
+        travel_m: Length of the camera path.
     """
 
     split: str
@@ -75,7 +75,7 @@ def measure_sequence(sequence: PairSequence, split: str) -> SequenceFacts:
 
 
 def sheet(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
-    """Return the statistics of many sequences as plain JSON: of all, by split, and every sequence."""
+    """Return statistics as JSON: over all sequences, by split, and of every sequence."""
     splits = sorted({f.split for f in facts})
     return {
         "measured_every": EVERY,
@@ -108,7 +108,7 @@ def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
 
 
 def markdown(document: Mapping[str, Any]) -> str:
-    """Return the statistics as two Markdown tables: by split, and how many frames are how bad."""
+    """Return the statistics as two Markdown tables: by split, and a histogram of the input's PSNR."""
     columns = {**document["splits"], "all": document["all"]}
     counted = ("sequences", "frames", "with_moving_actors", "not_known_whether_actors_move")
     rows = [[name.replace("_", " "), *(f"{c[name]:,}" for c in columns.values())] for name in counted]
@@ -134,7 +134,7 @@ def markdown(document: Mapping[str, Any]) -> str:
 
 
 def contact_sheet(sequences: Sequence[PairSequence], rows: int = ROWS) -> U8:
-    """Return a picture ``(H, W, 3)``: one row a sequence, evenly chosen; input and truth early, in the middle and late, opacity and map."""
+    """Return an image ``(H, W, 3)``: one row per sequence, evenly chosen; input and clean frame at three times, opacity and map."""
     chosen = [sequences[i] for i in np.unique(np.linspace(0, len(sequences) - 1, min(rows, len(sequences))).round().astype(int))]
     lines = []
     for sequence in chosen:
@@ -147,11 +147,11 @@ def contact_sheet(sequences: Sequence[PairSequence], rows: int = ROWS) -> U8:
     return np.concatenate([np.pad(line, ((0, 2), (0, width - line.shape[1]), (0, 0))) for line in lines])
 
 
-def write_sheet(out: Path, document: Mapping[str, Any], picture: U8) -> None:
+def write_sheet(out: Path, document: Mapping[str, Any], image: U8) -> None:
     """Write ``sheet.md`` and ``sheet.jpg`` into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "sheet.md", markdown(document))
-    cv2.imwrite(str(out / "sheet.jpg"), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    cv2.imwrite(str(out / "sheet.jpg"), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 def _thumb(image: U8) -> U8:

@@ -1,12 +1,12 @@
-"""Pairs on disk: one folder a sequence, one array file a channel, read through memory maps, also while more are being written.
+"""Training pairs on disk: one folder per sequence, one array file per channel, memory-mapped, readable while more are written.
 
-    ROOT/SPLIT/SEQUENCE/rgb_input.npy        (T, H, W, 3) uint8   what the damaged reconstruction shows
-                        rgb_gt.npy           (T, H, W, 3) uint8   what there is to see
-                        opacity.npy          (T, H, W)    uint8   accumulated opacity of the reconstruction, 255 is opaque
+    ROOT/SPLIT/SEQUENCE/rgb_input.npy        (T, H, W, 3) uint8   degraded render
+                        rgb_gt.npy           (T, H, W, 3) uint8   clean frame
+                        opacity.npy          (T, H, W)    uint8   accumulated opacity of the render, 255 is opaque
                         sdmap.npy            (T, H, W, 3) uint8   semantic map
                         T_world_camera.npy   (T, 4, 4)    float64
                         t_us.npy             (T,)         int64
-                        sequence.json        scene, family, camera, how it was made; written last: a folder without it is unfinished
+                        sequence.json        scene, family, camera, recipe; written last: a folder without it is incomplete
 
 Channels may differ in length; a sequence is as long as its shortest one.
 """
@@ -45,7 +45,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class PairClip:
-    """Consecutive frames; arrays as in the files, possibly views of memory maps that nobody may write to."""
+    """Consecutive frames; arrays as in the files, possibly read-only memory maps."""
 
     rgb_input: U8
     rgb_gt: U8
@@ -76,7 +76,7 @@ _FORMS: dict[str, tuple[int, str]] = {
 
 
 class PairSequence:
-    """A finished sequence on disk; its arrays are opened when first asked for.
+    """A complete sequence on disk; its arrays are opened on first use.
 
     Raises:
         InputError: A channel is missing, of another type or size, or empty.
@@ -97,12 +97,12 @@ class PairSequence:
 
     @cached_property
     def content(self) -> str:
-        """Digest of its arrays: two sequences are the same data only if this is equal, whatever they say of themselves."""
+        """Digest of its arrays, which identifies the data."""
         return str(self.info.get(CONTENT) or _content(self.folder))
 
     @cached_property
     def clip(self) -> PairClip:
-        """All frames that every channel has, as memory maps."""
+        """The frames that every channel has, as memory maps."""
         arrays = {name: self._open(name) for name in CHANNELS}
         size = arrays["rgb_gt"].shape[1:3]
         for name in ("rgb_input", "opacity", "sdmap"):
@@ -110,7 +110,9 @@ class PairSequence:
                 raise InputError(READING, str(self.folder), f"{name} is {arrays[name].shape[1:3]}, rgb_gt {size}", "make all of one size")
         length = min(len(a) for a in arrays.values())
         if length == 0:
-            raise InputError(READING, str(self.folder), "no frame that every channel has", "remove the folder and make it again")
+            raise InputError(
+                READING, str(self.folder), "no frame that every channel has", "remove the folder and run 'simrun train pairs' again"
+            )
         return PairClip(**{name: a[:length] for name, a in arrays.items()})
 
     def _open(self, name: str) -> Any:
@@ -119,7 +121,7 @@ class PairSequence:
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as error:
-            raise InputError(READING, str(path), str(error), "give a whole .npy file of this channel") from error
+            raise InputError(READING, str(path), str(error), "give a complete .npy file of this channel") from error
         if array.ndim != axes or array.dtype != np.dtype(dtype):
             found = f"{array.dtype} with {array.ndim} axes"
             raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/pairs.md)")
@@ -127,10 +129,10 @@ class PairSequence:
 
 
 class PairDataset:
-    """The finished sequences of one split, in order of name; `refresh` finds those that were finished since.
+    """The complete sequences of one split, in order of name; `refresh` finds new ones.
 
     Raises:
-        InputError: No such split, or no finished sequence in it.
+        InputError: No such split, or no complete sequence in it.
     """
 
     def __init__(self, root: Path | str, split: str) -> None:
@@ -139,7 +141,7 @@ class PairDataset:
         self.refresh()
 
     def refresh(self) -> None:
-        """Look again for finished sequences."""
+        """Find new sequences."""
         known = {s.name: s for s in self.sequences}
         finished = sorted(p.parent for p in self.folder.glob(f"*/{SEQUENCE_FILE}") if not p.parent.name.startswith("."))
         if not finished:
@@ -151,18 +153,18 @@ class PairDataset:
 
 
 def pairs_digest(sequences: Sequence[PairSequence]) -> str:
-    """Return what identifies some sequences as training data: their names and what is in their arrays, in order."""
+    """Return a digest of the names and arrays of sequences, in order."""
     return hashlib.blake2b("\n".join(f"{s.name} {s.content}" for s in sequences).encode(), digest_size=8).hexdigest()
 
 
 def write_sequence(folder: Path, frames: Iterable[Pair], length: int, info: Mapping[str, Any]) -> None:
-    """Write a sequence; it appears under its name only once complete.
+    """Write a sequence atomically.
 
     Args:
         folder: ROOT/SPLIT/SEQUENCE; replaced if it exists.
-        frames: At most ``length`` frames of one size, taken one at a time.
-        length: How many frames to make room for.
-        info: What to remember about it; goes to sequence.json.
+        frames: At most ``length`` frames of one size, consumed one at a time.
+        length: Frames to allocate.
+        info: Contents of sequence.json.
 
     Raises:
         InputError: No frame, or frames of changing size.
@@ -181,7 +183,7 @@ def _content(folder: Path) -> str:
             with (folder / f"{name}.npy").open("rb") as file:
                 out.update(hashlib.file_digest(file, "sha256").digest())
         except OSError as error:
-            raise InputError(READING, str(folder / f"{name}.npy"), str(error), "give a whole .npy file of this channel") from error
+            raise InputError(READING, str(folder / f"{name}.npy"), str(error), "give a complete .npy file of this channel") from error
     return out.hexdigest()
 
 
@@ -202,7 +204,7 @@ def _write_arrays(folder: Path, frames: Iterable[Pair], length: int) -> int:
         raise InputError("writing training pairs", str(folder), "no frames", "give at least one")
     for name, array in arrays.items():
         array.flush()
-        if count < length:  # the file's header says ``length``: write what there is under a header that tells the truth
+        if count < length:  # the header has ``length``: write the array again with its true length
             short = np.array(array[:count])
             del array
             np.save(folder / f"{name}.npy", short)

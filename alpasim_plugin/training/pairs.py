@@ -1,4 +1,4 @@
-"""Make pairs from scenarios: what a damaged reconstruction shows, what there is to see, and the map, along paths beside the log."""
+"""Render training pairs from scenarios: degraded and clean frames and the semantic map, along paths offset from the log."""
 
 from __future__ import annotations
 
@@ -23,49 +23,47 @@ from alpasim_plugin.types import F64, CameraSpec, Degradation, RenderRequest, Sc
 from alpasim_plugin.world.ground import ground_pose
 
 DOING = "making training pairs"
-
-
-Draw = Literal["mixed", "as-set"]
-SHARES = (0.08, 0.24)  # of the fit's schedule, drawn for mixed sequences: renderers that a fixer meets differ in quality
-SHIFT_M = 1.0  # of the cycle render (paper, App. A); the side is drawn
-MOVING_M = 2.0  # an actor whose track is longer moves
+DegradationMode = Literal["mixed", "as-set"]
+FIT_SHARES = (0.08, 0.24)  # of the fit's schedule, sampled for mixed sequences, so that the quality of the renderer varies
+SHIFT_M = 1.0  # of the cycle render (paper, App. A); the side is random
+MOVING_M = 2.0  # an actor with a longer track counts as moving
 
 
 @dataclass(frozen=True)
 class PairRecipe:
-    """How a sequence is made.
+    """Definition of a sequence.
 
     Args:
-        source: Renderer of the damaged frames.
-        target: Renderer of the frames to be learned.
-        degradation: ``mixed`` draws a reconstruction seen from beside the logged path or a cycle render seen from the path itself, by
-            halves; ``as-set`` takes what the scenario says.
-        wander_m: Largest sideways distance from the logged path; the camera drifts smoothly within it, except in cycle renders.
+        source: Renderer of the degraded frames.
+        target: Renderer of the clean frames.
+        degradation: ``mixed`` samples, with equal probability, a reconstruction viewed from an offset path or a cycle render viewed from
+            the logged path; ``as-set`` uses the scenario's setting.
+        max_offset_m: Largest lateral offset from the logged path; the offset varies smoothly, and is zero in cycle renders.
         interval_us: Time between frames.
-        camera: Name of the scenario's camera; None takes the first.
+        camera: Name of the scenario's camera; None for the first.
     """
 
     source: str = "3dgs"
     target: str = "clean"
-    degradation: Draw = "mixed"
-    wander_m: float = 1.5
+    degradation: DegradationMode = "mixed"
+    max_offset_m: float = 1.5
     interval_us: int = 100_000
     camera: str | None = None
 
 
 def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: int, *, split: str, family: str, threads: int = 1) -> bool:
-    """Make one sequence of a scenario unless the same one is there already.
+    """Render one sequence of a scenario unless an equal one exists.
 
     Args:
-        scenario: The whole of its driven time is rendered.
+        scenario: Rendered over its whole duration.
         folder: ROOT/SPLIT/SEQUENCE.
-        recipe: How.
-        seed: Rollout seed: the path beside the log and what wanders in the source renderer.
-        split, family: Remembered in sequence.json.
+        recipe: Definition of the sequence.
+        seed: Of the degradation, the lateral offset and the source renderer.
+        split, family: Stored in sequence.json.
         threads: Threads of the rasteriser.
 
     Returns:
-        Whether it was made now.
+        Whether it was rendered now.
 
     Raises:
         InputError: The scenario has no such camera.
@@ -87,11 +85,11 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
 
 
 def draw_degradation(scenario: Scenario, recipe: PairRecipe, seed: int) -> Degradation:
-    """Return what the damaged frames of a sequence suffer from."""
+    """Return the degradation of a sequence."""
     if recipe.degradation == "as-set":
         return scenario.degradation
     rng = stream(scenario.scene_id, seed, "training.degradation")
-    is_cycle, side, share = rng.random() < 0.5, rng.random() < 0.5, round(float(rng.uniform(*SHARES)), 2)
+    is_cycle, side, share = rng.random() < 0.5, rng.random() < 0.5, round(float(rng.uniform(*FIT_SHARES)), 2)
     if is_cycle:
         return Degradation("cycle", share=share, shift_m=SHIFT_M if side else -SHIFT_M)
     return Degradation("reconstruction", share=share)
@@ -102,9 +100,9 @@ def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed
     source = make_renderer(recipe.source, scenario, seed=seed, threads=threads)
     target = make_renderer(recipe.target, scenario, seed=seed, threads=threads)
     layers = prepare_map(scenario.lane_map)
-    offset_m = wander(scenario, recipe, seed)
+    offset_m = lateral_offsets(scenario, recipe, seed)
     for i, t_us in enumerate(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)):
-        T_world_camera = beside_log(scenario, t_us, float(offset_m[i])) @ camera.T_rig_camera
+        T_world_camera = offset_from_log(scenario, t_us, float(offset_m[i])) @ camera.T_rig_camera
         actors = log_actors(scenario, t_us)
         request = RenderRequest(t_us, camera, np.stack([T_world_camera, T_world_camera]), actors)
         damaged = source.render(request)
@@ -115,22 +113,22 @@ def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed
         yield Pair(damaged.rgb, target.render(request).rgb, opacity, sdmap, T_world_camera, t_us)
 
 
-def wander(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
-    """Return a sideways offset for every frame ``(T,)``, metres, left positive: two slow waves of random size, at most ``wander_m``.
+def lateral_offsets(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
+    """Return the lateral offset of every frame ``(T,)``, metres, left positive: two slow sines, at most ``max_offset_m``.
 
-    A fifth of the sequences stays on the logged path, where a reconstruction is best; so does every cycle render, which is damaged there.
+    A fifth of the sequences stays on the logged path, where a reconstruction is best; so do all cycle renders, which are degraded there.
     """
     rng = stream(scenario.scene_id, seed, "training.wander")
     t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
     on_path = rng.random() < 0.2 or scenario.degradation.kind == "cycle"
-    size = 0.0 if on_path else recipe.wander_m * np.sqrt(rng.uniform(0.05, 1.0))
+    size = 0.0 if on_path else recipe.max_offset_m * np.sqrt(rng.uniform(0.05, 1.0))
     periods_s, phases = rng.uniform([6.0, 12.0], [12.0, 30.0]), rng.uniform(0, 2 * np.pi, 2)
     waves = np.sin(2 * np.pi * t_s[:, None] / periods_s + phases) @ np.array([0.35, 0.65])
     return np.asarray(size * waves)
 
 
-def beside_log(scenario: Scenario, t_us: int, offset_m: float) -> F64:
-    """Return the rig's pose ``(4, 4)`` at a sideways offset from the logged one, on the ground, with the logged heading."""
+def offset_from_log(scenario: Scenario, t_us: int, offset_m: float) -> F64:
+    """Return the rig's pose ``(4, 4)`` at a lateral offset from the logged one, on the ground, with the logged heading."""
     T = interpolate(scenario.ego_log, t_us)
     x, y = T[:2, 3] + offset_m * T[:2, 1]
     return ground_pose(scenario.ground, float(x), float(y), yaw_of(T))

@@ -1,8 +1,8 @@
-"""Train the feature network of `perceptual-syn`: see the road, keep what pixels say, and count damage as far as it matters.
+"""Train the feature network of `perceptual-syn` with three losses on one backbone.
 
-Three lessons on one trunk. Semantics: which classes of the map are in a cell, from the clean frame. Read-out: pixels are a linear function
-of the first two stages' features, so that no change goes unseen. Distance: the distance to a damaged picture follows the target
-(training/perceptual_targets.py) and grows with the strength of the damage.
+Semantics: predict the classes of the map in each cell from the clean frame. Reconstruction: pixels are a linear function of the features of
+the first two stages, so that features keep all pixel changes. Distance: the distance to a distorted image matches the target
+(training/perceptual_targets.py) and increases with the strength of the distortion.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from alpasim_plugin.training.semantics import CLASSES, class_masks
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import F32, U8
 
-CELL = 4  # pixels of a cell with labels: the resolution of the second stage
+CELL = 4  # side of a labelled cell, pixels: the resolution of the second stage
 LOG_FLOOR = 0.01  # distances far below this count as equal
-RENDER = "render"  # damage that is not synthetic: what the damaged reconstruction of the pair shows
+RENDER = "render"  # kind of distortion: the degraded render of the pair
 
 
 @dataclass(frozen=True)
 class PerceptualRecipe:
-    """What a batch holds and what counts.
+    """Batch and loss weights.
 
     Args:
-        pictures: Clean pictures in a batch; each comes with three damaged ones.
-        side: Of a picture, pixels; a multiple of 16.
-        zoom: Least and greatest side of what is cut from a frame, relative to ``side``.
-        shapes_share: Share of pictures that are not cut from frames but drawn: shapes that hide one another, with texture.
-        render_share: Share of damages that are the pair's own damaged render, mixed in by strength.
-        semantics, readout, order: Weights of the lessons beside the distance's 1.
-        seed: Of weights and draws.
+        images: Clean images in a batch; each has three distorted versions.
+        side: Of an image, pixels; a multiple of 16.
+        zoom: Range of the crop size relative to ``side``.
+        shapes_share: Share of synthetic images of overlapping textured shapes instead of crops.
+        render_share: Share of distortions that blend in the pair's degraded render.
+        semantics, readout, order: Loss weights; the distance loss has weight 1.
+        seed: Of weights and sampling.
     """
 
-    pictures: int = 12
+    images: int = 12
     side: int = 80
     zoom: tuple[float, float] = (0.8, 1.8)
     shapes_share: float = 0.25
@@ -58,12 +58,12 @@ class PerceptualRecipe:
 
 @dataclass(frozen=True)
 class PerceptualBatch:
-    """Pictures in [-1, 1] and what they should give.
+    """Images in [-1, 1] and targets.
 
     Args:
         clean: ``(N, 3, S, S)``.
-        damaged: ``(3, N, 3, S, S)``: one damage mildly, the same strongly, another one.
-        targets: ``(3, N)`` distances to the clean picture.
+        damaged: ``(3, N, 3, S, S)``: a weak distortion, the same stronger, another one.
+        targets: ``(3, N)`` distances to the clean image.
         classes: ``(N, len(CLASSES), S / 4, S / 4)`` of 0 and 1.
         labelled: ``(N,)`` 1 where classes are known.
     """
@@ -75,27 +75,27 @@ class PerceptualBatch:
     labelled: Tensor
 
 
-class Lessons(nn.Module):
-    """The distance and what is only needed to teach its trunk."""
+class PerceptualTraining(nn.Module):
+    """The distance with the auxiliary heads of its training."""
 
     def __init__(self, net: PerceptualDistance) -> None:
         super().__init__()
         self.net = net
         one, two, three, four = net.trunk.widths
-        self.see = nn.ModuleList([nn.Conv2d(c, len(CLASSES), 1) for c in (two, three, four)])
-        self.read_half = nn.Conv2d(one, 3 * 2 * 2, 1)
-        self.read_quarter = nn.Conv2d(two, 3 * CELL * CELL, 1)
+        self.semantic_heads = nn.ModuleList([nn.Conv2d(c, len(CLASSES), 1) for c in (two, three, four)])
+        self.reconstruct_half = nn.Conv2d(one, 3 * 2 * 2, 1)
+        self.reconstruct_quarter = nn.Conv2d(two, 3 * CELL * CELL, 1)
 
     def semantics(self, features: list[Tensor]) -> Tensor:
         """Return logits ``(N, classes, H / 4, W / 4)``."""
         size = features[1].shape[2:]
-        parts = [F.interpolate(head(x), size=size, mode="bilinear") for head, x in zip(self.see, features[1:], strict=True)]
+        parts = [F.interpolate(head(x), size=size, mode="bilinear") for head, x in zip(self.semantic_heads, features[1:], strict=True)]
         return torch.stack(parts).sum(0)
 
     def readout_error(self, features: list[Tensor], image: Tensor) -> Tensor:
-        """Return how badly pixels are read off the first two stages, mean absolute, of [-1, 1]."""
-        half = F.pixel_shuffle(self.read_half(features[0]), 2)
-        quarter = F.pixel_shuffle(self.read_quarter(features[1]), CELL)
+        """Return the mean absolute error of the linear reconstruction of ``image`` from the first two stages."""
+        half = F.pixel_shuffle(self.reconstruct_half(features[0]), 2)
+        quarter = F.pixel_shuffle(self.reconstruct_quarter(features[1]), CELL)
         return (half - image).abs().mean() + (quarter - image).abs().mean()
 
 
@@ -104,9 +104,9 @@ class PerceptualTask:
 
     def __init__(self, sequences: Sequence[PairSequence], recipe: PerceptualRecipe) -> None:
         self.sequences, self.recipe = sequences, recipe
-        self.module = Lessons(PerceptualDistance())
-        _draw_weights(self.module, torch.Generator().manual_seed(recipe.seed))
-        _spread(self.module.net.trunk)
+        self.module = PerceptualTraining(PerceptualDistance())
+        _init_weights(self.module, torch.Generator().manual_seed(recipe.seed))
+        _he_init(self.module.net.trunk)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -116,9 +116,9 @@ class PerceptualTask:
     def batch(self, index: int) -> PerceptualBatch:
         """Make batch ``index``."""
         r = self.recipe
-        rows = [make_example(self.sequences, r, index * r.pictures + i) for i in range(r.pictures)]
-        clean = torch.stack([to_picture(row.clean) for row in rows])
-        damaged = torch.stack([torch.stack([to_picture(row.damaged[k]) for row in rows]) for k in range(3)])
+        rows = [make_example(self.sequences, r, index * r.images + i) for i in range(r.images)]
+        clean = torch.stack([to_image_tensor(row.clean) for row in rows])
+        damaged = torch.stack([torch.stack([to_image_tensor(row.damaged[k]) for row in rows]) for k in range(3)])
         targets = torch.tensor([[row.targets[k] for row in rows] for k in range(3)])
         classes = torch.stack([torch.from_numpy(row.classes) for row in rows])
         return PerceptualBatch(clean, damaged, targets, classes, torch.tensor([float(row.labelled) for row in rows]))
@@ -126,20 +126,20 @@ class PerceptualTask:
     def loss(self, batch: PerceptualBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         del index
-        r, lessons = self.recipe, self.module
+        r, module = self.recipe, self.module
         n = len(batch.clean)
         everything = torch.cat([batch.clean, batch.damaged.flatten(0, 1)])
-        features = lessons.net.trunk(everything)
+        features = module.net.trunk(everything)
         clean = [x[:n] for x in features]
-        made = torch.stack([lessons.net.between([x[n * k : n * (k + 1)] for x in features], clean) for k in (1, 2, 3)])  # (3, N)
-        wanted = (batch.targets + LOG_FLOOR).log()
-        said = (made + LOG_FLOOR).log()
-        step = (wanted[1] - wanted[0]).clamp(min=0)  # how much worse the stronger damage is
+        made = torch.stack([module.net.feature_distance([x[n * k : n * (k + 1)] for x in features], clean) for k in (1, 2, 3)])  # (3, N)
+        target = (batch.targets + LOG_FLOOR).log()
+        log_distance = (made + LOG_FLOOR).log()
+        step = (target[1] - target[0]).clamp(min=0)  # target difference between the two strengths
         parts = {
-            "distance": F.smooth_l1_loss(said, wanted, beta=0.3),
-            "order": r.order * F.relu(0.7 * step - (said[1] - said[0])).mean(),
+            "distance": F.smooth_l1_loss(log_distance, target, beta=0.3),
+            "order": r.order * F.relu(0.7 * step - (log_distance[1] - log_distance[0])).mean(),
             "semantics": r.semantics * self._semantics(clean, batch),
-            "readout": r.readout * lessons.readout_error(features, everything),
+            "readout": r.readout * module.readout_error(features, everything),
         }
         numbers = {name: float(value.detach()) for name, value in parts.items()}
         numbers["wrong_order"] = float(((made[1] <= made[0]) & (step > 0.1)).float().sum() / (step > 0.1).float().sum().clamp(min=1))
@@ -154,7 +154,7 @@ class PerceptualTask:
 
 @dataclass(frozen=True)
 class Example:
-    """One clean picture ``(S, S, 3)`` in 0 to 1, three damaged ones, their targets, and labels."""
+    """One clean image ``(S, S, 3)`` in 0 to 1, three distorted ones, their targets, and labels."""
 
     clean: F32
     damaged: tuple[F32, F32, F32]
@@ -164,7 +164,7 @@ class Example:
 
 
 def make_example(sequences: Sequence[PairSequence], recipe: PerceptualRecipe, index: int) -> Example:
-    """Make example ``index``: a function of the data, the recipe and the index alone."""
+    """Make example ``index``: a function of the data, the recipe and the index only."""
     rng = stream("training", recipe.seed, "perceptual.example", index)
     render: F32 | None = None
     if rng.random() < recipe.shapes_share:
@@ -173,27 +173,27 @@ def make_example(sequences: Sequence[PairSequence], recipe: PerceptualRecipe, in
     else:
         clean, render, classes = _cut(rng, sequences[int(rng.integers(len(sequences)))], recipe)
         labelled = True
-    first, second = (_Damage.draw(rng, clean, render, recipe) for _ in range(2))
+    first, second = (_Degradation.draw(rng, clean, render, recipe) for _ in range(2))
     weak, strong = np.sort(rng.uniform(0.02, 1.0, 2) ** 1.5)
     damaged = first(clean, weak), first(clean, strong), second(clean, float(rng.uniform(0.02, 1.0)))
     return Example(clean, tuple(d[0] for d in damaged), tuple(d[1] for d in damaged), classes, labelled)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
-class _Damage:
-    """Synthetic damage, or the pair's render mixed in."""
+class _Degradation:
+    """A synthetic distortion, or blending with the pair's degraded render."""
 
     made: Distortion | None
     render: F32 | None
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, clean: F32, render: F32 | None, recipe: PerceptualRecipe) -> _Damage:
+    def draw(cls, rng: np.random.Generator, clean: F32, render: F32 | None, recipe: PerceptualRecipe) -> _Degradation:
         if render is not None and rng.random() < recipe.render_share:
             return cls(None, render)
         return cls(draw_distortion(rng, clean.shape), None)
 
     def __call__(self, clean: F32, strength: float) -> tuple[F32, float]:
-        """Return the damaged picture and its target."""
+        """Return the distorted image and its target."""
         if self.made is None:
             assert self.render is not None
             out = clean + np.float32(strength) * (self.render - clean)
@@ -203,7 +203,7 @@ class _Damage:
 
 
 def _cut(rng: np.random.Generator, sequence: PairSequence, recipe: PerceptualRecipe) -> tuple[F32, F32, F32]:
-    """Cut a picture, its damaged render and its classes from a random place of a random frame; mirrored or not, exposed anew."""
+    """Return a random crop of a random frame, its degraded render and its classes, with random flip, gain and gamma."""
     clip = sequence.clip
     h, w = clip.rgb_gt.shape[1:3]
     t = int(rng.integers(len(clip)))
@@ -221,7 +221,7 @@ def _cut(rng: np.random.Generator, sequence: PairSequence, recipe: PerceptualRec
 
 
 def draw_shapes(rng: np.random.Generator, side: int) -> F32:
-    """Draw a picture ``(side, side, 3)`` of ellipses and boxes that hide one another, with texture: edges of every contrast and size."""
+    """Draw an image ``(side, side, 3)`` of overlapping textured ellipses and boxes: edges of all contrasts and sizes."""
     image = np.full((side, side, 3), rng.random(3), dtype=np.float32)
     for _ in range(int(rng.integers(5, 80))):
         size = side * 0.5 * float(rng.random()) ** 3 + 1
@@ -239,13 +239,13 @@ def draw_shapes(rng: np.random.Generator, side: int) -> F32:
     return np.asarray(np.clip(cv2.GaussianBlur(image, (0, 0), 0.5), 0, 1), dtype=np.float32)
 
 
-def to_picture(image: F32) -> Tensor:
+def to_image_tensor(image: F32) -> Tensor:
     """Map ``(H, W, 3)`` in 0 to 1 to ``(3, H, W)`` in [-1, 1]."""
     return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1) * 2 - 1
 
 
-def _draw_weights(module: nn.Module, generator: torch.Generator) -> None:
-    """Draw what torch draws for a new convolution, from a generator of our own."""
+def _init_weights(module: nn.Module, generator: torch.Generator) -> None:
+    """Initialise convolutions as torch does by default, from the given generator."""
     for conv in module.modules():
         if isinstance(conv, nn.Conv2d):
             bound = conv.weight[0].numel() ** -0.5
@@ -253,8 +253,8 @@ def _draw_weights(module: nn.Module, generator: torch.Generator) -> None:
             nn.init.uniform_(conv.bias, -bound, bound, generator=generator)  # type: ignore[arg-type]
 
 
-def _spread(trunk: FeatureNet) -> None:
-    """Give layers the size of steps that leaky units need (He et al., 2015)."""
+def _he_init(trunk: FeatureNet) -> None:
+    """Rescale the weights for leaky ReLU units (He et al., 2015)."""
     for module in trunk.modules():
         if isinstance(module, nn.Conv2d):
             nn.init.zeros_(module.bias)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Measure whether a distance of pictures does what `perceptual-syn` was trained to do, on frames it has not seen."""
+"""Validate a perceptual image distance on held-out frames: monotonicity in severity and rank correlation with the targets."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from alpasim_plugin.training.pair_store import PairSequence
 from alpasim_plugin.training.perceptual_targets import target_distance
 from alpasim_plugin.types import F32, F64
 
-ArrayDistance = Callable[[F32, F32], F64]  # pictures (N, H, W, 3) in 0 to 1, twice -> (N,), smaller is nearer
+ArrayDistance = Callable[[F32, F32], F64]  # images (N, H, W, 3) in 0 to 1, twice -> (N,), smaller is closer
 STRENGTHS = (0.05, 0.15, 0.3, 0.5, 0.75, 1.0)
 STRUCTURAL = ("blur", "coarse", "erase", "ghost", "splat")
-MODERATE = 0.5  # strength at which structural damage must count more than a shift of one pixel
+MODERATE = 0.5  # strength at which a structural distortion must be farther than a shift of one pixel
 
 
 @dataclass(frozen=True)
-class Ladder:
-    """Distances of frames under one kind of damage at rising strengths: ``made`` and ``wanted`` ``(frames, strengths)``."""
+class SeveritySweep:
+    """Distances under one kind of distortion at increasing strengths: ``made`` and target ``wanted``, ``(frames, strengths)``."""
 
     made: F64
     wanted: F64
 
     @property
     def in_order(self) -> float:
-        """Share of neighbouring strengths where more damage is farther away; steps that hardly change the picture are left out."""
+        """Share of consecutive strengths with increasing distance; steps with a negligible target difference are excluded."""
         counted = np.diff(self.wanted, axis=1) > 1e-3
         return float((np.diff(self.made, axis=1) > 0)[counted].mean()) if counted.any() else float("nan")
 
@@ -45,8 +45,8 @@ def check_frames(sequences: Sequence[PairSequence], count: int, channel: str = "
     return np.stack(picked).astype(np.float32) / np.float32(255)
 
 
-def ladders(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, Ladder]:
-    """Damage every frame in every way at rising strengths."""
+def severity_sweeps(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, SeveritySweep]:
+    """Distort every frame with every kind at increasing strengths."""
     out = {}
     for kind in KINDS:
         draws = [draw_distortion(stream("training", seed, f"perceptual.check.{kind}", i), f.shape, kind) for i, f in enumerate(frames)]
@@ -56,32 +56,32 @@ def ladders(distance: ArrayDistance, frames: F32, seed: int = 0) -> dict[str, La
             made.append(distance(damaged, frames))
             moved = draws[0].displacement_px(s)
             wanted.append([target_distance(f, d, kind, moved) for f, d in zip(frames, damaged, strict=True)])
-        out[kind] = Ladder(np.array(made).T, np.array(wanted).T)
+        out[kind] = SeveritySweep(np.array(made).T, np.array(wanted).T)
     return out
 
 
 def shift_one_px(frames: F32) -> list[F32]:
-    """Return the frames moved by one pixel to the right and down, ``(N, H, W, 3)`` each; the far row or column is repeated."""
+    """Return the frames moved by one pixel to the right and down, ``(N, H, W, 3)`` each; the border is repeated."""
     right = np.concatenate([frames[:, :, :1], frames[:, :, :-1]], axis=2)
     down = np.concatenate([frames[:, :1], frames[:, :-1]], axis=1)
     return [right, down]
 
 
 def check(distance: ArrayDistance, frames: F32, renders: F32 | None = None, seed: int = 0) -> dict[str, Any]:
-    """Return what docs/video-metrics.md shows of a distance.
+    """Return the validation results of a distance (docs/video-metrics.md).
 
     Args:
-        distance: Of pictures.
+        distance: Of images.
         frames: ``(N, H, W, 3)`` clean, in 0 to 1.
-        renders: Their damaged renders, or None.
-        seed: Of the damage.
+        renders: Their degraded renders, or None.
+        seed: Of the distortions.
 
     Returns:
         ``in_order`` by kind; ``rank_correlation`` with the targets over all kinds and strengths; ``shift_1px`` (median distance), and
         ``moderate`` (median distance by structural kind at strength 0.5, and ``above_shift``: share of frames where it exceeds the
-        frame's shift of one pixel); ``render`` (median distance of damaged renders).
+        frame's shift of one pixel); ``render`` (median distance of degraded renders).
     """
-    steps = ladders(distance, frames, seed)
+    steps = severity_sweeps(distance, frames, seed)
     shift = np.mean([distance(moved, frames) for moved in shift_one_px(frames)], axis=0)
     at = STRENGTHS.index(MODERATE)
     moderate = {
@@ -90,15 +90,15 @@ def check(distance: ArrayDistance, frames: F32, renders: F32 | None = None, seed
     }
     return {
         "frames": len(frames),
-        "in_order": {kind: round(ladder.in_order, 4) for kind, ladder in steps.items()},
+        "in_order": {kind: round(sweep.in_order, 4) for kind, sweep in steps.items()},
         "rank_correlation": float(stats.spearmanr(*_flat(steps)).statistic),
         "shift_1px": float(np.median(shift)),
         "moderate": moderate,
-        "by_strength": {kind: [round(float(v), 5) for v in np.median(ladder.made, axis=0)] for kind, ladder in steps.items()},
+        "by_strength": {kind: [round(float(v), 5) for v in np.median(sweep.made, axis=0)] for kind, sweep in steps.items()},
         "shift_px_at_1": SHIFT_PX,
         "render": None if renders is None else float(np.median(distance(renders, frames))),
     }
 
 
-def _flat(steps: Mapping[str, Ladder]) -> tuple[F64, F64]:
-    return tuple(np.concatenate([getattr(ladder, name).ravel() for ladder in steps.values()]) for name in ("made", "wanted"))  # type: ignore[return-value]
+def _flat(steps: Mapping[str, SeveritySweep]) -> tuple[F64, F64]:
+    return tuple(np.concatenate([getattr(sweep, name).ravel() for sweep in steps.values()]) for name in ("made", "wanted"))  # type: ignore[return-value]

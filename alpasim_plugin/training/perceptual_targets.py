@@ -1,8 +1,8 @@
-"""How far apart two pictures should count: what `perceptual-syn` is trained to say.
+"""Target distances of `perceptual-syn`.
 
 Structure is measured by the similarity of gradient magnitudes (Xue et al., "Gradient magnitude similarity deviation", IEEE TIP 2014, Eq. 4)
-on three scales, colour by the difference on a coarse one. That is blind to why pixels differ; the kind of damage is known here, so a gain
-per kind says how much it matters: little where pixels only moved a little, more where thin structure is gone.
+on three scales, colour by the difference on a coarse one. These do not depend on the cause of a difference; the kind of distortion is known
+here, so a gain per kind weights it: low for small displacements, high for lost thin structure.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ GAINS: Mapping[str, float] = {
     "blur": 4.0, "coarse": 4.0, "noise": 0.7, "stain": 1.0, "ghost": 4.0, "erase": 5.0, "splat": 1.6, "colour": 2.0, "jpeg": 3.0,
     "sharpen": 2.0, "render": 3.0,
 }  # fmt: skip
-MOVED_GAIN_PER_PX, MOVED_GAIN_MAX = 0.35, 1.6  # for kinds that only move pixels
+MOVED_GAIN_PER_PX, MOVED_GAIN_MAX = 0.35, 1.6  # for geometric kinds
 
 
 def target_distance(reference: F32, damaged: F32, kind: str, displacement_px: float = 0.0) -> float:
-    """Return the distance that two pictures ``(H, W, 3)`` in 0 to 1 should have, about 0 to 1.
+    """Return the target distance of two images ``(H, W, 3)`` in 0 to 1, about 0 to 1.
 
     Args:
-        reference, damaged: The pictures.
-        kind: Of the damage, a key of `GAINS`, or "shift" or "warp".
-        displacement_px: How far pixels moved, for "shift" and "warp".
+        reference, damaged: The images.
+        kind: Of the distortion, a key of `GAINS`, or "shift" or "warp".
+        displacement_px: Of pixels, for "shift" and "warp".
     """
     gain = GAINS[kind] if kind in GAINS else min(MOVED_GAIN_PER_PX * displacement_px, MOVED_GAIN_MAX)
     return gain * (structure_error(reference, damaged) + COLOUR_WEIGHT * colour_error(reference, damaged))
 
 
 def structure_error(a: F32, b: F32) -> float:
-    """Return one minus the similarity of gradient magnitudes of ``(H, W, 3)`` pictures in 0 to 1, 0 (equal) to 1."""
+    """Return one minus the similarity of gradient magnitudes of ``(H, W, 3)`` images in 0 to 1, 0 (equal) to 1."""
     x, y = (np.ascontiguousarray(image @ np.array([0.299, 0.587, 0.114], dtype=np.float32)) for image in (a, b))
     total = 0.0
     for scale_weight in SCALES:
@@ -49,7 +49,7 @@ def structure_error(a: F32, b: F32) -> float:
 
 
 def colour_error(a: F32, b: F32) -> float:
-    """Return the mean absolute difference of ``(H, W, 3)`` pictures in 0 to 1 at an eighth of the resolution."""
+    """Return the mean absolute difference of ``(H, W, 3)`` images in 0 to 1 at an eighth of the resolution."""
     h, w = a.shape[:2]
     small = [cv2.resize(image, (max(1, w // 8), max(1, h // 8)), interpolation=cv2.INTER_AREA) for image in (a, b)]
     return float(np.abs(small[0] - small[1]).mean())

@@ -1,4 +1,4 @@
-"""The perceptual term of the shared rollout: decode one position causally, compare its frames with equally decoded clean ones."""
+"""The perceptual term of the shared rollout: decode one position causally and compare its frames with decoded clean latents."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Distance = Callable[[Tensor, Tensor], Tensor]  # frames (F, 3, H, W) in [-1, 1],
 class DecodedDistance:
     """Decode position w of the predictions and of the clean latents, and average a distance over its frames.
 
-    The decoder's memory of what came before w is made without gradients: truncation distance 1 (paper, App. A.3).
+    The decoder state before w has no gradients: truncation distance 1 (paper, App. A.3).
 
     Args:
         decoder: Frozen.
         distance: Frozen, differentiable in its first argument.
         z_0: ``(B, C, N, H, W)`` clean latents.
-        render: ``(B, 3, 1 + 4 (N - 1), 8H, 8W)`` render's frames for a decoder that sees them, or None.
+        render: ``(B, 3, 1 + 4 (N - 1), 8H, 8W)`` render for a conditioned decoder, or None.
         opacity: ``(B, 1, ...)`` their opacity, or None.
     """
 
@@ -36,11 +36,11 @@ class DecodedDistance:
     opacity: Tensor | None = None
 
     def __call__(self, predicted: Tensor, w: int) -> Tensor:
-        """Return the mean distance of position ``w``'s frames; ``predicted`` reaches at least to w."""
+        """Return the mean distance of position ``w``'s frames; ``predicted`` includes position w."""
         with torch.no_grad():
             wanted = self._decode(self.z_0, w)
         made = self._decode(predicted, w)
-        return self.distance(frames_of(made), frames_of(wanted)).mean()
+        return self.distance(flatten_frames(made), flatten_frames(wanted)).mean()
 
     def _decode(self, z: Tensor, w: int) -> Tensor:
         state, end = None, 0
@@ -55,6 +55,6 @@ class DecodedDistance:
         return self.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
 
 
-def frames_of(video: Tensor) -> Tensor:
-    """Line up the frames of clips: ``(B, C, T, H, W)`` to ``(B T, C, H, W)``."""
+def flatten_frames(video: Tensor) -> Tensor:
+    """Flatten clips to frames: ``(B, C, T, H, W)`` to ``(B T, C, H, W)``."""
     return video.transpose(1, 2).flatten(0, 1)

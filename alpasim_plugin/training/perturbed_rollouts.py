@@ -1,6 +1,6 @@
-"""Practice drives for the learned policy: where the car is, how it got there, and who is around, off the logged path and its timing.
+"""Perturbed rollouts for the learned policy: drives that leave the logged path and its timing, with other traffic.
 
-Every drive has a stream of its own (scene, seed, "training.policy.drive", number): what is done with one leaves the others as they were.
+Every rollout has its own random stream (scene, seed, "training.policy.drive", number), so rollouts are independent of each other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.geometry import se3, yaw_of
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.policy_expert import STEP_S, Habit, Line, acceleration, advance, leader_on
+from alpasim_plugin.training.policy_expert import STEP_S, DrivingStyle, ReferenceLine, acceleration, advance, leader_on
 from alpasim_plugin.types import F64, Actor, Scenario
 from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
@@ -22,46 +22,46 @@ from alpasim_plugin.world.lane_map import LaneIndex
 from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.state import bodies_from
 
-MOMENT_S = 0.5  # between two frames; the earlier one shows the motion of the others
-WANDER_M, WANDER_BESIDE_M = 1.8, 1.3  # beside another lane of the same direction the nearest lane must stay the same
-CAST_LEADER = 0.55  # share of drives in which somebody is put ahead
+FRAME_INTERVAL_S = 0.5  # between two frames; the earlier one shows the motion of other road users
+MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = 1.8, 1.3  # with a neighbouring lane the nearest lane must not change
+LEADER_SHARE = 0.55  # share of rollouts with a synthetic leader
 
 
 @dataclass(frozen=True)
-class Moment:
-    """One frame's worth of a practice drive."""
+class RolloutState:
+    """State of a perturbed rollout at one frame."""
 
-    t_us: int  # of the recording; decides where recorded actors are
+    t_us: int  # time of the recording, which gives the poses of recorded actors
     T_world_rig: F64  # (4, 4)
     speed_mps: float
-    s_m: float  # arc length of the line beside the car
+    s_m: float  # arc length of the car's projection on the line
     actors: dict[str, F64]  # as in `RenderRequest`
     bodies: Bodies
-    free: bool  # the car touches nobody, so the frame is one that a drive can show
+    collision_free: bool  # frames with a collision are not used
 
 
 @dataclass(frozen=True)
-class Practice:
-    """A drive: its line, what it should do, and its moments in order, `MOMENT_S` apart."""
+class PerturbedRollout:
+    """A rollout: its reference line, the expert's driving style, and its states in order, `FRAME_INTERVAL_S` apart."""
 
-    line: Line
-    habit: Habit
-    moments: tuple[Moment, ...]
+    line: ReferenceLine
+    style: DrivingStyle
+    states: tuple[RolloutState, ...]
 
 
-def practice_drives(scenario: Scenario, count: int, drive_s: float, seed: int) -> Iterator[Practice]:
-    """Yield drives of a scenario along its route, along the lanes beside it, and along the turns of its junctions, where it has any."""
+def perturbed_rollouts(scenario: Scenario, count: int, drive_s: float, seed: int) -> Iterator[PerturbedRollout]:
+    """Yield rollouts of a scenario along its route, its neighbouring lanes and the other turns of its junctions."""
     first = ego_state_from_log(scenario.ego_log, scenario.start_us, scenario.vehicle)
     cruise = max(first.speed_mps, 6.0)
-    others = [*turning_lines(scenario), *((path, None) for path in lines_beside(scenario))]
+    others = [*turning_lines(scenario), *((path, None) for path in neighbour_lines(scenario))]
     for k in range(count):
-        # Every third drive keeps to the route; the others take turns among the other ways there are.
+        # Every third rollout follows the route; the others alternate among the other lines.
         path, turn_s_m = others[(k - 1 - k // 3) % len(others)] if others and k % 3 else (smooth_path(scenario.route.xyz), None)
         yield _drive(scenario, path, turn_s_m, cruise, drive_s, stream(scenario.scene_id, seed, "training.policy.drive", k))
 
 
-def lines_beside(scenario: Scenario) -> list[Path]:
-    """Return the lanes beside the route's, left and right, where there is one along all of it."""
+def neighbour_lines(scenario: Scenario) -> list[Path]:
+    """Return the left and right neighbouring lanes that exist along the whole route."""
     lanes = scenario.lane_map.lanes
     out = []
     for side in ("left_neighbour", "right_neighbour"):
@@ -72,7 +72,7 @@ def lines_beside(scenario: Scenario) -> list[Path]:
 
 
 def turning_lines(scenario: Scenario) -> list[tuple[Path, float]]:
-    """Return the ways out of the route's junctions that the route does not take: the line, and where along it the turn begins."""
+    """Return the turns at the route's junctions that the route does not take: the line, and the arc length where the turn begins."""
     index, lanes = LaneIndex(scenario.lane_map), scenario.lane_map.lanes
     out = []
     for i, lane_id in enumerate(scenario.route.lane_ids[:-1]):
@@ -86,7 +86,7 @@ def turning_lines(scenario: Scenario) -> list[tuple[Path, float]]:
 
 
 def _joined(*lines: F64) -> Path:
-    """Return one smooth path along polylines, of which each begins where the one before ends."""
+    """Return one smooth path along consecutive polylines."""
     line = np.concatenate(lines)
     apart = np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 0.05])
     return smooth_path(line[apart])
@@ -94,39 +94,41 @@ def _joined(*lines: F64) -> Path:
 
 def _drive(
     scenario: Scenario, path: Path, turn_s_m: float | None, cruise_mps: float, drive_s: float, random: np.random.Generator
-) -> Practice:
-    habit = Habit(cruise_mps * random.uniform(0.85, 1.15))
-    # The car that is seen drives a little otherwise than the one that is taught, so that there is something to correct.
-    style = Habit(habit.wanted_mps * random.uniform(0.8, 1.2), random.uniform(0.7, 2.0), random.uniform(2.0, 4.5), random.uniform(2.0, 4.0))
-    line = Line.along(path, 1.3 * cruise_mps)
+) -> PerturbedRollout:
+    style = DrivingStyle(cruise_mps * random.uniform(0.85, 1.15))
+    # The rollout's driving style differs from the expert's, so that there are errors to correct.
+    driven_style = DrivingStyle(
+        style.desired_mps * random.uniform(0.8, 1.2), random.uniform(0.7, 2.0), random.uniform(2.0, 4.5), random.uniform(2.0, 4.0)
+    )
+    line = ReferenceLine.along(path, 1.3 * cruise_mps)
     log_s = path.project(scenario.ego_log.xyz[:, :2])[0] if turn_s_m is None else None
     t_us, s = _start(scenario, path, log_s, turn_s_m, random)
-    v = min(style.wanted_mps, float(np.interp(s, path.s, line.limit_mps))) * random.uniform(0.8, 1.1)
+    v = min(driven_style.desired_mps, float(np.interp(s, path.s, line.limit_mps))) * random.uniform(0.8, 1.1)
     if random.random() < 0.12:
         v = random.uniform(0.0, 3.0)
     front = scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
     half = scenario.vehicle.box.width_m / 2
-    leader = _CastLeader.draw(scenario, path, s + front, habit.wanted_mps, random)
-    offset = _wander(random, WANDER_BESIDE_M if turn_s_m is None and lines_beside(scenario) else WANDER_M)
-    moments = []
-    lag = random.uniform(0.0, 1.0)  # a late driver gets nearer than the taught one would
+    leader = _SyntheticLeader.draw(scenario, path, s + front, style.desired_mps, random)
+    offset = _lateral_offset(random, MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M)
+    states = []
+    lag = random.uniform(0.0, 1.0)  # a delayed driver gets closer to the leader than the expert
     accel = 0.0
     for step in range(round(drive_s / STEP_S)):
         t = t_us + round(step * STEP_S * 1e6)
         if t > scenario.end_us or s > path.length_m - 15.0:
             break
-        actors, bodies = others_at(scenario, t, leader)
+        actors, bodies = traffic_at(scenario, t, leader)
         ahead = leader_on(line, s, front, half, bodies)
-        if step % round(MOMENT_S / STEP_S) == 0:
-            moments.append(_moment(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
-        wanted = acceleration(line, s, v, ahead, style)
+        if step % round(FRAME_INTERVAL_S / STEP_S) == 0:
+            states.append(_state_at(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
+        wanted = acceleration(line, s, v, ahead, driven_style)
         accel += (wanted - accel) * (1.0 - 0.8 * lag)
         if ahead.gap_m < 1.5:
             accel = min(wanted, accel)
         s, v = advance(s, v, accel, STEP_S)
         if leader is not None:
             leader.advance(STEP_S)
-    return Practice(line, habit, tuple(moments))
+    return PerturbedRollout(line, style, tuple(states))
 
 
 def _start(scenario: Scenario, path: Path, log_s: F64 | None, turn_s_m: float | None, random: np.random.Generator) -> tuple[int, float]:
@@ -138,27 +140,27 @@ def _start(scenario: Scenario, path: Path, log_s: F64 | None, turn_s_m: float | 
     return t_us, max(s, 1.0)
 
 
-def _wander(random: np.random.Generator, largest_m: float) -> tuple[F64, F64, F64]:
-    """Return amplitudes, angular frequencies and phases of the sideways drift: a slow wave and a quicker one."""
+def _lateral_offset(random: np.random.Generator, largest_m: float) -> tuple[F64, F64, F64]:
+    """Return amplitudes, angular frequencies and phases of the lateral offset: a slow and a fast sine."""
     size = largest_m * np.sqrt(random.uniform(0.0, 1.0)) * np.array([0.65, 0.35])
     return size, 2 * np.pi / random.uniform([8.0, 4.0], [20.0, 8.0]), random.uniform(0, 2 * np.pi, 2)
 
 
-def _moment(
-    scenario: Scenario, path: Path, t_us: int, s: float, v: float, wander: tuple[F64, F64, F64], at_s: float,
+def _state_at(
+    scenario: Scenario, path: Path, t_us: int, s: float, v: float, offset_waves: tuple[F64, F64, F64], at_s: float,
     actors: dict[str, F64], bodies: Bodies,
-) -> Moment:  # fmt: skip
-    size, frequency, phase = wander
+) -> RolloutState:  # fmt: skip
+    size, frequency, phase = offset_waves
     offset = float(size @ np.sin(frequency * at_s + phase))
     drift = float((size * frequency) @ np.cos(frequency * at_s + phase))
     xyz, yaw = path.at(s, offset)
     heading = float(yaw) + float(np.arctan2(np.clip(drift, -0.17 * max(v, 1.0), 0.17 * max(v, 1.0)), max(v, 1.0)))
     pose = ground_pose(scenario.ground, float(xyz[0]), float(xyz[1]), heading)
-    return Moment(t_us, pose, v, s, actors, bodies, not _touches(scenario, pose, bodies))
+    return RolloutState(t_us, pose, v, s, actors, bodies, not _collides(scenario, pose, bodies))
 
 
-def _touches(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: float = 0.1) -> bool:
-    """Tell whether a body's outline or middle line reaches into the car's, or the other way round."""
+def _collides(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: float = 0.1) -> bool:
+    """Return whether the car's footprint overlaps an actor's (tested on a grid of points of each)."""
     if len(bodies.xy) == 0:
         return False
     centre = T_world_rig[:2, 3] + scenario.vehicle.rear_axle_to_centre_m * T_world_rig[:2, 0]
@@ -171,19 +173,19 @@ def _touches(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: flo
             (xy, yaw, np.array([length, width]), centre, yaw_of(T_world_rig), half),
             (centre, yaw_of(T_world_rig), half, xy, yaw, np.array([length, width])),
         ):
-            points = at + (grid * extent) @ _turn(angle).T
-            local = (points - other) @ _turn(other_angle)
+            points = at + (grid * extent) @ _rotation(angle).T
+            local = (points - other) @ _rotation(other_angle)
             if (np.abs(local) < other_extent).all(axis=1).any():
                 return True
     return False
 
 
-def _turn(angle: float) -> F64:
+def _rotation(angle: float) -> F64:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def others_at(scenario: Scenario, t_us: int, leader: _CastLeader | None) -> tuple[dict[str, F64], Bodies]:
-    """Return the poses of everybody at a recorded time, and the same as bodies with velocities."""
+def traffic_at(scenario: Scenario, t_us: int, leader: _SyntheticLeader | None) -> tuple[dict[str, F64], Bodies]:
+    """Return the poses of all actors at a recorded time, and the same as bodies with velocities."""
     actors = log_actors(scenario, t_us)
     before, after = (log_actors(scenario, t_us + dt_us) for dt_us in (-100_000, 100_000))
     if leader is not None:
@@ -196,7 +198,7 @@ def others_at(scenario: Scenario, t_us: int, leader: _CastLeader | None) -> tupl
     for i, name in enumerate(names):
         if leader is not None and name == leader.actor.actor_id:
             velocity[i] = leader.speed_mps * np.array([np.cos(yaw[i]), np.sin(yaw[i])])
-        else:  # who has only just appeared moves on as the log shows it next
+        else:  # an actor that has just appeared: use the forward difference
             earlier, later = (before, actors) if name in before else (actors, after)
             if name in later:
                 velocity[i] = (later[name][:2, 3] - earlier[name][:2, 3]) / 0.1
@@ -204,29 +206,29 @@ def others_at(scenario: Scenario, t_us: int, leader: _CastLeader | None) -> tupl
 
 
 @dataclass
-class _CastLeader:
-    """One of the scene's cars, put on the line ahead: it drives, stands, brakes at some time, or sets off."""
+class _SyntheticLeader:
+    """One of the scene's cars, placed on the line ahead: it drives, stands, brakes or sets off."""
 
     actor: Actor
     path: Path
     s_m: float
     speed_mps: float
     target_mps: float
-    change_s: float  # when it begins to change its speed
+    change_s: float  # time until it changes its speed
     rate_mps2: float
 
     @staticmethod
-    def draw(scenario: Scenario, path: Path, bumper_s_m: float, wanted_mps: float, random: np.random.Generator) -> _CastLeader | None:
+    def draw(scenario: Scenario, path: Path, bumper_s_m: float, desired_mps: float, random: np.random.Generator) -> _SyntheticLeader | None:
         vehicles = [a for a in scenario.actors if a.label in ("car", "truck", "bus", "motorcycle")]
-        if not vehicles or random.random() > CAST_LEADER:
+        if not vehicles or random.random() > LEADER_SHARE:
             return None
         named = [a for a in vehicles if a.actor_id == "ahead"]
         actor = named[0] if named else vehicles[int(random.integers(len(vehicles)))]
         stands = random.random() < 0.35
-        speed = 0.0 if stands else wanted_mps * random.uniform(0.3, 1.0)
-        target = wanted_mps if stands and random.random() < 0.3 else speed * random.choice([0.0, 0.0, 0.5, 1.0])
+        speed = 0.0 if stands else desired_mps * random.uniform(0.3, 1.0)
+        target = desired_mps if stands and random.random() < 0.3 else speed * random.choice([0.0, 0.0, 0.5, 1.0])
         gap = random.uniform(20.0, 55.0) if stands else random.uniform(6.0, 35.0)
-        return _CastLeader(
+        return _SyntheticLeader(
             actor, path, bumper_s_m + gap + actor.box.length_m / 2, speed, target, random.uniform(1.0, 6.0), random.uniform(1.0, 4.0)
         )
 

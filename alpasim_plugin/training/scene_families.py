@@ -1,7 +1,7 @@
-"""Draw scenarios of many families, so that what a network learns on some roads is tested on others.
+"""Sample scenarios from families of roads and traffic; test families differ from training families.
 
-A family is a kind of road with a kind of traffic. The families of training and validation differ from those of the test: there the road
-turns at junctions, loses or gains a lane, is one-way or winding, and buses, trucks, cyclists and pedestrians take the place of cars.
+Training and validation share their families. In test families the road turns at junctions, loses or gains a lane, is one-way or winding,
+and traffic consists of buses, trucks, cyclists and pedestrians instead of cars.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from alpasim_plugin.seeding import stream
 Spec = dict[str, Any]
 Rng = np.random.Generator
 
-MARGIN_M = 60.0  # road beyond what the ego drives
+MARGIN_M = 60.0  # road beyond the ego's path
 
 
 def draw_spec(family: str, scene_id: str, seed: int, duration_s: float) -> Spec:
@@ -24,9 +24,9 @@ def draw_spec(family: str, scene_id: str, seed: int, duration_s: float) -> Spec:
 
     Args:
         family: One of `TRAIN_FAMILIES` or `TEST_FAMILIES`.
-        scene_id: Name of the scene; enters the draw.
-        seed: Which draw.
-        duration_s: Length of the drive, seconds; the road is made long enough for it.
+        scene_id: Name of the scene; part of the random stream's key.
+        seed: Of the sample.
+        duration_s: Length of the drive, seconds, which determines the road length.
 
     Raises:
         KeyError: No such family.
@@ -71,7 +71,7 @@ def _bend(curvature_per_m: float, arc_m: float, ease_m: float) -> list[Spec]:
 
 
 def _to_length(segments: list[Spec], length_m: float) -> list[Spec]:
-    """Let the road go on straight until it is long enough."""
+    """Append a straight to reach the length."""
     return [*segments, _straight(length_m - sum(float(s.get("length_m", 40.0)) for s in segments))]
 
 

@@ -1,4 +1,4 @@
-"""Write the scenarios of the three splits: train, val and test, apart by seed, and test apart by family as well."""
+"""Write the scenarios of the splits train, val and test: disjoint by seed; test also by family."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Split = Literal["train", "val", "test"]
 SPLITS: dict[Split, tuple[str, ...]] = {"train": TRAIN_FAMILIES, "val": TRAIN_FAMILIES, "test": TEST_FAMILIES}
 DEFAULT_COUNTS: dict[Split, int] = {"train": 120, "val": 20, "test": 60}
 FIRST_SEED: dict[Split, int] = {"train": 1_000_000, "val": 2_000_000, "test": 3_000_000}
-DRAWS = 8  # a draw in which the expert cannot drive is replaced by the next
+DRAWS = 8  # samples per scene: one that the expert cannot drive is rejected
 
 
 def write_scenes(folder: Path, split: Split, count: int, duration_s: float) -> Iterator[Path]:
-    """Write ``count`` scenario files of a split, families in turn, and yield their paths; files that exist stay as they are.
+    """Write ``count`` scenario files of a split, families in rotation, and yield their paths; existing files are kept.
 
-    A scene is kept only if it loads: the expert must find a way through it.
+    Rejection sampling: a scene must load, which requires a feasible expert path.
 
     Raises:
-        InputError: None of the draws of a scene can be driven.
+        InputError: All samples of a scene are rejected.
     """
     families = SPLITS[split]
     (folder / split).mkdir(parents=True, exist_ok=True)
@@ -55,7 +55,7 @@ def _write_drivable(path: Path, family: str, scene_id: str, first_seed: int, dur
         write_text(path, text)
         return
     raise InputError(
-        "drawing a training scene", f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}",
-        f"no draw can be driven; the last: {last}",
+        "sampling a training scene", f"{scene_id}, seeds {first_seed} to {first_seed + DRAWS - 1}",
+        f"no sample can be driven; the last: {last}",
         f"change the family {family!r} in training/scene_families.py",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Classes of a semantic map's pixels, read back from its colours: labels for learning to see a road."""
+"""Class masks of a semantic map, recovered from its colours: labels for the semantic loss."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _LINES = {
     "crosswalk": "crosswalk", "stop_line": "stop line",
 }  # fmt: skip
 _BOXES = {"car": "vehicle", "truck": "vehicle", "pedestrian": "other road user", "cyclist": "other road user"}
-DARKEST = 24  # colours fade to black with distance; darker ones say too little about their hue
+DARKEST = 24  # colours fade to black with distance; the hue of darker ones is unreliable
 
 
 def class_masks(sdmap: U8, cell: int) -> F32:
-    """Return which classes are in each cell of a semantic map.
+    """Return the classes present in each cell of a semantic map.
 
     Args:
         sdmap: ``(H, W, 3)``; H and W are multiples of ``cell``.

@@ -5,8 +5,8 @@
     perceptual      d( D(z^w_0), D(clean^w) )                            at one sampled position w, through the last k predictions
 
 Names as in the paper: ``z_r`` render, ``z_0`` clean, ``z_1`` source, ``m`` mask, ``eps`` noise, ``sg`` stop-gradient. Latents are
-``(B, C, N, H, W)``, normalised. Every random number is an argument. What the history holds of a block are the keys and values of its
-clean latents, slightly noised (`sampling.finalise`), as at deployment; their gradient reaches the weights, not the latents.
+``(B, C, N, H, W)``, normalised. All random numbers are arguments. The history of a block holds the keys and values of its clean
+latents, slightly noised (`sampling.finalise`), as at deployment; their gradient reaches the weights, not the latents.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from alpasim_plugin.nets.sampling import finalise, flow_step, interpolant, mixed
 
 FlowHistory = Literal["own", "clean", "redenoised"]
 Perceptual = Callable[[Tensor, int], Tensor]  # predictions (B, C, N, H, W), position w -> scalar
-T_SOURCE = 1000.0  # what the network is told at t = 1
+T_SOURCE = 1000.0  # time input of the network at t = 1
 
 
 @dataclass(frozen=True)
 class Objectives:
-    """What is minimised, and on which history: the axes of the paper's ablation.
+    """Loss terms and the history they are computed on: the axes of the paper's ablation.
 
     Args:
         flow: History of flow matching: the model's ``own`` predictions, the ``clean`` latents (diffusion forcing), clean latents that
-            the model noised and denoised again (``redenoised``), or None for no flow matching.
-        horizon: k, how many latent positions ending at w the perceptual gradient passes through; 0 for no perceptual term.
+            the model noised and denoised again (``redenoised``), or None without flow matching.
+        horizon: k, number of latent positions ending at w that the perceptual gradient passes through; 0 without a perceptual term.
         weight: lambda, of the perceptual term.
-        use_map: Whether the network sees the semantic map.
-        mixed: Whether the source is Eq. 1; otherwise it is noise, and the render's latents are joined to the map's as further channels.
+        use_map: Whether the network is conditioned on the semantic map.
+        mixed: Whether the source is Eq. 1; otherwise it is noise, and the render's latents are concatenated to the map's channels.
     """
 
     flow: FlowHistory | None = "own"
@@ -57,7 +57,7 @@ class Objectives:
 
 @dataclass(frozen=True)
 class Sample:
-    """A batch of clips as latents, and all the noise that its training takes.
+    """A batch of clips as latents, with all noise of the training step.
 
     Args:
         z_r, z_0: Render and clean frames ``(B, C, N, H, W)``.
@@ -66,7 +66,7 @@ class Sample:
         eps: Noise of the source, like ``z_0``.
         eps_context: Noise of the cache write, like ``z_0``.
         t: ``(B, N)`` uniform in 0..1, flow matching's times.
-        t_again: ``(B, N)`` uniform in 0..1, the noise levels of re-denoised history.
+        t_redenoise: ``(B, N)`` uniform in 0..1, the noise levels of re-denoised history.
         w: Position of the perceptual term.
     """
 
@@ -77,27 +77,27 @@ class Sample:
     eps: Tensor
     eps_context: Tensor
     t: Tensor
-    t_again: Tensor
+    t_redenoise: Tensor
     w: int
 
 
 @dataclass(frozen=True)
 class Losses:
-    """Terms of one sample.
+    """Loss terms of one batch.
 
     Args:
-        total: What is minimised.
-        flow: Mean over everything; None if off.
-        perceptual: Without its weight; None if off.
-        rollout: ``(B, C, N, H, W)`` the model's own predictions, cut from gradients; None if no objective needed them.
-        seen: The predictions up to w as the perceptual term met them, block by block, before the horizon cuts them.
+        total: Weighted sum.
+        flow: Mean over all elements; None if off.
+        perceptual: Unweighted; None if off.
+        rollout: ``(B, C, N, H, W)`` the model's own predictions, detached; None if no objective needs them.
+        predictions: The predictions up to w of the perceptual term, block by block, before detaching at the horizon.
     """
 
     total: Tensor
     flow: Tensor | None
     perceptual: Tensor | None
     rollout: Tensor | None
-    seen: tuple[Tensor, ...] = ()
+    predictions: tuple[Tensor, ...] = ()
 
 
 def losses(
@@ -117,33 +117,33 @@ def losses(
         net: The generator.
         sample: Latents and noise.
         text: Prompt.
-        objectives: Which terms.
-        perceptual: Decodes the predictions causally and compares position w with the clean frames; needed if ``objectives.horizon``.
+        objectives: Loss terms.
+        perceptual: Decodes the predictions causally and compares position w with the clean frames; required with ``objectives.horizon``.
         block_latents, window: As at deployment, in latents.
-        channel_weights: ``(C,)`` of the flow-matching error, mean 1; None weighs all channels alike. Its minimum does not depend on them.
+        channel_weights: ``(C,)`` of the flow-matching error, mean 1; None for equal weights. The minimiser does not depend on them.
 
     Raises:
-        InputError: A perceptual term without its function, or w outside the clip.
+        InputError: A perceptual term without a function, or w outside the clip.
     """
     n = sample.z_0.shape[2]
     if objectives.horizon and perceptual is None:
-        raise InputError("training on a shared rollout", "the perceptual term", "no function that measures it", "give one, or horizon=0")
+        raise InputError("training on a shared rollout", "the perceptual term", "no distance function", "give one, or horizon=0")
     if not 0 <= sample.w < n:
         raise InputError("training on a shared rollout", f"w = {sample.w}", f"{n} latents", "sample w within the clip")
     rollout = _Rollout(net, sample, text, objectives, block_latents, window)
     history = rollout.history()
     flow = None if objectives.flow is None else rollout.flow_matching(history, channel_weights)
-    seen: tuple[Tensor, ...] = ()
+    predictions: tuple[Tensor, ...] = ()
     perc = None
     if objectives.horizon:
         assert perceptual is not None
-        seen = rollout.predictions_with_gradient()
-        perc = perceptual(torch.cat([rollout.cut(z, b) for z, b in zip(seen, rollout.blocks, strict=False)], dim=2), sample.w)
+        predictions = rollout.predictions_with_gradient()
+        perc = perceptual(torch.cat([rollout.cut(z, b) for z, b in zip(predictions, rollout.blocks, strict=False)], dim=2), sample.w)
     terms = [term for term in (flow, None if perc is None else objectives.weight * perc) if term is not None]
-    return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, seen)
+    return Losses(torch.stack(terms).sum(), flow, perc, rollout.predicted, predictions)
 
 
-def weighed(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
+def channel_weighted(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
     """Return squared errors ``(B, C, ...)`` times the weights ``(C,)`` of their channels."""
     return squares if channel_weights is None else squares * channel_weights.view(1, -1, *[1] * (squares.ndim - 2))
 
@@ -162,7 +162,7 @@ def roll_out(
     window: int | None = 12,
     use_map: bool = True,
 ) -> Tensor:
-    """Return the generator's own predictions of whole clips ``(B, C, N, H, W)``, as it makes them when deployed; see `Sample`."""
+    """Return the generator's own predictions of whole clips ``(B, C, N, H, W)``, as at deployment; see `Sample`."""
     t = torch.ones(z_r.shape[0], z_r.shape[2])
     sample = Sample(z_r, z_r, z_map, m, eps, eps_context, t, t, z_r.shape[2] - 1)
     rollout = _Rollout(net, sample, text, Objectives("own", 0, use_map=use_map), block_latents, window)
@@ -172,7 +172,7 @@ def roll_out(
 
 
 class _Rollout:
-    """One batch on its way through the generator; the methods are the equations, the attributes what they share."""
+    """Rollout of one batch through the generator; the methods are the equations."""
 
     def __init__(
         self, net: CosmosCausalDiT, s: Sample, text: Tensor | TextContext, objectives: Objectives, block_latents: int, window: int | None
@@ -189,7 +189,7 @@ class _Rollout:
         self._before: GraphCache | None = None  # the rollout's cache before the block that holds ``first``
 
     def history(self) -> Tensor | None:
-        """Return the history of flow matching ``(B, C, N, H, W)`` without gradients, and roll out where anything needs it."""
+        """Return the history of flow matching ``(B, C, N, H, W)`` without gradients, and compute the rollout if needed."""
         with torch.no_grad():
             if self.objectives.flow == "own" or self.objectives.horizon:
                 self.predicted = self._roll(self.generate, fork_at=self.first)
@@ -210,15 +210,15 @@ class _Rollout:
         z_t = interpolant(s.z_0, self.z_1, t)
         for b in self.blocks:
             v = self.net.step(z_t[:, :, b], T_SOURCE * s.t[:, b], self.text, self.condition[:, :, b], cache, write=False)
-            errors.append(weighed((v - (self.z_1 - s.z_0)[:, :, b]).square(), channel_weights).mean(dim=(0, 1, 3, 4)))
+            errors.append(channel_weighted((v - (self.z_1 - s.z_0)[:, :, b]).square(), channel_weights).mean(dim=(0, 1, 3, 4)))
             self._write(history[:, :, b], b, cache)
         return torch.cat(errors).mean()
 
     def predictions_with_gradient(self) -> tuple[Tensor, ...]:
         """Return the predictions of the blocks up to w's, with gradients from the block of the horizon's first position on.
 
-        The values are those of the rollout: the same network on the same sources and history. What lies before the horizon is cut before it
-        enters the history.
+        The values equal the rollout's: same network, sources and history. Predictions before the horizon are detached before they enter the
+        history.
         """
         assert self.predicted is not None
         assert self._before is not None
@@ -235,12 +235,12 @@ class _Rollout:
         return tuple(out)
 
     def cut(self, z: Tensor, b: slice) -> Tensor:
-        """Return a block's predictions with those before the horizon cut from their gradients."""
+        """Return a block's predictions with those before the horizon detached."""
         outside = min(max(self.first - b.start, 0), z.shape[2])
         return torch.cat([z[:, :, :outside].detach(), z[:, :, outside:]], dim=2)
 
     def _roll(self, make: Callable[[slice, GraphCache], Tensor], fork_at: int | None = None) -> Tensor:
-        """Make block after block, each with those before as its history; remember the cache before the block that holds ``fork_at``."""
+        """Predict the blocks in order, each with its predecessors as history; keep a fork of the cache before the block of ``fork_at``."""
         cache, parts = self._new_cache(), []
         for b in self.blocks:
             if fork_at is not None and b.start <= fork_at < b.stop:
@@ -250,8 +250,8 @@ class _Rollout:
         return torch.cat(parts, dim=2)
 
     def _denoise_again(self, b: slice, cache: GraphCache) -> Tensor:
-        """Noise the clean latents to a random level and let the model denoise them, given what it has so denoised before."""
-        t = self.s.t_again[:, b]
+        """Noise the clean latents to a random level and denoise them, given previously denoised blocks."""
+        t = self.s.t_redenoise[:, b]
         z_t = interpolant(self.s.z_0[:, :, b], self.z_1[:, :, b], t[:, None, :, None, None])
         v = self.net.step(z_t, T_SOURCE * t, self.text, self.condition[:, :, b], cache, write=False)
         return flow_step(z_t, v, t[:, None, :, None, None])

@@ -1,6 +1,6 @@
-"""One training loop for every network here: accumulate, clip, step, average, log, checkpoint, resume, and stop at the first bad number.
+"""The training loop: gradient accumulation, clipping, EMA of the weights, log, checkpoints, resume, stop at a non-finite loss.
 
-The batch of step i is a function of i alone, so a resumed run sees what an uninterrupted one would have seen and ends with equal weights.
+The batch of step i is a function of i only, so a resumed run has the same batches as an uninterrupted one and ends with equal weights.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from alpasim_plugin.atomic import atomic_file, write_safetensors, write_text
+from alpasim_plugin.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.errors import InfrastructureError, InputError
 
 Batch = TypeVar("Batch")
-Loss = tuple[Tensor, Mapping[str, float]]  # what is minimised, and numbers for the log
+Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
 
 STATE_FILE, LOG_FILE, BAD_FILE = "state.safetensors", "log.jsonl", "bad_batch.pt"
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Optimisation.
+    """Optimisation schedule.
 
     Args:
-        steps: Updates in all.
-        peak_lr: Learning rate after the warm-up; it falls along a cosine to a hundredth.
-        warmup: Updates until the peak.
-        accumulate: Batches an update.
+        steps: Total updates.
+        peak_lr: Learning rate after the warm-up, with cosine decay to a hundredth.
+        warmup: Updates of linear warm-up.
+        accumulate: Batches per update.
         clip: Largest gradient norm.
         weight_decay: Of AdamW, on matrices and kernels only.
-        ema: Decay of the averaged weights.
+        ema: Decay of the exponential moving average of the weights.
         save_every: Updates between checkpoints.
     """
 
@@ -60,15 +60,15 @@ class Schedule:
 
 
 class Trainer(Generic[Batch]):
-    """Train one module in one folder; starting again in the same folder continues.
+    """Train one module in one run folder; the same folder resumes.
 
     Args:
-        module: What is trained: its parameters that require a gradient.
+        module: Its parameters that require a gradient are trained.
         folder: Receives state.safetensors (weights, average, moments), log.jsonl.
-        schedule: Optimisation.
-        batch: Makes the batch number i: the same for the same i, whatever was drawn before.
-        loss: Maps a batch and its number to what is minimised and numbers for the log.
-        facts: What identifies the run; a folder begun with other facts is refused.
+        schedule: Optimisation schedule.
+        batch: Returns batch number i, a function of i only.
+        loss: Maps a batch and its number to the loss and values for the log.
+        facts: Identity of the run; a folder of another run is refused.
         autocast: Precision of the forward pass, or None.
 
     Raises:
@@ -103,7 +103,7 @@ class Trainer(Generic[Batch]):
         """Train to the schedule's end, or to update ``until``.
 
         Raises:
-            InfrastructureError: A loss or gradient is not finite; weights stay as after the last good update, the batch is saved.
+            InfrastructureError: A loss or gradient is not finite; the weights are those of the last good update, and the batch is saved.
         """
         last = min(until or self.schedule.steps, self.schedule.steps)
         while self.step < last:
@@ -115,7 +115,7 @@ class Trainer(Generic[Batch]):
                 self.save()
 
     def averaged(self) -> dict[str, Tensor]:
-        """Return the module's state dict with averaged parameters; what is not trained stays as it is."""
+        """Return the module's state dict with averaged (EMA) parameters."""
         return {**self.module.state_dict(), **self.average}
 
     def save(self) -> None:
@@ -150,11 +150,11 @@ class Trainer(Generic[Batch]):
             group["lr"] = lr
         self.optimiser.step()
         self.step += 1
-        self._follow()
+        self._update_average()
         return {**sums, "grad_norm": norm, "lr": lr, "s": time.perf_counter() - began}
 
-    def _follow(self) -> None:
-        """Move the average; early on it follows faster, so that it does not remember the start."""
+    def _update_average(self) -> None:
+        """Update the EMA; its decay is lower in early updates, so that the initial weights have little influence."""
         decay = min(self.schedule.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for name, p in self.parameters.items():
@@ -165,13 +165,17 @@ class Trainer(Generic[Batch]):
         with atomic_file(path) as partial:
             torch.save(batch, partial)
         self.save()
-        do = f"look at the batch in {path}; lower the learning rate or repair the data, then start again: training goes on from there"
+        do = f"inspect the batch in {path}; lower the learning rate or repair the data, then run again: training resumes"
         raise InfrastructureError("training", str(self.folder), found, do)
 
     def _write_log(self, numbers: Mapping[str, float]) -> None:
         row = {"step": self.step, **{k: float(f"{v:.6g}") for k, v in numbers.items()}}
-        with (self.folder / LOG_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        path = self.folder / LOG_FILE
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+        except OSError as error:
+            raise disk_error(path, error, "writing a training log") from error
 
     def _resume(self) -> None:
         path = self.folder / STATE_FILE
@@ -179,7 +183,7 @@ class Trainer(Generic[Batch]):
             meta = file.metadata()
         if meta["facts"] != self._facts:
             raise InputError(
-                "continuing a training run", str(path), f"it was begun as {meta['facts']}, this is {self._facts}", "choose another folder"
+                "continuing a training run", str(path), f"the folder has {meta['facts']}, this run {self._facts}", "choose another folder"
             )
         tensors = load_file(str(path))
         self.step = int(meta["step"])
@@ -192,7 +196,7 @@ class Trainer(Generic[Batch]):
         self._cut_log()
 
     def _cut_log(self) -> None:
-        """Drop log rows of updates that were made after the checkpoint: they will be made again."""
+        """Drop log rows of updates after the checkpoint, which are repeated."""
         path = self.folder / LOG_FILE
         if path.exists():
             rows = [line for line in path.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= self.step]

@@ -1,7 +1,7 @@
 """Train the tiny autoencoder on pairs and on driving video.
 
-It has to carry three kinds of pictures: clean frames, which it must also paint with the help of the damaged render; and damaged renders and
-semantic maps, which it only encodes for the generator. Latents get a little noise while it learns: a generator's are never exact.
+Three kinds of images are trained: clean frames, decoded with and without the degraded render as a condition; and degraded renders and
+semantic maps, which are inputs of the generator. Noise is added to the latents, since those of a generator have errors.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import LATENT
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.clips import Clip, ClipSize, draw_pair_clip, draw_video_clip
+from alpasim_plugin.training.clips import Clip, CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.training.trainer import Loss
 from alpasim_plugin.types import U8
@@ -26,7 +26,7 @@ from alpasim_plugin.types import U8
 
 @dataclass(frozen=True)
 class VaeRecipe:
-    """What a batch holds and what counts.
+    """Batch and loss weights.
 
     Args:
         pair_clips: Clips from pairs in a batch.
@@ -34,16 +34,16 @@ class VaeRecipe:
         size: Frames (1 + 4k) and crop.
         latent_noise: Standard deviation of the noise on latents, which have unit variance.
         edge_weight: Weight of the difference of neighbouring pixels and frames: sharpness and flicker.
-        side_weight: Weight of damaged renders and semantic maps.
-        seed: Of draws and noise.
+        auxiliary_weight: Weight of degraded renders and semantic maps.
+        seed: Of sampling and noise.
     """
 
     pair_clips: int = 2
     video_clips: int = 1
-    size: ClipSize = ClipSize(9, 96, 160)
+    size: CropSize = CropSize(9, 96, 160)
     latent_noise: float = 0.05
     edge_weight: float = 0.3
-    side_weight: float = 0.3
+    auxiliary_weight: float = 0.3
     seed: int = 0
 
 
@@ -53,7 +53,7 @@ class VaeBatch:
 
     pairs: Clip | None
     video: Tensor | None
-    side: Tensor | None  # one damaged render or one semantic map
+    auxiliary: Tensor | None  # one degraded render or one semantic map
 
 
 class VaeTask:
@@ -73,16 +73,16 @@ class VaeTask:
         """Make batch ``index``."""
         r = self.recipe
         pairs = None
-        side = None
+        auxiliary = None
         if r.pair_clips:
             clips = [draw_pair_clip(self.sequences, r.size, r.seed, index * r.pair_clips + i) for i in range(r.pair_clips)]
             pairs = Clip(*(torch.stack([getattr(c, name) for c in clips]) for name in ("target", "render", "opacity", "sdmap")))
-            side = (pairs.render if index % 2 else pairs.sdmap)[:1]  # type: ignore[index]
+            auxiliary = (pairs.render if index % 2 else pairs.sdmap)[:1]  # type: ignore[index]
         video = None
         if r.video_clips and self.videos:
             clips = [draw_video_clip(self.videos, r.size, r.seed, index * r.video_clips + i) for i in range(r.video_clips)]
             video = torch.stack([c.target for c in clips])
-        return VaeBatch(pairs, video, side)
+        return VaeBatch(pairs, video, auxiliary)
 
     def loss(self, batch: VaeBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
@@ -90,16 +90,17 @@ class VaeTask:
         parts: dict[str, Tensor] = {}
         if batch.pairs is not None:
             z, noisy = self._latents(batch.pairs.target, index, 0)
-            parts["latent"] = picture_error(self.vae.decode(noisy, clamp=False), batch.pairs.target, r.edge_weight)
-            painted = self.vae.decode(noisy, render=batch.pairs.render, opacity=batch.pairs.opacity, clamp=False)
-            parts["render"] = picture_error(painted, batch.pairs.target, r.edge_weight)
+            parts["latent"] = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.pairs.target, r.edge_weight)
+            conditioned = self.vae.decode(noisy, render=batch.pairs.render, opacity=batch.pairs.opacity, clamp=False)
+            parts["render"] = reconstruction_loss(conditioned, batch.pairs.target, r.edge_weight)
             parts["spread"] = 1e-3 * (z.var(dim=(0, 2, 3, 4)).clamp_min(1e-6).log() ** 2).mean()
         if batch.video is not None:
             _, noisy = self._latents(batch.video, index, 1)
-            parts["video"] = picture_error(self.vae.decode(noisy, clamp=False), batch.video, r.edge_weight)
-        if batch.side is not None:
-            _, noisy = self._latents(batch.side, index, 2)
-            parts["side"] = r.side_weight * picture_error(self.vae.decode(noisy, clamp=False), batch.side, r.edge_weight)
+            parts["video"] = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.video, r.edge_weight)
+        if batch.auxiliary is not None:
+            _, noisy = self._latents(batch.auxiliary, index, 2)
+            error = reconstruction_loss(self.vae.decode(noisy, clamp=False), batch.auxiliary, r.edge_weight)
+            parts["auxiliary"] = r.auxiliary_weight * error
         total = torch.stack(list(parts.values())).sum()
         return total, {name: float(value.detach()) for name, value in parts.items()}
 
@@ -109,8 +110,8 @@ class VaeTask:
         return z, z + self.recipe.latent_noise * torch.from_numpy(noise).to(z)
 
 
-def picture_error(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:
-    """Return a smooth absolute error of values and, weighted, of their differences along rows, columns and frames."""
+def reconstruction_loss(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:
+    """Return a Charbonnier loss of values plus a weighted smooth L1 loss of differences along rows, columns and frames."""
     d = made - wanted
     value = torch.sqrt(d * d + 1e-4).mean()
     edges = [F.smooth_l1_loss(x, torch.zeros_like(x), beta=0.02) for x in (d.diff(dim=-1), d.diff(dim=-2), d.diff(dim=-3))]
@@ -118,7 +119,7 @@ def picture_error(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:
 
 
 def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation ``(16,)`` of the latents of clips ``(1, 3, T, H, W)``, one channel each."""
+    """Return mean and standard deviation ``(16,)`` of the latent channels over clips ``(1, 3, T, H, W)``."""
     with torch.inference_mode():
         z = torch.cat([vae.encode(c).flatten(2)[0] for c in clips], dim=1).double()
     return z.mean(1).float(), z.std(1).float()
@@ -126,10 +127,10 @@ def measure_stats(vae: TinyVAE, clips: Sequence[Tensor]) -> tuple[Tensor, Tensor
 
 @torch.no_grad()
 def channel_amplitudes(vae: TinyVAE, sigma: float = 0.3) -> Tensor:
-    """Return how strongly an error of each latent channel shows in pixels: its root mean square there, scaled to mean 1, ``(16,)``.
+    """Return the root-mean-square pixel error that an error of each latent channel causes, scaled to mean 1, ``(16,)``.
 
-    Channels are normalised to unit variance, but a unit of the one that carries brightness moves pixels 4 to 39 times as much as a
-    unit of the others (shipped weights). A loss that weighs all alike spends the network on what cannot be seen.
+    Channels have unit variance, but a unit of the brightness channel changes pixels 4 to 39 times as much as a unit of the others
+    (shipped weights). Equal channel weights spend capacity on invisible errors.
     """
     noise = torch.from_numpy(stream("training", 0, "vae.channel_amplitudes").standard_normal((1, LATENT, 3, 8, 8), dtype="float32"))
     z = torch.zeros_like(noise)

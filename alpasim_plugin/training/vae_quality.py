@@ -1,4 +1,4 @@
-"""Measure an autoencoder: how near its pictures come, and how much they flicker beside the original's own motion."""
+"""Reconstruction quality of an autoencoder: PSNR, and temporal flicker relative to the motion of the original."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class VaeQuality:
     """Mean over a clip's frames.
 
     Args:
-        psnr_db: Peak signal-to-noise ratio of 8-bit pictures, from the mean squared error of each frame, dB.
-        flicker: Root mean square of the change of the error from frame to frame, grey levels of 255; zero where the error stands still.
-        copy_flicker: The same of the original's own change from frame to frame: what motion alone gives.
+        psnr_db: Peak signal-to-noise ratio of 8-bit images, per frame, dB.
+        flicker: Root mean square of the temporal difference of the error, grey levels of 255; zero for a static error.
+        copy_flicker: Root mean square of the temporal difference of the original: the effect of motion alone.
     """
 
     psnr_db: float
@@ -29,11 +29,11 @@ class VaeQuality:
 
 
 def round_trip(vae: TinyVAE, video: Tensor, render: Tensor | None = None, opacity: Tensor | None = None) -> Tensor:
-    """Encode and decode a clip ``(1, 3, T, H, W)`` of any size; with a render, the decoder sees it."""
+    """Encode and decode a clip ``(1, 3, T, H, W)`` of any size; a render conditions the decoder."""
     with torch.inference_mode():
         padded, size = pad_clip(video)
-        seen = [None if x is None else pad_clip(x)[0] for x in (render, opacity)]
-        return crop_clip(vae.decode(vae.encode(padded), render=seen[0], opacity=seen[1]), size)
+        condition = [None if x is None else pad_clip(x)[0] for x in (render, opacity)]
+        return crop_clip(vae.decode(vae.encode(padded), render=condition[0], opacity=condition[1]), size)
 
 
 def quality(made: Tensor, wanted: Tensor) -> VaeQuality:

@@ -1,7 +1,7 @@
-"""What a generator may be trained as: the variants of the paper's ablation, its starting point, and a fixer without a past.
+"""Training variants of the generator: the paper's ablation, their common initialisation, and a fixer without history.
 
-The paper starts all of them from one causal video model that was trained for other work. Here ``base`` is that starting point: diffusion
-forcing on the same clips, with histories of every noise level. ``image`` sees one frame at a time.
+The paper initialises all variants from one pretrained causal video model. Here ``base`` is that initialisation: diffusion forcing on the
+same clips, with histories of every noise level. ``image`` takes one frame at a time.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class Variant:
 
     Args:
         name: As in the paper.
-        stages: Objectives, one after the other, each for an equal share of the updates.
-        history: Whether the network sees latents before its block.
-        about: A few words for tables.
+        stages: Objectives in sequence, each for an equal share of the updates.
+        history: Whether the network attends to latents before its block.
+        about: Short description for tables.
     """
 
     name: str
@@ -33,10 +33,10 @@ class Variant:
     history: bool = True
 
     def objectives(self, step: int, steps: int) -> Objectives:
-        """Return what update ``step`` of ``steps`` minimises."""
+        """Return the objectives of update ``step`` of ``steps``."""
         return self.stages[min(step * len(self.stages) // steps, len(self.stages) - 1)]
 
-    def weighing(self, perceptual: float) -> Variant:
+    def with_perceptual_weight(self, perceptual: float) -> Variant:
         """Return the variant with another weight lambda of its perceptual term.
 
         Raises:
@@ -46,25 +46,25 @@ class Variant:
 
     @property
     def use_map(self) -> bool:
-        """Whether the network sees the semantic map."""
+        """Whether the network is conditioned on the semantic map."""
         return self.stages[0].use_map
 
     @property
     def mixed(self) -> bool:
-        """Whether a block starts from Eq. 1; otherwise from noise, with the render among the conditions."""
+        """Whether a block starts from Eq. 1; otherwise from noise, with the render as a condition."""
         return self.stages[0].mixed
 
 
 _ALL = (
-    Variant(BASE, (Objectives("clean", 0),), "diffusion forcing on noisy histories: where all others start"),
+    Variant(BASE, (Objectives("clean", 0),), "diffusion forcing on noisy histories: initialisation of the others"),
     Variant(IMAGE, (Objectives("clean", 1),), "one frame at a time, no history", history=False),
     Variant("V1", (Objectives("clean", 0),), "diffusion forcing: clean history"),
     Variant("V2", (Objectives("own", 0),), "flow matching on own history"),
-    Variant("V3", (Objectives(None, 4),), "perceptual alone"),
+    Variant("V3", (Objectives(None, 4),), "perceptual loss only"),
     Variant("V4", (Objectives("own", 1),), "k = 1"),
     Variant("V5", (Objectives("own", 4, use_map=False),), "no map"),
     Variant("V6", (Objectives("own", 4, mixed=False),), "from noise, render as a condition"),
-    Variant("V7", (Objectives("own", 0), Objectives(None, 4)), "one after the other"),
+    Variant("V7", (Objectives("own", 0), Objectives(None, 4)), "two stages in sequence"),
     Variant("V8", (Objectives("redenoised", 4),), "history noised and denoised again"),
     Variant("V9", (Objectives("own", 4),), "OneFixer"),
 )

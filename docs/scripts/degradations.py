@@ -18,7 +18,7 @@ from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.image_metrics import psnr_db, ssim
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.training.pair_sheet import HOLE_BELOW
-from alpasim_plugin.training.pairs import beside_log
+from alpasim_plugin.training.pairs import offset_from_log
 from alpasim_plugin.types import F64, U8, Degradation, Frame, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
 
@@ -47,7 +47,7 @@ class Row:
 def frame(renderer: Renderer, scenario: Scenario, t_us: int, left_m: float) -> Frame:
     """Render what the first camera sees from a place beside the log."""
     camera = scenario.cameras[0]
-    T = beside_log(scenario, t_us, left_m) @ camera.T_rig_camera
+    T = offset_from_log(scenario, t_us, left_m) @ camera.T_rig_camera
     return renderer.render(RenderRequest(t_us, camera, np.stack([T, T]), log_actors(scenario, t_us)))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from alpasim_plugin.types import F64, U8
 from evaluators.video.facts import DRIFT, PSNR, SSIM, WARP, WARP_LATE
 from evaluators.video.frames import identical_frames, psnr_db, ssim
-from evaluators.video.perceptual import PictureDistance, picture_distances
+from evaluators.video.perceptual import ImageDistance, picture_distances
 from evaluators.video.warp import late_window, warp_l1
 
 SETTLED = slice(50, 100)  # frames that the end of a long clip is held against
@@ -33,7 +33,7 @@ class ClipQuality:
         return out if drift is None else {**out, DRIFT: drift}
 
 
-def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, PictureDistance]) -> ClipQuality:
+def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, ImageDistance]) -> ClipQuality:
     """Measure one clip.
 
     Args:

@@ -1,6 +1,6 @@
 """Perceptual distance of frames by a network that is handed in: `perceptual-syn`, or LPIPS where its weights are on disk.
 
-Networks come from `alpasim_plugin.nets.picture_distance.load_distance`; torch is loaded only when one is used.
+Networks come from `alpasim_plugin.nets.image_distance.load_distance`; torch is loaded only when one is used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 BATCH = 8  # frames at a time
 
 
-class PictureDistance(Protocol):
+class ImageDistance(Protocol):
     """A frozen network that measures the perceptual distance of images."""
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
@@ -26,7 +26,7 @@ class PictureDistance(Protocol):
         ...
 
 
-def picture_distances(net: PictureDistance, made: U8, truth: U8) -> F64:
+def picture_distances(net: ImageDistance, made: U8, truth: U8) -> F64:
     """Return a network's distance of every frame to the true one.
 
     Args:

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.train import app
 from alpasim_plugin.cli.training_options import scene_files, whole_numbers
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import load_tiny_vae, save_bundle
@@ -48,7 +50,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def told(capsys: pytest.CaptureFixture[str], *command: str | Path) -> tuple[dict[str, Any], str]:
+def run_train(capsys: pytest.CaptureFixture[str], *command: str | Path) -> tuple[dict[str, Any], str]:
     """Run ``simrun train`` and return its document and what it said beside it."""
     assert run_command(["train", *map(str, command), "--json"]) == 0
     out, err = capsys.readouterr()
@@ -56,7 +58,7 @@ def told(capsys: pytest.CaptureFixture[str], *command: str | Path) -> tuple[dict
 
 
 def test_scenes_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document, err = told(capsys, "scenes", "--out", tmp_path, "--split", "val", "--count", 1, "--duration-s", 2)
+    document, err = run_train(capsys, "scenes", "--out", tmp_path, "--split", "val", "--count", 1, "--duration-s", 2)
     assert document == {"split": "val", "scenes": 1, "paths": [str(path) for path in (tmp_path / "val").glob("*.yaml")]}
     assert document["paths"][0] in err
 
@@ -65,7 +67,7 @@ def test_pairs_made_and_kept_are_counted(tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / "scenes" / "val").mkdir(parents=True)
     (tmp_path / "scenes" / "val" / "mine.yaml").write_text(BARE)
     command = ("pairs", tmp_path / "scenes", "--out", tmp_path / "pairs", "--split", "val", "--source", "clean", "--degradation", "as-set")
-    first, again = (told(capsys, *command)[0] for _ in range(2))
+    first, again = (run_train(capsys, *command)[0] for _ in range(2))
     assert (first["sequences"], first["made"], again["made"]) == (1, 1, 0)
     assert Path(first["rows"][0]["folder"], "sequence.json").is_file()
 
@@ -77,12 +79,12 @@ def test_imported_pairs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     for name, array in channels.items():
         np.save(tmp_path / f"{name}.npy", array)
         options += [f"--{name}", tmp_path / f"{name}.npy"]
-    document, _ = told(capsys, "import-pairs", tmp_path / "pairs", "--name", "drive", *options)
+    document, _ = run_train(capsys, "import-pairs", tmp_path / "pairs", "--name", "drive", *options)
     assert document == {"folder": str(tmp_path / "pairs" / "train" / "drive"), "split": "train", "frames": 4}
 
 
 def test_weights_come_with_digest_updates_and_time(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document, err = told(capsys, "vae", data, "--out", tmp_path, "--steps", 1)
+    document, err = run_train(capsys, "vae", data, "--out", tmp_path, "--steps", 1)
     weights = tmp_path / "vae.safetensors"
     assert document["weights"] == str(weights)
     assert document["sha256"] == hashlib.sha256(weights.read_bytes()).hexdigest()
@@ -93,10 +95,10 @@ def test_weights_come_with_digest_updates_and_time(data: Path, tmp_path: Path, c
     assert f"wrote {weights}" in err.replace("\n", "")
 
 
-def lessons(folder: Path) -> None:
-    """Write two lessons of a grey road."""
+def demonstrations(folder: Path) -> None:
+    """Write two demonstrations on a grey road."""
     folder.mkdir(parents=True)
-    numbers = ("turn", "turn_before", "speed", "wanted", "gap", "leader")
+    numbers = ("yaw", "yaw_before", "speed", "desired_speed", "gap", "leader")
     arrays = {
         "frames": np.full((2, 114, 352, 3), 128, dtype=np.uint8), "points": np.ones((2, 9, 2), dtype=np.float32),
         "headings": np.zeros((2, 9), dtype=np.float32), "speeds": np.zeros((2, 8), dtype=np.float32),
@@ -106,30 +108,30 @@ def lessons(folder: Path) -> None:
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)
     lens = {"K": [[176.0, 0, 176], [0, 176.0, 57], [0, 0, 1]], "T_rig_camera": np.eye(4).tolist()}
-    (folder / "lessons.json").write_text(json.dumps({**lens, "lessons": 2, "recipe": {"renderer": "clean"}}))
+    (folder / "demonstrations.json").write_text(json.dumps({**lens, "samples": 2, "recipe": {"renderer": "clean"}}))
 
 
 def test_a_policys_card_says_what_made_it_and_how_well_it_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for split, name in (("train", "street_000"), ("train", "street_003"), ("train", "bend_001"), ("val", "street_000")):
-        lessons(tmp_path / "lessons" / split / name)
-    monkeypatch.setattr(sys, "argv", ["simrun", "train", "policy", "lessons", "--threads", "1"])
-    document, _ = told(capsys, "policy", tmp_path / "lessons", "--out", tmp_path / "run", "--steps", 1)
+        demonstrations(tmp_path / "demonstrations" / split / name)
+    monkeypatch.setattr(sys, "argv", ["simrun", "train", "policy", "demonstrations", "--threads", "1"])
+    document, _ = run_train(capsys, "policy", tmp_path / "demonstrations", "--out", tmp_path / "run", "--steps", 1)
     card = json.loads(Path(document["card"]).read_text())
     load_net(Path(document["weights"]))
     assert Path(document["card"]).name == "learned.json"
-    assert card["command"] == "simrun train policy lessons --threads 1"
+    assert card["command"] == "simrun train policy demonstrations --threads 1"
     assert card["machine"]["cores"] == os.cpu_count()
     assert card["sha256"] == document["sha256"]
-    assert card["data"] == {"frames": 6, "lessons": 6, "scenes": {"bend": 1, "street": 2}, "renderer": "clean"}
-    assert card["held_out"]["lessons"] == 2
+    assert card["data"] == {"frames": 6, "samples": 6, "scenes": {"bend": 1, "street": 2}, "renderer": "clean"}
+    assert card["held_out"]["samples"] == 2
     assert card["curves"][-1]["step"] == card["steps"] == 1
 
 
 def test_a_bundle_is_measured_as_its_autoencoder_is(data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     TinyVAE.random(seed=3).save(tmp_path / "vae.safetensors")
-    (whole, err), (alone, _) = (told(capsys, "vae-quality", path, data) for path in (bundle, tmp_path / "vae.safetensors"))
+    (whole, err), (alone, _) = (run_train(capsys, "vae-quality", path, data) for path in (bundle, tmp_path / "vae.safetensors"))
     assert whole["rows"] == alone["rows"]
     assert [row["from"] for row in whole["rows"]] == ["latent", "latent and render", "render alone"]
     assert "[1/1] a: " in err
@@ -167,3 +169,13 @@ def test_what_is_no_list_of_whole_numbers_is_refused(text: str) -> None:
     assert whole_numbers("--horizon", "0, 4", 0) == [0, 4]
     with pytest.raises(InputError, match="--horizon"):
         whole_numbers("--horizon", text, 0)
+
+
+def test_former_names_of_a_verb_and_an_option_are_accepted_and_hidden() -> None:
+    run = CliRunner()
+    assert "painter" not in run.invoke(app, ["--help"]).output
+    assert "Fine-tune the decoder" in run.invoke(app, ["painter", "--help"]).output
+    assert "recolour" not in run.invoke(app, ["fixer", "--help"]).output
+    refused = run.invoke(app, ["fixer", "absent", "--vae", "absent", "--out", "absent", "--no-recolour", "--variant", "V0"])
+    assert isinstance(refused.exception, InputError)
+    assert "no such variant" in str(refused.exception)

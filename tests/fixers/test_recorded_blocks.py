@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from alpasim_plugin.fixers.pipeline import BlockPipeline
-from alpasim_plugin.nets.graphs import CudaRecorder, EagerRecorder, GraphedFunction
+from alpasim_plugin.nets.graphs import CudaRecorder, GraphedFunction
 from tests.fixers.fixer_cases import busy_settings, fixer, maps_of, moving_picture, run_blocks
+from tests.nets.eager_recorder import EagerRecorder
 
 CASES = [(), ("history=finalise",), ("steps=[1000,500]", "window=4", "sink=1"), ("window=1",), ("decoder.kind=latent", "uses_map=false")]
 

@@ -176,4 +176,4 @@ def test_reopened_block_sends_nothing_to_the_device_and_a_moved_rotation_is_a_ne
     assert not made
     cache._token_rows = kept
     cache.commit()
-    assert (cache.in_sight, cache.begin(2) is table, cache.in_sight) == ((2, 0, True), True, (4, 0, True))
+    assert (cache.visible, cache.begin(2) is table, cache.visible) == ((2, 0, True), True, (4, 0, True))

@@ -182,13 +182,13 @@ def test_truncated_safetensors_is_refused(tmp_path, keep):
     path = tmp_path / "net.safetensors"
     write_safetensors(path, random_weights(SMALL))
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match=r"not a whole safetensors file of \d+ bytes[\s\S]*truncated or of another format"):
+    with pytest.raises(InputError, match=r"not a complete safetensors file of \d+ bytes[\s\S]*truncated or of another format"):
         load_weights(path)
 
 
 def test_text_file_and_missing_file_are_refused(tmp_path):
     (tmp_path / "a.safetensors").write_text("version https://git-lfs.github.com/spec/v1\n")
-    with pytest.raises(InputError, match="not a whole safetensors file"):
+    with pytest.raises(InputError, match="not a complete safetensors file"):
         load_weights(tmp_path / "a.safetensors")
     with pytest.raises(InputError, match="no such file"):
         load_weights(tmp_path / "b.safetensors")

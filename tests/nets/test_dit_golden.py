@@ -12,6 +12,7 @@ from alpasim_plugin.nets.layers import patchify
 from alpasim_plugin.nets.rope import rotate
 from alpasim_plugin.nets.sampling import sample_block
 from alpasim_plugin.nets.schedule import context_level, from_names
+from tests.nets.cache_history import history
 from tests.nets.dit_cases import furthest, stream
 
 EPSILON = torch.finfo(torch.float32).eps
@@ -79,7 +80,7 @@ def test_blocks_through_a_cache_that_covers_the_clip(net, io):
     assert furthest(net(**clip, condition_mask=mask), io["out.cached_full.wholeclip.out"]) < TOLERANCE
     cache = net.new_cache(1, 8, 12, window=6)
     assert furthest(stream(net, cache, **clip, blocks=(2, 2, 2), mask=mask), io["out.cached_full.blocks.out"]) < TOLERANCE
-    keys, values = cache.history(0)
+    keys, values = history(cache, 0)
     assert furthest(keys, io["out.cached_full.block0.k_cache"]) < TOLERANCE
     assert furthest(values, io["out.cached_full.block0.v_cache"]) < TOLERANCE
 
@@ -99,7 +100,7 @@ def test_two_forwards_a_block_through_a_rolling_window(net, io, window, sink, ke
     assert furthest(torch.cat(noisy, 2), io[f"{name}.out_noisy"]) < TOLERANCE
     assert furthest(torch.cat(context, 2), io[f"{name}.out_context"]) < TOLERANCE
     if sink:
-        assert furthest(cache.history(0)[0], io[f"{name}.final_block0_k_cache"]) < TOLERANCE
+        assert furthest(history(cache, 0)[0], io[f"{name}.final_block0_k_cache"]) < TOLERANCE
 
 
 def test_every_intermediate_tensor_of_the_first_block(net, io):

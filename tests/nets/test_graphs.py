@@ -7,12 +7,14 @@ import torch
 
 from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
-from alpasim_plugin.nets.graphs import CudaRecorder, EagerRecorder, GraphedFunction
+from alpasim_plugin.nets.graphs import CudaRecorder, GraphedFunction
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
 from alpasim_plugin.nets.sampling import finalise, mixed_source, sample_block
 from alpasim_plugin.nets.schedule import steps
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from tests.nets.cache_history import history
 from tests.nets.dit_reference import random_weights
+from tests.nets.eager_recorder import EagerRecorder
 
 SIZES = DiTSizes(width=32, blocks=2, head_width=16, mlp_width=48, adaln_rank=4, text_width=6, context_width=8)
 
@@ -48,7 +50,7 @@ class Drive:
         noise = [torch.randn(1, 16, 2, 4, 6, generator=g) for _ in range(2)]
         args = [views.to(self.device), m.to(self.device), [eps.to(self.device) for eps in noise], *self.states]
         self.cache.begin(2)
-        out, *self.states = self.function(*args, key=self.cache.in_sight) if self.graphed else self.function(*args)
+        out, *self.states = self.function(*args, key=self.cache.visible) if self.graphed else self.function(*args)
         self.cache.commit()
         return out
 
@@ -71,7 +73,7 @@ def test_replayed_blocks_are_eager_blocks_bit_for_bit(precision):
     assert sum(recorded.function.counts.values()) == 9
     assert all(place == places[1] for place in places[1:]), "the cache moved"
     for layer in range(SIZES.blocks):
-        for ours, theirs in zip(recorded.cache.history(layer), eager.cache.history(layer), strict=True):
+        for ours, theirs in zip(history(recorded.cache, layer), history(eager.cache, layer), strict=True):
             assert torch.equal(ours, theirs)
 
 
@@ -124,7 +126,7 @@ def test_arguments_are_left_alone_and_none_may_be_among_them():
 
 
 def test_results_are_not_there_before_the_replay():
-    """The twin must not be kinder than a graph, which computes nothing while it is recorded."""
+    """The eager recorder must also leave its outputs undefined before the first replay, as a graph does."""
     recording = EagerRecorder().record(lambda: (torch.ones(2), torch.ones(2, dtype=torch.long)))
     assert recording.outputs[0].isnan().all()
     assert not recording.outputs[1].any()
@@ -156,3 +158,9 @@ def test_a_function_that_waits_for_the_device_is_refused():
     graphed = GraphedFunction(lambda x: x + float(x.sum()), CudaRecorder(torch.device("cuda")), warmups=0)
     with pytest.raises(InfrastructureError, match="recording a CUDA graph"):
         graphed(torch.ones(2, device="cuda"))
+
+
+def test_counts_say_how_every_call_ran():
+    double = GraphedFunction(lambda x: 2 * x, EagerRecorder(), warmups=1)
+    assert [float(double(torch.tensor(float(i)))) for i in range(3)] == [0.0, 2.0, 4.0]
+    assert dict(double.counts) == {"eager": 1, "recorded": 1, "replayed": 1}

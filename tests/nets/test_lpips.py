@@ -13,8 +13,8 @@ import torch
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import file_sha256
+from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, available, distance_for_training, load_distance
 from alpasim_plugin.nets.lpips import LPIPS, TRUNKS, Kind, load_lpips
-from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, available, distance_for_training, load_distance
 from alpasim_plugin.seeding import stream
 
 KINDS: tuple[Kind, ...] = ("alex", "vgg")

@@ -8,6 +8,7 @@ import torch
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names, named, shifted, steps
+from tests.nets.cache_history import history
 from tests.nets.dit_cases import clip, furthest, network
 
 
@@ -100,19 +101,19 @@ def test_senseless_schedules_are_refused(call):
 @pytest.mark.parametrize(("history", "forwards"), [("finalise", 3), ("last-forward", 2)])
 def test_history_decides_what_the_cache_keeps(history, forwards):
     net, (_, _, text, hdmap) = network(), clip(2)
-    cache, told = net.new_cache(1, 4, 6), []
+    cache, calls = net.new_cache(1, 4, 6), []
 
     class Counter:
         def step(self, x, t, text, hdmap, cache, write, mask):
-            told.append((round(t), write))
+            calls.append((round(t), write))
             return net.step(x, t, text, hdmap, cache, write, mask)
 
     sources = [noise(1, 4, 2, 4, 6, seed=i) for i in range(sources_needed(steps(2), history))]
     z = sample_block(Counter(), sources, text, hdmap, cache, steps(2), history)
     assert z.isfinite().all()
-    assert len(told) == forwards
-    assert [write for _, write in told] == [False] * (forwards - 1) + [True]
-    assert told[-1][0] == (128 if history == "finalise" else 833)
+    assert len(calls) == forwards
+    assert [write for _, write in calls] == [False] * (forwards - 1) + [True]
+    assert calls[-1][0] == (128 if history == "finalise" else 833)
     assert cache.position == 2
 
 
@@ -130,7 +131,7 @@ def test_one_step_is_equation_two_and_folding_changes_nothing():
     folded = sample_block(net.folded(1000.0), [z_1, eps], text, hdmap, three, steps(1), "finalise", finalise_net=net.folded(128.0))
     two.reset()
     assert furthest(folded, sample_block(net, [z_1, eps], *args)) < 1e-5
-    assert furthest(two.history(1)[0], three.history(1)[0]) < 1e-5
+    assert furthest(history(two, 1)[0], history(three, 1)[0]) < 1e-5
 
 
 @pytest.mark.parametrize("history", ["finalise", "last-forward"])

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.frame_layers import run, to_layers
-from alpasim_plugin.nets.streaming_state import Carry
+from alpasim_plugin.nets.frame_layers import channels_last, run_layers
+from alpasim_plugin.nets.streaming_state import StreamingState
 from alpasim_plugin.nets.taehv import TinyDecoder
 from tests.nets.codec_cases import golden
 
@@ -37,7 +37,7 @@ def test_latents_decode_to_the_original_frames(numbers: Any, name: str, latents_
 @pytest.mark.parametrize("name", CASES)
 def test_frames_that_are_dropped_are_the_original_ones_too(numbers: Any, name: str) -> None:
     decoder = TinyDecoder.from_state_dict(numbers[0])
-    frames = run(decoder.decoder, to_layers(numbers[1][f"in.{name}"].transpose(1, 2)), Carry(None))
+    frames = run_layers(decoder.decoder, channels_last(numbers[1][f"in.{name}"].transpose(1, 2)), StreamingState(None))
     expected = numbers[1][f"out.{name}.decoder_raw_all_frames_unclamped"].permute(0, 1, 3, 4, 2)
     torch.testing.assert_close(frames, expected, atol=TOLERANCE, rtol=0)
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.frame_layers import from_layers, to_layers
+from alpasim_plugin.nets.frame_layers import channels_first, channels_last
 from alpasim_plugin.nets.latent_stats import WAN_MEAN, WAN_STD
-from alpasim_plugin.nets.streaming_state import Carry
+from alpasim_plugin.nets.streaming_state import StreamingState
 from alpasim_plugin.nets.wan_vae import WanVAE
 from tests.nets.codec_cases import golden
 
@@ -61,12 +61,12 @@ def test_every_chunk_leaves_the_original_encoder_output_and_state(vae: WanVAE, n
     name = "clip_b1_t17_40x64"
     video, state, start = io[f"in.{name}"], None, 0
     for index, count in enumerate([1, 4, 4, 4, 4]):
-        carry = Carry(state)
-        out = from_layers(vae.encoder.next(to_layers(video[:, :, start : start + count]), carry))
+        streaming = StreamingState(state)
+        out = channels_first(vae.encoder.next(channels_last(video[:, :, start : start + count]), streaming))
         torch.testing.assert_close(out, io[f"out.{name}.encoder_chunk{index}"], atol=TOLERANCE, rtol=0)
         slots = [tuple(slot) for slot in config["cases"][name]["encoder_cache_slots_after_each_chunk"][index] if slot is not None]
-        assert [tuple(from_layers(kept).shape) for kept in carry.state] == slots
-        state, start = carry.state, start + count
+        assert [tuple(channels_first(kept).shape) for kept in streaming.state] == slots
+        state, start = streaming.state, start + count
 
 
 def test_decoder_state_has_the_original_slots(vae: WanVAE, numbers: Any) -> None:

@@ -1,4 +1,4 @@
-"""The learned policy: what it looks at, what it is told, and that it drives by its pixels."""
+"""The learned policy: its image input, its command input, and that its plan depends on the image."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from policies import check_policy, make_policy
 from policies.conformance import STRAIGHT, observations
 from policies.learned import WEIGHTS, Learned
 from policies.learned_command import route_command
-from policies.learned_net import KNOTS_M, LearnedNet, knot_weights, load_net, path_from_headings, path_grid, save_net
-from policies.learned_view import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, look, view_map
+from policies.learned_net import KNOTS_M, LearnedNet, integrate_path, knot_weights, load_net, path_grid, save_net
+from policies.learned_view import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, level_view, view_homography
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from tests.policies.policy_world import CAMERA, observe, scenario_with
 
@@ -33,7 +33,7 @@ def test_point_of_the_world_has_its_place_in_the_view_whatever_the_camera() -> N
         for turn in (-0.1, 0.0, 0.1):
             in_camera = transform_points(inverse(camera.T_rig_camera), point[None])[0]
             pixel = camera.K @ in_camera
-            view = np.linalg.inv(view_map(camera, turn)) @ pixel
+            view = np.linalg.inv(view_homography(camera, turn)) @ pixel
             ahead = se2(0.0, 0.0, turn)[:3, :3].T @ (point - camera.T_rig_camera[:3, 3])
             wanted = [WIDTH / 2 - FOCAL_PX * ahead[1] / ahead[0], HORIZON_ROW - FOCAL_PX * ahead[2] / ahead[0]]
             np.testing.assert_allclose(view[:2] / view[2], wanted, atol=1e-9)
@@ -44,8 +44,8 @@ def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view() -> None:
     views = []
     sizes = ({}, {"pitch_deg": 5.0}, {"width": 1024, "height": 576})
     for camera in (pinhole_camera(hfov_deg=80.0, **size) for size in sizes):
-        views.append(look(road.image(camera, pose), camera)[24:60, 10:-10].astype(float))
-        assert look(road.image(camera, pose), camera).shape == (HEIGHT, WIDTH, 3)
+        views.append(level_view(road.image(camera, pose), camera)[24:60, 10:-10].astype(float))
+        assert level_view(road.image(camera, pose), camera).shape == (HEIGHT, WIDTH, 3)
     for other in views[1:]:
         assert np.abs(other - views[0]).mean() < 6.0
         assert np.corrcoef(other.ravel(), views[0].ravel())[0, 1] > 0.95
@@ -54,13 +54,13 @@ def test_cameras_of_other_size_and_pitch_show_nearly_the_same_view() -> None:
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
-def route_with_turn(after_m: float, radius_m: float, left: bool, aside_m: float = 0.0) -> np.ndarray:
+def route_with_turn(after_m: float, radius_m: float, left: bool, lateral_m: float = 0.0) -> np.ndarray:
     s = 80 / 19 * np.arange(20)
     arc = np.clip((s - after_m) / radius_m, 0.0, np.pi / 2)
     beyond = np.maximum(s - after_m - radius_m * np.pi / 2, 0.0)
     x = np.minimum(s, after_m) + radius_m * np.sin(arc)
     y = radius_m * (1 - np.cos(arc)) + beyond
-    return np.stack([x, (y if left else -y) + aside_m, np.zeros(20)], axis=1)
+    return np.stack([x, (y if left else -y) + lateral_m, np.zeros(20)], axis=1)
 
 
 @pytest.mark.parametrize("left", [True, False])
@@ -78,7 +78,7 @@ def test_bend_of_the_road_itself_is_no_turn(radius_m: float) -> None:
 
 def test_command_says_nothing_about_the_place_in_the_lane() -> None:
     for after_m in (3.0, 25.0):
-        words = {route_command(route_with_turn(after_m, 12.0, True, aside_m)) for aside_m in (-1.5, -0.3, 0.0, 1.5)}
+        words = {route_command(route_with_turn(after_m, 12.0, True, lateral_m)) for lateral_m in (-1.5, -0.3, 0.0, 1.5)}
         assert len(words) == 1
 
 
@@ -94,7 +94,7 @@ def test_route_that_is_over_or_absent_gives_keep() -> None:
 
 def test_headings_of_a_circle_lay_out_the_circle() -> None:
     heading = torch.tensor([[s / 40.0 for s in KNOTS_M]], dtype=torch.float64)
-    points, yaw = path_from_headings(heading, torch.from_numpy(knot_weights()))
+    points, yaw = integrate_path(heading, torch.from_numpy(knot_weights()))
     s = path_grid()
     np.testing.assert_allclose(yaw[0].numpy(), s / 40.0, atol=1e-12)
     np.testing.assert_allclose(points[0].numpy(), 40.0 * np.stack([np.sin(s / 40.0), 1 - np.cos(s / 40.0)], axis=1), atol=2e-3)
@@ -109,7 +109,7 @@ def test_weights_survive_the_disk_and_foreign_ones_are_refused(tmp_path: Path) -
     with pytest.raises(InputError, match="no such file"):
         Learned(scenario_with(), weights=tmp_path / "absent")
     path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(InputError, match="not a whole safetensors file"):
+    with pytest.raises(InputError, match="not a complete safetensors file"):
         Learned(scenario_with(), weights=path)
     del net.word
     save_net(net, path, {})
@@ -145,8 +145,8 @@ def test_seeds_drive_differently_and_a_seed_alike() -> None:
         np.testing.assert_array_equal(a, b)
     apart = max(np.abs(a - b).max() for a, b in zip(first, other, strict=True))
     assert 0.01 < apart < 8.0
-    aside = max(np.abs(a[:, 1] - b[:, 1]).max() for a, b in zip(first, other, strict=True))
-    assert aside < 2.5
+    lateral = max(np.abs(a[:, 1] - b[:, 1]).max() for a, b in zip(first, other, strict=True))
+    assert lateral < 2.5
 
 
 def test_temperature_zero_is_the_mean_for_every_seed() -> None:

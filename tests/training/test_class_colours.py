@@ -1,4 +1,4 @@
-"""Recolouring a drawn map equals drawing it with the other class, and leaves the rest alone."""
+"""Class-colour augmentation of a drawn map equals drawing it with the other class, and changes nothing else."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.style import COLOURS
-from alpasim_plugin.training.class_colours import OTHERS, recolour_boxes
+from alpasim_plugin.training.class_colours import OTHERS, swap_class_colours
 from tests.semantic_map.test_draw import CAR, EMPTY, PIN, ActorBox, at, line, prepare_map, replace, se2
 
 LABELS = {"truck": "truck", "cyclist": "rider", "pedestrian": "person", "other": "dog"}
@@ -23,9 +23,9 @@ def drawn(label: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_recoloured_cars_are_what_the_other_class_looks_like(kind: str) -> None:
+def test_augmented_cars_have_the_colours_of_the_other_class(kind: str) -> None:
     car, wanted = drawn("car"), drawn(LABELS[kind])
-    made = recolour_boxes(car, kind)
+    made = swap_class_colours(car, kind)
     differs = (car != wanted).any(axis=-1)
     off = np.abs(made.astype(int) - wanted).max(axis=-1)
     assert differs.sum() > 100
@@ -35,9 +35,9 @@ def test_recoloured_cars_are_what_the_other_class_looks_like(kind: str) -> None:
 
 def test_a_map_without_cars_stays_as_it_is() -> None:
     people = drawn("person")
-    np.testing.assert_array_equal(recolour_boxes(people, "truck"), people)
+    np.testing.assert_array_equal(swap_class_colours(people, "truck"), people)
     black = np.zeros((2, 4, 4, 3), np.uint8)
-    np.testing.assert_array_equal(recolour_boxes(black, "truck"), black)
+    np.testing.assert_array_equal(swap_class_colours(black, "truck"), black)
 
 
 @pytest.mark.parametrize("paint", COLOURS)
@@ -45,9 +45,9 @@ def test_a_map_without_cars_stays_as_it_is() -> None:
 def test_paint_of_every_colour_and_darkness_stays(paint: str, kind: str) -> None:
     shares = np.linspace(0.1, 1.0, 64)[None, :, None]
     faded = np.rint(shares * np.array(COLOURS[paint])).astype(np.uint8)
-    np.testing.assert_array_equal(recolour_boxes(faded, kind), faded)
+    np.testing.assert_array_equal(swap_class_colours(faded, kind), faded)
 
 
 def test_an_unknown_class_is_refused() -> None:
     with pytest.raises(InputError, match="it has no colours"):
-        recolour_boxes(drawn("car"), "tram")
+        swap_class_colours(drawn("car"), "tram")

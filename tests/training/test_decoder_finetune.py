@@ -13,8 +13,8 @@ import torch
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
 from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.training.decoder_finetune import PainterRecipe, PainterTask, Rollouts
-from alpasim_plugin.training.decoder_finetune_run import train_painter
+from alpasim_plugin.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
+from alpasim_plugin.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.training.fixer_run import train_fixer
 from alpasim_plugin.training.shared_rollout import Objectives, Sample, losses
 from alpasim_plugin.training.trainer import Schedule
@@ -22,7 +22,7 @@ from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run
 
 from .test_generator import FORM, brightness, clips_of, data, run_of  # noqa: F401 - data is a fixture
 
-RECIPE = PainterRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)
+RECIPE = DecoderRecipe(clips=2, rows=4, columns=4, perceptual_weight=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -83,13 +83,13 @@ def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
 
 def test_only_the_decoder_learns_and_pictures_get_nearer(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     schedule = Schedule(30, peak_lr=5e-3, warmup=3, ema=0.5, save_every=10)
-    path = train_painter(bundle, data, tmp_path / "painter", FORM, RECIPE, schedule, ("brightness", brightness))
+    path = finetune_decoder(bundle, data, tmp_path / "decoder", FORM, RECIPE, schedule, ("brightness", brightness))
     before, after = load_weights(bundle), load_weights(path)
     assert before.keys() == after.keys()
     changed = {key for key in before if not torch.equal(before[key], after[key])}
     assert changed
     assert all(key.startswith("vae.decoder.") for key in changed)
-    rows = [json.loads(line) for line in (tmp_path / "painter" / "log.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (tmp_path / "decoder" / "log.jsonl").read_text().splitlines()]
     gains = [row["psnr_db"] - row["render_psnr_db"] for row in rows]
     assert np.mean(gains[-8:]) > np.mean(gains[:8]) + 0.5, "decibels over the render"
     card = json.loads(path.with_suffix(".card.json").read_text())
@@ -102,7 +102,7 @@ def test_only_the_decoder_learns_and_pictures_get_nearer(data: Path, bundle: Pat
 
 def test_batches_are_functions_of_their_number_and_crops_fit(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     rollouts = Rollouts(clips_of(data, tmp_path / "z"), net_of(bundle), 2, 4, True, tmp_path / "r")
-    one, two = (PainterTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2))
+    one, two = (DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2))
     two.batch(0)
     a, b = one.batch(3), two.batch(3)
     assert torch.equal(a.z, b.z)
@@ -112,10 +112,10 @@ def test_batches_are_functions_of_their_number_and_crops_fit(data: Path, bundle:
     wanted = clip.sequence.clip.rgb_gt[0, :, ::-1].astype(np.float32) / 127.5 - 1
     np.testing.assert_allclose(clip.clean(1)[:, 0].permute(1, 2, 0), wanted, atol=1e-6)
     with pytest.raises(InputError, match="a crop of 9 x 4"):
-        PainterTask(TinyVAE.load(data / "vae.safetensors"), rollouts, PainterRecipe(rows=9, columns=4))
+        DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, DecoderRecipe(rows=9, columns=4))
 
 
 def test_a_fixer_without_history_is_refused(data: Path, tmp_path: Path) -> None:  # noqa: F811
     image = train_fixer(run_of(data, "image"), tmp_path / "image", ("brightness", brightness))
     with pytest.raises(InputError, match="no history"):
-        train_painter(image, data, tmp_path / "out", FORM, RECIPE, Schedule(1))
+        finetune_decoder(image, data, tmp_path / "out", FORM, RECIPE, Schedule(1))

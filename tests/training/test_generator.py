@@ -124,9 +124,9 @@ def test_a_run_can_be_stopped_for_what_there_is_and_goes_on(data: Path, tmp_path
 
 def test_the_perceptual_terms_weight_can_be_chosen() -> None:
     assert [stage.weight for stage in variant_of("V7").stages] == [10.0, 10.0]
-    assert [stage.weight for stage in variant_of("V7").weighing(2.5).stages] == [2.5, 2.5]
+    assert [stage.weight for stage in variant_of("V7").with_perceptual_weight(2.5).stages] == [2.5, 2.5]
     with pytest.raises(InputError, match="weight -1"):
-        variant_of("V9").weighing(-1.0)
+        variant_of("V9").with_perceptual_weight(-1.0)
 
 
 def test_v7_divides_its_updates_between_its_two_terms() -> None:

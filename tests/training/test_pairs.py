@@ -13,7 +13,7 @@ import pytest
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.training.pairs import MOVING_M, SHARES, PairRecipe, draw_degradation, make_sequence, wander
+from alpasim_plugin.training.pairs import FIT_SHARES, MOVING_M, PairRecipe, draw_degradation, lateral_offsets, make_sequence
 from alpasim_plugin.types import Degradation, Environment, Scenario
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
@@ -34,7 +34,7 @@ def draws(street: Scenario) -> list[tuple[Degradation, float]]:
     recipe, out = PairRecipe(), []
     for seed in range(60):
         amount = draw_degradation(street, recipe, seed)
-        out.append((amount, float(np.abs(wander(replace(street, degradation=amount), recipe, seed)).max())))
+        out.append((amount, float(np.abs(lateral_offsets(replace(street, degradation=amount), recipe, seed)).max())))
     return out
 
 
@@ -48,7 +48,7 @@ def test_half_are_reconstructions_seen_from_beside_the_path_and_half_cycle_rende
     assert max(aside) > 0.4
     assert max(aside) <= 1.5
     assert {amount.shift_m for amount, _ in drawn if amount.kind == "cycle"} == {1.0, -1.0}
-    assert all(SHARES[0] <= amount.share <= SHARES[1] for amount, _ in drawn)
+    assert all(FIT_SHARES[0] <= amount.share <= FIT_SHARES[1] for amount, _ in drawn)
     assert len({amount.share for amount, _ in drawn}) > 8
 
 

@@ -1,4 +1,4 @@
-"""Training of the perceptual distance: damage that is monotone, targets that say so, batches that repeat, lessons that are learned."""
+"""Training of the perceptual distance: damage that is monotone, targets that say so, batches that repeat, module that are learned."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from alpasim_plugin.nets.perceptual import PerceptualDistance, load_perceptual
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.distortions import KINDS, draw_distortion
 from alpasim_plugin.training.perceptual import PerceptualRecipe, PerceptualTask, draw_shapes
-from alpasim_plugin.training.perceptual_check import Ladder, check, shift_one_px
+from alpasim_plugin.training.perceptual_check import SeveritySweep, check, shift_one_px
 from alpasim_plugin.training.perceptual_targets import GAINS, colour_error, structure_error, target_distance
 from alpasim_plugin.training.semantics import CLASSES, class_masks
 from alpasim_plugin.training.trainer import Schedule, Trainer
@@ -69,7 +69,7 @@ def test_map_colours_are_read_back_however_faded() -> None:
             assert masks.sum() == 1
 
 
-SMALL = PerceptualRecipe(pictures=3, side=32)
+SMALL = PerceptualRecipe(images=3, side=32)
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_batch_depends_on_its_number_alone(task: PerceptualTask) -> None:
     assert torch.all(first.targets[1] >= first.targets[0] - 1e-3)  # the stronger damage of a kind
 
 
-def test_every_lesson_reaches_the_trunk(task: PerceptualTask) -> None:
+def test_every_loss_term_reaches_the_trunk(task: PerceptualTask) -> None:
     batch = task.batch(0)
     loss, parts = task.loss(batch, 0)
     loss.backward()
@@ -120,7 +120,7 @@ def test_check_tells_a_good_distance_from_a_bad_one() -> None:
     assert good["rank_correlation"] > 0.4 > bad["rank_correlation"]
     assert np.mean(list(good["in_order"].values())) > 0.9
     assert np.mean(list(bad["in_order"].values())) < 0.1
-    assert Ladder(np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3]])).in_order == 0.0
+    assert SeveritySweep(np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3]])).in_order == 0.0
 
 
 def test_shift_moves_by_one_pixel() -> None:

@@ -101,10 +101,10 @@ def test_rollout_and_flow_matching_are_the_equations(net: CosmosCausalDiT) -> No
 @pytest.mark.parametrize("w", [0, 4, 5, 7])
 def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net: CosmosCausalDiT, k: int, w: int) -> None:
     result = losses(net, sample(w), TEXT, Objectives(flow=None, horizon=k), at_w)
-    live = [z for z in result.seen if z.requires_grad]
+    live = [z for z in result.predictions if z.requires_grad]
     grads = torch.autograd.grad(result.total, [*live, *net.parameters()], allow_unused=True)
     by_block = {id(z): g for z, g in zip(live, grads, strict=False)}
-    reached = torch.cat([torch.zeros_like(z) if by_block.get(id(z)) is None else by_block[id(z)] for z in result.seen], dim=2)
+    reached = torch.cat([torch.zeros_like(z) if by_block.get(id(z)) is None else by_block[id(z)] for z in result.predictions], dim=2)
     for position in range(w + 1):
         size = reached[:, :, position].abs().max()
         assert torch.isfinite(size)
@@ -117,7 +117,7 @@ def test_perceptual_gradient_reaches_the_last_k_predictions_and_no_other(net: Co
 def test_predictions_with_gradient_have_the_values_of_the_rollout(net: CosmosCausalDiT) -> None:
     for k in (1, 2, 3, 8):
         result = losses(net, sample(5), TEXT, Objectives(horizon=k), at_w)
-        torch.testing.assert_close(torch.cat(result.seen, dim=2), result.rollout[:, :, :6], atol=0, rtol=0)
+        torch.testing.assert_close(torch.cat(result.predictions, dim=2), result.rollout[:, :, :6], atol=0, rtol=0)
         assert not result.rollout.requires_grad
 
 
@@ -152,8 +152,8 @@ def test_history_of_every_kind_is_what_its_name_says(net: CosmosCausalDiT) -> No
     s = sample()
     with torch.no_grad():
         own, clean, again = (losses(net, s, TEXT, Objectives(flow=kind, horizon=0)).flow for kind in ("own", "clean", "redenoised"))
-        # a model that is told almost no noise gives the clean latents back: history as if it were clean
-        near = losses(net, replace(s, t_again=torch.zeros_like(s.t_again)), TEXT, Objectives(flow="redenoised", horizon=0)).flow
+        # a model at almost no noise gives the clean latents back: history as if it were clean
+        near = losses(net, replace(s, t_redenoise=torch.zeros_like(s.t_redenoise)), TEXT, Objectives(flow="redenoised", horizon=0)).flow
     assert len({float(x) for x in (own, clean, again)}) == 3
     torch.testing.assert_close(near, clean, atol=0, rtol=0)
 
@@ -212,17 +212,17 @@ def test_decoded_frames_are_those_of_the_whole_clip() -> None:
     z, frames = noise("z", 1, 16, 4, H, W), 1 + 4 * 3
     render, opacity = noise("render", 1, 3, frames, 8 * H, 8 * W).clamp(-1, 1), uniform("opacity", 1, 1, frames, 8 * H, 8 * W)
     whole = vae.decode(z, render=render, opacity=opacity, clamp=False)
-    seen = []
-    term = DecodedDistance(vae, lambda a, b: seen.append(a) or a.mean(dim=(1, 2, 3)), z, render, opacity)  # type: ignore[func-returns-value]
+    predictions = []
+    term = DecodedDistance(vae, lambda a, b: predictions.append(a) or a.mean(dim=(1, 2, 3)), z, render, opacity)  # type: ignore[func-returns-value]
     for w, frames_of_w in ((0, slice(0, 1)), (1, slice(1, 5)), (3, slice(9, 13))):
         term(z, w)
-        torch.testing.assert_close(seen[-1], whole[0, :, frames_of_w].transpose(0, 1), atol=1e-5, rtol=0)
+        torch.testing.assert_close(predictions[-1], whole[0, :, frames_of_w].transpose(0, 1), atol=1e-5, rtol=0)
 
 
 def test_impossible_objectives_are_refused(net: CosmosCausalDiT) -> None:
     with pytest.raises(InputError, match="nothing to minimise"):
         Objectives(flow=None, horizon=0)
-    with pytest.raises(InputError, match="no function that measures it"):
+    with pytest.raises(InputError, match="no distance function"):
         losses(net, sample(), TEXT, Objectives())
     with pytest.raises(InputError, match="w = 8"):
         losses(net, sample(8), TEXT, Objectives(horizon=0))

@@ -1,5 +1,6 @@
-"""The training loop: resuming changes nothing, a bad number stops it and loses nothing."""
+"""The training loop: resuming gives equal weights, and a non-finite loss or a full disk loses nothing."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.trainer import BAD_FILE, Schedule, Trainer
 
 
-class Line(nn.Module):
+class Linear(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(3, 4))
@@ -27,7 +28,7 @@ TRUTH = torch.arange(12.0).reshape(3, 4) / 12
 
 
 def trainer(folder: Path, schedule: Schedule, facts: str = "a", bad_at: int = -1) -> Trainer[Tensor]:
-    model = Line()
+    model = Linear()
 
     def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
         error = ((x @ model.weight.T + model.bias - x @ TRUTH.T) ** 2).mean()
@@ -86,9 +87,9 @@ def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) ->
 
 def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
     trainer(tmp_path, Schedule(steps=2)).run()
-    with pytest.raises(InputError, match="it was begun as"):
+    with pytest.raises(InputError, match="the folder has"):
         trainer(tmp_path, Schedule(steps=2), facts="b")
-    with pytest.raises(InputError, match="it was begun as"):
+    with pytest.raises(InputError, match="the folder has"):
         trainer(tmp_path, Schedule(steps=3))
 
 
@@ -98,3 +99,25 @@ def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
     assert s.lr(10) == pytest.approx(1.0)
     assert s.lr(60) == pytest.approx(0.505)
     assert s.lr(110) == pytest.approx(0.01)
+
+
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
+def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
+    (tmp_path / "log.jsonl").symlink_to("/dev/full")
+    with pytest.raises(InfrastructureError, match="No space left on device") as caught:
+        trainer(tmp_path, Schedule(steps=2)).run()
+    assert caught.value.doing == "writing a training log"
+
+
+def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    t = trainer(tmp_path, Schedule(steps=4, save_every=2))
+    t.run(until=2)
+
+    def refuse(fd: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(InfrastructureError, match="free disk space"):
+        t.run()
+    monkeypatch.undo()
+    assert trainer(tmp_path, Schedule(steps=4, save_every=2)).step == 2

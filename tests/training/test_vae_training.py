@@ -10,14 +10,14 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
-from alpasim_plugin.training.clips import ClipSize, draw_pair_clip, draw_video_clip
+from alpasim_plugin.training.clips import CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.training.trainer import Schedule, Trainer
 from alpasim_plugin.training.vae import VaeRecipe, VaeTask, channel_amplitudes, measure_stats
 from alpasim_plugin.training.vae_quality import quality, round_trip
 
 from .pair_files import make
 
-SIZE = ClipSize(5, 16, 32)
+SIZE = CropSize(5, 16, 32)
 
 
 def test_a_draw_repeats_and_its_channels_belong_together(tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_a_draw_repeats_and_its_channels_belong_together(tmp_path: Path) -> None
 
 def test_clip_larger_than_the_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no room"):
-        draw_pair_clip([make(tmp_path)], ClipSize(5, 64, 64), 0, 0)
+        draw_pair_clip([make(tmp_path)], CropSize(5, 64, 64), 0, 0)
     with pytest.raises(InputError, match="no room"):
         draw_video_clip([np.zeros((4, 32, 48, 3), np.uint8)], SIZE, 0, 0)
 
@@ -47,7 +47,7 @@ def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path: Path) -> None:
     before = task.loss(fixed, 0)[1]
     Trainer(vae, tmp_path / "run", Schedule(steps=12, peak_lr=2e-3, warmup=2), lambda _: fixed, task.loss, task.facts).run()
     after = task.loss(fixed, 0)[1]
-    for kind in ("latent", "render", "video", "side"):
+    for kind in ("latent", "render", "video", "auxiliary"):
         assert after[kind] < before[kind]
 
 

@@ -1,4 +1,4 @@
-"""Perceptual distances by name: `perceptual-syn`, which comes with the package, and LPIPS, whose weights are the user's."""
+"""Perceptual image distances by name: `perceptual-syn`, shipped with the package, and LPIPS, with weights from the user."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ FOLDER_VARIABLE = "SIMRUN_METRIC_WEIGHTS"
 _KINDS: dict[str, Kind] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 
 
-class PictureDistance(Protocol):
-    """A frozen network that says how far apart pictures look."""
+class ImageDistance(Protocol):
+    """A frozen network that measures a perceptual distance."""
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return ``(B,)`` for pictures ``(B, 3, H, W)`` in [-1, 1]."""
+        """Return ``(B,)`` for images ``(B, 3, H, W)`` in [-1, 1]."""
         ...
 
 
 def weights_folder(folder: str | Path | None = None) -> Path | None:
-    """Return the folder of metric weights: the given one, else what ``SIMRUN_METRIC_WEIGHTS`` names, else None."""
+    """Return the folder of metric weights: the given one, else ``SIMRUN_METRIC_WEIGHTS``, else None."""
     named = folder or os.environ.get(FOLDER_VARIABLE)
     return Path(named) if named else None
 
@@ -38,11 +38,11 @@ def available(folder: str | Path | None = None) -> tuple[DistanceName, ...]:
     return tuple(name for name in names if name == NAME or (found is not None and not missing_files(_KINDS[name], found)))
 
 
-def load_distance(name: str, folder: str | Path | None = None) -> PictureDistance:
+def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
     """Load a distance by name, frozen.
 
     Raises:
-        InputError: Unknown name, no folder of weights, or weights that are missing or changed.
+        InputError: Unknown name, no folder of weights, or missing or modified weights.
     """
     if name == NAME:
         return load_perceptual()
@@ -51,11 +51,11 @@ def load_distance(name: str, folder: str | Path | None = None) -> PictureDistanc
     found = weights_folder(folder)
     if found is None:
         do = f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/video-metrics.md, or use {NAME}"
-        raise InputError("loading LPIPS", name, "no folder of weights is named", do)
+        raise InputError("loading LPIPS", name, "no folder of weights is set", do)
     return load_lpips(_KINDS[name], found)
 
 
-def distance_for_training(folder: str | Path | None = None) -> tuple[DistanceName, PictureDistance]:
-    """Return LPIPS with VGG where its weights are on disk, else `perceptual-syn`, with the name that must stand beside every result."""
+def distance_for_training(folder: str | Path | None = None) -> tuple[DistanceName, ImageDistance]:
+    """Return LPIPS with VGG where its weights are on disk, else `perceptual-syn`, with its name, which every result must state."""
     name: DistanceName = "lpips_vgg" if "lpips_vgg" in available(folder) else "perceptual-syn"
     return name, load_distance(name, folder)
