@@ -10,8 +10,7 @@ import numpy as np
 import typer
 
 from alpasim_plugin.bench.block_speed import BlockTimes, measure_blocks
-from alpasim_plugin.bench.block_work import TEXT_TOKENS, BlockWork, block_work
-from alpasim_plugin.bench.roofline import Device, device_of
+from alpasim_plugin.bench.roofline import TEXT_TOKENS, BlockWork, Device, block_work, device_of
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
@@ -26,7 +25,7 @@ Examples:
 
 - `simrun bench roofline --fixer onefixer-2b --size 960x544 --on h200 --measure --device cuda`
 
-- `simrun bench roofline --fixer onefixer-tiny --size 256x144 --on 3:0.15:0.3:20:8 --measure`
+- `simrun bench roofline --fixer onefixer-tiny --size 256x144 --on 3:0.15:20:8 --measure`
 """
 
 
@@ -37,7 +36,7 @@ def roofline(
     views: Annotated[int, typer.Option("--views", min=1, help="Cameras side by side.")] = 1,
     text_tokens: Annotated[int, typer.Option("--text-tokens", min=1, help="Length of the prompt.")] = TEXT_TOKENS,
     on: Annotated[
-        str, typer.Option("--on", help="h200, h100, a100, rtx4090, or half:float32:int8:bandwidth:memory in TFLOP/s, TOP/s, GB/s, GB.")
+        str, typer.Option("--on", help="h200, h100, a100, rtx4090, or half:float32:bandwidth:memory in TFLOP/s, GB/s, GB.")
     ] = "h200",
     measure: Annotated[bool, typer.Option("--measure", help="Also run it, with random weights, on --device.")] = False,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where to measure.")] = "cuda",
@@ -68,7 +67,7 @@ def roofline(
     print("\n".join(table(work, limits, times)))
     print(
         f"\nmemory: weights {work.weight_bytes / 1e9:.2f} GB, cache {work.cache_bytes / 1e9:.2f} GB, "
-        f"codecs' memories {work.state_bytes / 1e9:.2f} GB; at least {work.memory_bytes / 1e9:.1f} GB to run"
+        f"codec states {work.state_bytes / 1e9:.2f} GB; at least {work.memory_bytes / 1e9:.1f} GB to run"
     )
     if times is not None:
         peak = "" if times.peak_mb is None else f", peak {times.peak_mb / 1e3:.2f} GB"
