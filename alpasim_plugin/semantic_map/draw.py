@@ -1,7 +1,8 @@
 """Draw the semantic map that conditions a fixer: lanes, boundaries, crossings, signs, lights and road users seen from a camera.
 
 Prepare a scene once (`prepare_map`), then draw it from any camera, pinhole or f-theta. A depth buffer decides what hides what; colours and
-widths fade with depth along the optical axis. The plain twin is `alpasim_plugin.semantic_map.reference`.
+widths fade with depth along the optical axis. The reference
+implementation that tests compare with is `tests/semantic_map/draw_reference.py`.
 """
 
 from __future__ import annotations

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.semantic_map.layers import POLE_HEIGHT_M, LaneLine, MapExtras, lane_lines
 from alpasim_plugin.semantic_map.style import OPENGL, MapStyle, Rgb
-from alpasim_plugin.semantic_map.triangulate import ear_clip
 from alpasim_plugin.types import F64, Bool, Box, LaneMap
 
 GROUP = 32  # segments that share a bounding sphere
@@ -91,7 +91,7 @@ def prepare_map(lane_map: LaneMap, extras: MapExtras | None = None, style: MapSt
         pieces += _lane_line(LaneLine(line.xyz - origin, line.colour, line.patterns), style)
     for name, width_px, group in plain:
         pieces += [(line - origin, width_px, 1.0 if name == "pole" else gain, style.colours[name]) for line in group]
-    corners = [_triangulate(name, ring - origin) for name, ring in areas]
+    corners = [triangulate(name, ring - origin) for name, ring in areas]
     colours = [_flat(-GROUND_BIAS_M[name], style.colours[name], len(c)) for (name, _), c in zip(areas, corners, strict=True)]
     for name, pose, box in boxes:
         corners.append(box_corners(pose, box, origin)[TRIANGLES])
@@ -214,10 +214,19 @@ def _spheres(ends: F64) -> F64:
     return out
 
 
-def _triangulate(name: str, ring: F64) -> F64:
-    """Fill a ring ``(N, 3)`` with triangles ``(T, 3, 3)``; a concave outline stays concave."""
+def triangulate(name: str, ring: F64) -> F64:
+    """Return the triangles ``(T, 3, 3)`` that fill a ring ``(N, 3)`` in plan view; concave outlines stay concave.
+
+    The triangulation is the constrained Delaunay one. Of a ring that crosses itself, each lobe is filled.
+
+    Raises:
+        InputError: Fewer than three corners.
+    """
     if len(ring) > 1 and np.array_equal(ring[0], ring[-1]):
         ring = ring[:-1]
     if len(ring) < 3:
         raise InputError(DOING, name, f"an outline of {len(ring)} points", "give at least three corners")
-    return np.asarray(ring[ear_clip(ring[:, :2])])
+    outline = shapely.make_valid(shapely.Polygon(ring))
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
+    corners = shapely.get_coordinates(parts, include_z=True).reshape(-1, 4, 3)  # closed: the first corner stands again at the end
+    return np.asarray(corners[:, :3])

@@ -14,9 +14,9 @@ from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import ActorBox, Area, LaneLine, MapExtras, TrafficLight, actor_boxes
 from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.semantic_map.projection import FThetaCamera
-from alpasim_plugin.semantic_map.reference import draw_map_reference, draw_reference
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL
 from alpasim_plugin.types import Actor, Box, CameraSpec, FTheta, LaneMap, Trajectory
+from tests.semantic_map.draw_reference import draw_map_reference, draw_reference
 
 # Camera axes in a rig that looks along x.
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
