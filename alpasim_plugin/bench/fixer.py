@@ -102,7 +102,7 @@ class Row:
         peak_mb: Largest memory beyond an empty process, 1e6 bytes; None where the system does not tell.
         rounding: Mean, largest and PSNR (None: equal) against the same setting in float32 over the whole clip; None where there is none.
         model: The same against the base over the whole clip; None where the networks are others.
-        hit_rate: Of foretold frames, the share that was used; None where nothing is foretold.
+        hit_rate: Of predicted frames, the share that was used; None where nothing is predicted.
         guarded: Frames that the guard passed on unfixed; they are left out of the errors.
         problem: Why the setting was not measured, else empty.
     """
@@ -124,7 +124,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchOptions:
     """How to measure.
 
     Attributes:
@@ -154,11 +154,11 @@ class Plan:
 SLOW_FRAMES = 21  # of a slow row's clip: three blocks
 
 
-def bench_clip(plan: Plan, clip: Clip, on_row: Callable[[Row], None] = lambda row: None, apart: bool = True) -> list[Row]:
+def bench_clip(options: BenchOptions, clip: Clip, on_row: Callable[[Row], None] = lambda row: None, apart: bool = True) -> list[Row]:
     """Measure every setting on one clip.
 
     Args:
-        plan: How.
+        options: How.
         clip: Frames and maps of a real rollout, in whole blocks.
         on_row: Told of every row as it is done.
         apart: Measure every row in a process of its own, which makes memory and first calls its own as well.
@@ -168,11 +168,11 @@ def bench_clip(plan: Plan, clip: Clip, on_row: Callable[[Row], None] = lambda ro
     """
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="simrun-bench-") as folder:
-        settle = Settings(plan, Path(folder))
+        settle = Settings(options, Path(folder))
         latents = 1 + (len(clip.t_us) - 1) // 4
-        truth = whole_clip(settle.over_all(BASE, latents), clip, SCENE, plan.seed)
-        for case in filter(plan.includes, cases(latents)):
-            row = _row(plan, settle, case, clip, truth if case.weights == "stand-in" else None, apart)
+        truth = whole_clip(settle.over_all(BASE, latents), clip, SCENE, options.seed)
+        for case in filter(options.includes, cases(latents)):
+            row = _row(options, settle, case, clip, truth if case.weights == "stand-in" else None, apart)
             rows.append(row)
             on_row(row)
     return rows
@@ -181,8 +181,8 @@ def bench_clip(plan: Plan, clip: Clip, on_row: Callable[[Row], None] = lambda ro
 class Settings:
     """Turn cases into settings, with stand-in weights where the fixer has none of its own."""
 
-    def __init__(self, plan: Plan, folder: Path) -> None:
-        self.plan, self.folder = plan, folder
+    def __init__(self, options: BenchOptions, folder: Path) -> None:
+        self.options, self.folder = options, folder
         self.own = self._read(())
         weights = self.own.weights
         self.given = any((weights.bundle, weights.dit, weights.vae))
@@ -196,7 +196,7 @@ class Settings:
         plain = self._read(case.overrides)
         path = self.folder / f"{plain.decoder.kind}.safetensors"
         if not path.exists():
-            save_stand_in(path, plain, self.plan.seed)
+            save_stand_in(path, plain, self.options.seed)
         return self._read((*case.overrides, f"weights.bundle={path}"))
 
     def over_all(self, case: Case, latents: int) -> OneFixerSettings:
@@ -208,19 +208,19 @@ class Settings:
         return "given" if self.given and case.weights == "stand-in" else case.weights
 
     def _read(self, overrides: Sequence[str]) -> OneFixerSettings:
-        settings = fixer_settings(self.plan.name, (*self.plan.overrides, *overrides))
+        settings = fixer_settings(self.options.name, (*self.options.overrides, *overrides))
         if not isinstance(settings, OneFixerSettings):
-            raise InputError("measuring a fixer", self.plan.name, "it has no networks", "name one of the onefixer family")
+            raise InputError("measuring a fixer", self.options.name, "it has no networks", "name one of the onefixer family")
         return settings
 
 
-def _row(plan: Plan, settle: Settings, case: Case, clip: Clip, truth: U8 | None, apart: bool) -> Row:
+def _row(options: BenchOptions, settle: Settings, case: Case, clip: Clip, truth: U8 | None, apart: bool) -> Row:
     size = (clip.rgb.shape[2], clip.rgb.shape[1])
     try:
         settings = settle.of(case)
         given = clip.first(SLOW_FRAMES) if case.slow else clip
-        timing = _apart(plan, settings, given) if apart else _here(plan, settings, given)
-        same = whole_clip(settings, given, SCENE, plan.seed)
+        timing = _apart(options, settings, given) if apart else _here(options, settings, given)
+        same = whole_clip(settings, given, SCENE, options.seed)
     except SimrunError as error:
         return Row(case.group, case.name, settle.label(case), size, 0, {}, problem=error.found)
     n, fixed = len(timing.images), ~timing.guarded
@@ -252,15 +252,15 @@ def spread(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, floa
     return {name: (float(np.median(ms)), float(np.percentile(ms, 95))) for name, ms in series.items() if len(ms)}
 
 
-def _here(plan: Plan, settings: OneFixerSettings, clip: Clip) -> Timing:
-    return measure(settings, clip, SCENE, plan.seed, plan.device, plan.threads, plan.passes)
+def _here(options: BenchOptions, settings: OneFixerSettings, clip: Clip) -> Timing:
+    return measure(settings, clip, SCENE, options.seed, options.device, options.threads, options.passes)
 
 
-def _apart(plan: Plan, settings: OneFixerSettings, clip: Clip) -> Timing:
+def _apart(options: BenchOptions, settings: OneFixerSettings, clip: Clip) -> Timing:
     """Measure in a fresh Python: nothing of earlier rows is warm, and the memory is this row's alone."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
     command = [sys.executable, "-c", "from alpasim_plugin.bench.fixer import serve; serve()"]
-    done = subprocess.run(command, input=pickle.dumps((plan, settings, clip)), stdout=subprocess.PIPE, env=environment, check=False)
+    done = subprocess.run(command, input=pickle.dumps((options, settings, clip)), stdout=subprocess.PIPE, env=environment, check=False)
     if done.returncode:
         found = f"exit code {done.returncode}"
         raise FixerError("measuring a fixer", settings.name, found, "see its message above; too little memory ends it with -9")

@@ -25,7 +25,7 @@ SPARE = 8  # frames that a drive is longer, so that the block begun last is comp
 
 
 @dataclass(frozen=True)
-class LoopSample:
+class DriveSample:
     """One drive behind a fixer.
 
     Attributes:
@@ -57,7 +57,7 @@ def drive(
     seed: int = 0,
     device: str = "cpu",
     threads: int | None = None,
-) -> LoopSample:
+) -> DriveSample:
     """Drive a scene until so many frames of whole blocks have gone through a fixer.
 
     Args:
@@ -88,7 +88,7 @@ def drive(
     names = sorted({name for taken in tap.stages for name in taken})
     stages = {name: [taken.get(name, 0.0) / len(block) for taken, block in zip(tap.stages, tap.given, strict=True)][1:] for name in names}
     shown = np.stack([frame.rgb for frame in watched.frames[: len(given)]])
-    return LoopSample(Clip.of(given, maps), shown, shares[1:], stages, spent[0], fixed.facts())
+    return DriveSample(Clip.of(given, maps), shown, shares[1:], stages, spent[0], fixed.facts())
 
 
 def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:

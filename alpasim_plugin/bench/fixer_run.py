@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from alpasim_plugin.bench.fixer import SCENE, Case, Plan, Row, Settings, bench_clip, difference, spread
-from alpasim_plugin.bench.fixer_drive import LoopSample, drive
+from alpasim_plugin.bench.fixer import SCENE, BenchOptions, Case, Row, Settings, bench_clip, difference, spread
+from alpasim_plugin.bench.fixer_drive import DriveSample, drive
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.reference import whole_clip
@@ -41,12 +41,12 @@ class Bench:
 
 
 def bench_fixer(
-    plan: Plan, sizes: list[tuple[int, int]], frames: int, on_row: Callable[[Row], None] = lambda row: None, apart: bool = True
+    options: BenchOptions, sizes: list[tuple[int, int]], frames: int, on_row: Callable[[Row], None] = lambda row: None, apart: bool = True
 ) -> Bench:
     """Measure a fixer at every size.
 
     Args:
-        plan: Which fixer and how.
+        options: Which fixer and how.
         sizes: Widths and heights, pixels.
         frames: Least length of the drive; blocks are completed.
         on_row: Told of every row as it is done.
@@ -59,45 +59,45 @@ def bench_fixer(
     rows: list[Row] = []
     for size in sizes:
         with tempfile.TemporaryDirectory(prefix="simrun-bench-") as folder:
-            settle = Settings(plan, Path(folder))
-            rows += bench_clip(plan, recorded(plan, frames, size).clip, on_row, apart)
-            for case in filter(plan.includes, LOOPS):
-                rows.append(_loop_row(plan, settle, case, frames, size))
+            settle = Settings(options, Path(folder))
+            rows += bench_clip(options, recorded(options, frames, size).clip, on_row, apart)
+            for case in filter(options.includes, LOOPS):
+                rows.append(_loop_row(options, settle, case, frames, size))
                 on_row(rows[-1])
     facts = {
-        "fixer": plan.name,
-        "overrides": list(plan.overrides),
+        "fixer": options.name,
+        "overrides": list(options.overrides),
         "scene": DRIVEN,
-        "device": plan.device,
-        "threads": plan.threads or torch.get_num_threads(),
-        "passes": plan.passes,
+        "device": options.device,
+        "threads": options.threads or torch.get_num_threads(),
+        "passes": options.passes,
         "load_before_after": [round(before, 2), round(os.getloadavg()[0], 2)],
         "hardware": hardware(),
         "versions": versions(),
     }
-    if plan.device != "cpu":
-        facts["accelerator"] = torch.cuda.get_device_name(plan.device)
+    if options.device != "cpu":
+        facts["accelerator"] = torch.cuda.get_device_name(options.device)
     return Bench(rows, facts)
 
 
-def recorded(plan: Plan, frames: int, size: tuple[int, int]) -> LoopSample:
+def recorded(options: BenchOptions, frames: int, size: tuple[int, int]) -> DriveSample:
     """Drive the scene with nothing fixed, and keep what a fixer would have been given."""
     settings = fixer_settings("identity", ["mode=chunk", "uses_map=true"])
-    return drive(DRIVEN, frames, size, settings, SCENE, seed=plan.seed, threads=plan.threads)
+    return drive(DRIVEN, frames, size, settings, SCENE, seed=options.seed, threads=options.threads)
 
 
-def _loop_row(plan: Plan, settle: Settings, case: Case, frames: int, size: tuple[int, int]) -> Row:
+def _loop_row(options: BenchOptions, settle: Settings, case: Case, frames: int, size: tuple[int, int]) -> Row:
     case = replace(case, weights="stand-in") if settle.given else case
     try:
         settings = settle.of(case)
-        sample = drive(DRIVEN, frames, size, settings, SCENE, seed=plan.seed, device=plan.device, threads=plan.threads)
-        exact = whole_clip(settings, sample.clip, SCENE, plan.seed)
-        whole = whole_clip(settle.over_all(case, 1 + len(exact) // 4), sample.clip, SCENE, plan.seed)
+        sample = drive(DRIVEN, frames, size, settings, SCENE, seed=options.seed, device=options.device, threads=options.threads)
+        exact = whole_clip(settings, sample.clip, SCENE, options.seed)
+        whole = whole_clip(settle.over_all(case, 1 + len(exact) // 4), sample.clip, SCENE, options.seed)
     except SimrunError as error:
         return Row(case.group, case.name, settle.label(case), size, 0, {}, problem=error.found)
-    foretold = sample.facts.get("foretold")
+    predicted = sample.facts.get("predicted")
     return Row(
         case.group, case.name, settle.label(case), size, len(exact), spread(sample.stages | {"all-in": sample.ms}), sample.first_ms,
         rounding=difference(sample.shown, exact), model=difference(sample.shown, whole),
-        hit_rate=sample.facts["hits"] / foretold if foretold else None,
+        hit_rate=sample.facts["hits"] / predicted if predicted else None,
     )  # fmt: skip

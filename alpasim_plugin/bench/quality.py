@@ -13,7 +13,7 @@ import numpy as np
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import BlockFixer
 from alpasim_plugin.fixers.card import Card
-from alpasim_plugin.fixers.refine import StreamTally, refine_frames
+from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.types import I64, U8, Frame
 from evaluators.video import clip_quality
 from evaluators.video.perceptual import PictureDistance
@@ -60,7 +60,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Rolled:
+class ArmResult:
     """What an arm made of a clip.
 
     Args:
@@ -88,7 +88,7 @@ def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mappi
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def roll(clip: QualityClip, arm: Arm, fixer: BlockFixer | None) -> Rolled:
+def roll(clip: QualityClip, arm: Arm, fixer: BlockFixer | None) -> ArmResult:
     """Run an arm over a clip.
 
     Args:
@@ -102,15 +102,15 @@ def roll(clip: QualityClip, arm: Arm, fixer: BlockFixer | None) -> Rolled:
     if (fixer is None) != (arm.card is None):
         raise InputError("rolling a clip", f"arm {arm.label!r}", "a fixer too many or too few", "give a session exactly for a fixer's arm")
     if fixer is None or arm.card is None:
-        return Rolled(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
-    tally, frames = StreamTally(), []
+        return ArmResult(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
+    tally, frames = StreamStats(), []
     for block in refine_frames(_frames(clip, arm.card.settings.uses_map), fixer):
         tally.add(block)
         frames += [frame.rgb for frame in block.fixed]
-    return Rolled(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
+    return ArmResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
 
 
-def measure(clip: QualityClip, arm: Arm, rolled: Rolled, seed: int, networks: Mapping[str, PictureDistance]) -> dict[str, Any]:
+def measure(clip: QualityClip, arm: Arm, rolled: ArmResult, seed: int, networks: Mapping[str, PictureDistance]) -> dict[str, Any]:
     """Return the row of one clip under one arm, as `evaluators.video.summary` takes it."""
     found = clip_quality(rolled.video, None if arm.label == TRUTH else clip.truth, networks)
     return {

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.bench.fixer import Plan, Row
+from alpasim_plugin.bench.fixer import BenchOptions, Row
 from alpasim_plugin.bench.fixer_run import Bench, bench_fixer
 from alpasim_plugin.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
 from alpasim_plugin.cli.refine import fixer_overrides
@@ -54,8 +54,8 @@ def fixer(
     if docs and not PAGE.is_file():
         raise InputError("writing the fixer's bench into the docs", str(PAGE), "no such file", "run it at the root of the repository")
     own = tuple(fixer_overrides(overrides or []))
-    plan = Plan(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
-    bench = bench_fixer(plan, parse_sizes(sizes), 21 if quick else frames, (lambda row: None) if as_json else _say)
+    options = BenchOptions(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
+    bench = bench_fixer(options, parse_sizes(sizes), 21 if quick else frames, (lambda row: None) if as_json else _say)
     document = as_document(bench)
     if out is not None:
         write_results(bench, out)

@@ -82,7 +82,7 @@ class Difference:
 
 
 @dataclass
-class StreamTally:
+class StreamStats:
     """What a refined stream added up to: times per frame, difference from what went in, and what the guard saw."""
 
     frames: int = 0
