@@ -13,8 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.bench.fixer import BenchOptions, Row
-from alpasim_plugin.bench.fixer_run import Bench, bench_fixer
+from alpasim_plugin.bench.fixer import Bench, BenchOptions, Row, bench_fixer
 from alpasim_plugin.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError

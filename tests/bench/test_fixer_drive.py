@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.bench.fixer_drive import DriveSample, drive
+from alpasim_plugin.bench.whole_clip import whole_clip
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.reference import whole_clip
 from tests.fixers.fixer_cases import SMALL_DIT, small_settings
 
 SCENE = "smoke/straight"
