@@ -70,7 +70,7 @@ class OpCounter(TorchDispatchMode):
         name = func._schema.name.removeprefix("aten::")
         if func._overloadpacket is ATTENTION:
             out = torch.empty_like(args[0]) if args[0].is_meta else func(*args, **kwargs)  # meta would expand the scores
-            flops = sdpa_flop_count(*(x.shape for x in args[:3]))
+            flops = sdpa_flop_count(*(x.shape for x in args[:3]))  # type: ignore[no-untyped-call]
         else:
             with FlopCounterMode(display=False) as counter:
                 out = func(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""``simrun bench fixer``: what a fixer's settings cost, and what they do to its pictures."""
+"""``simrun bench fixer``: time and error of a fixer, setting by setting."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def fixer(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Time a fixer's stages setting by setting, with the error of the same pictures beside it.
+    """Time a fixer's stages setting by setting, with the error of the same images beside it.
 
     Rounding is the error against the same setting in float32 over the whole clip at once; model is the error against the base setting
     with a window over the whole clip.
@@ -54,7 +54,7 @@ def fixer(
         raise InputError("writing the fixer's bench into the docs", str(PAGE), "no such file", "run it at the root of the repository")
     own = tuple(fixer_overrides(overrides or []))
     options = BenchOptions(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
-    bench = bench_fixer(options, parse_sizes(sizes), 21 if quick else frames, (lambda row: None) if as_json else _say)
+    bench = bench_fixer(options, parse_sizes(sizes), 21 if quick else frames, (lambda row: None) if as_json else _print_row)
     document = as_document(bench)
     if out is not None:
         write_results(bench, out)
@@ -120,7 +120,7 @@ def write_results(bench: Bench, folder: Path) -> None:
 
 
 def machine_line(facts: dict[str, Any]) -> str:
-    """Say in one line what it was measured on, the load of the machine included."""
+    """Return one line on the fixer, the machine and its load."""
     where = facts.get("accelerator") or f"{facts['hardware']['cpu']}, {facts['threads']} thread(s) on {facts['hardware']['cores']} cores"
     before, after = facts["load_before_after"]
     chosen = f" with {', '.join(facts['overrides'])}" if facts["overrides"] else ""
@@ -130,7 +130,7 @@ def machine_line(facts: dict[str, Any]) -> str:
     )
 
 
-def _say(row: Row) -> None:
+def _print_row(row: Row) -> None:
     """Report a finished row on standard error."""
     ms = "not measured" if row.problem else f"{row.ms['all-in'][0]:.1f} ms a frame"
     print(f"{row.size[0]}x{row.size[1]} {row.group}: {row.name}, {ms}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""``simrun bench roofline``: how fast a fixer could be on a device, and how fast it is there."""
+"""``simrun bench roofline``: lower bounds of a fixer's time per block on a device, and measured times."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def roofline(
     name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer-2b",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
     size: Annotated[str, typer.Option("--size", help="Width x height, multiples of 16.")] = "960x544",
-    views: Annotated[int, typer.Option("--views", min=1, help="Cameras side by side.")] = 1,
+    views: Annotated[int, typer.Option("--views", min=1, help="Cameras in the batch.")] = 1,
     text_tokens: Annotated[int, typer.Option("--text-tokens", min=1, help="Length of the prompt.")] = TEXT_TOKENS,
     on: Annotated[
         str, typer.Option("--on", help="h200, h100, a100, rtx4090, or half:float32:bandwidth:memory in TFLOP/s, GB/s, GB.")
@@ -47,10 +47,10 @@ def roofline(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Count a fixer's work per block without running it, and say what a device needs for it at best.
+    """Count a fixer's work per block without running it, and print lower bounds of its time on a device.
 
-    The compute floor lets everything but products and convolutions be free; the eager floor lets every operation wait for its own
-    arithmetic or memory traffic. Needs neither weights nor a GPU, except to measure.
+    The compute floor counts products and convolutions alone; the eager floor adds up all operations, each at its own arithmetic or
+    memory traffic. Needs neither weights nor a GPU, except to measure.
     """
     del debug
     settings = fixer_settings(name, fixer_overrides(overrides or []))

@@ -1,4 +1,4 @@
-"""``simrun bench quality``: fixers over recorded clips, open loop, against the frames that there were to see."""
+"""``simrun bench quality``: fixers over recorded clips, open loop, against ground-truth frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 import typer
 from rich.console import Console
 
-from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, roll, row_key
+from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, row_key, run_arm
 from alpasim_plugin.cli.jobs import spread
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
@@ -48,7 +48,7 @@ Examples:
 
 @dataclass(frozen=True)
 class Work:
-    """One clip under one arm, as it travels to a process."""
+    """One clip under one arm, as sent to a worker process."""
 
     folder: Path  # of the sequence
     arm: Arm
@@ -168,7 +168,7 @@ def identity(name: str, folder: Path | None) -> str:
 
 
 def finish(work: Work) -> dict[str, Any]:
-    """Bring one clip under one arm to its row, from disk where it is there already."""
+    """Return the row of one clip under one arm, from disk if it is up to date."""
     sequence = PairSequence(work.folder)
     clip = quality_clip(sequence).first(work.frames)
     key = row_key(clip, work.arm, work.seed, work.device, dict(work.networks))
@@ -184,12 +184,12 @@ def finish(work: Work) -> dict[str, Any]:
     if card is not None:
         scene = str(sequence.info.get("scene_id", sequence.name))
         fixer = make_fixer(card.name, card.settings, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
-    rolled = roll(clip, work.arm, fixer)
+    result = run_arm(clip, work.arm, fixer)
     for i in at:
-        done, png = cv2.imencode(".png", cv2.cvtColor(rolled.video[i], cv2.COLOR_RGB2BGR))
+        done, png = cv2.imencode(".png", cv2.cvtColor(result.video[i], cv2.COLOR_RGB2BGR))
         assert done
         write_bytes(work.picture_file(i), png.tobytes())
-    row = measure(clip, work.arm, rolled, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
+    row = measure(clip, work.arm, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
     write_json(work.row_file, {"key": key, "row": row})
     return row
 
@@ -197,12 +197,12 @@ def finish(work: Work) -> dict[str, Any]:
 def quality_clip(sequence: PairSequence) -> QualityClip:
     """Return a sequence of pairs as a clip to measure on."""
     clip = sequence.clip
-    facts = {**sequence.info, CONTENT: sequence.content}  # a sequence made again is another one, whatever it says of itself
+    facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
     return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
 
 
 def shown_frames(frames: int) -> tuple[int, ...]:
-    """Return the indices of the frames that are shown."""
+    """Return the indices of the frames shown."""
     return tuple(dict.fromkeys(int(share * (frames - 1)) for share in PICTURE_SHARES))
 
 

@@ -20,7 +20,7 @@ from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_vid
 
 INTERRUPTED = 130
 LINE_EVERY_S = 10.0
-SCENE = "video"  # key of the noise: the same for every file, so that a renamed video gives the same result
+SCENE = "video"  # key of the noise, the same for every file: a renamed video gives the same result
 PREFIX = "fixer."
 
 EPILOG = """
@@ -88,7 +88,7 @@ def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
 
 
 def untrained_notice(label: str) -> str:
-    """Say that weights are missing, so that nobody takes a result for a repair."""
+    """Return a warning that the weights are untrained."""
     return f"UNTRAINED: {label}. The result shows the pipeline, not a repair."
 
 

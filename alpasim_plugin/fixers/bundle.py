@@ -1,7 +1,7 @@
-"""Everything a trained fixer is, in one safetensors file: transformer, autoencoder, prompt, and what it was trained for.
+"""Weights of a fixer in one safetensors file: transformer, autoencoder, prompt, and the settings they were trained with.
 
 Keys carry their part: ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's), ``prompt.text``. The header holds ``format``,
-``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained for. Only safetensors is read: a pickle is
+``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained with. Only safetensors is read: a pickle is
 refused.
 """
 
@@ -21,31 +21,31 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 FORMAT = "simrun-fixer-1"
 PARTS = ("dit", "vae", "decoder", "prompt")
-MUST_MATCH = ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled")  # other values give wrong pictures
+MUST_MATCH = ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled")  # other values give wrong images
 MAY_DIFFER = ("steps", "history", "window", "sink", "holes", "uses_map")  # named in the label
 DOING = "loading a fixer's weights"
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a file holds."""
+    """Contents of a bundle."""
 
     parts: Mapping[str, StateDict]  # by part, keys without it
     trained: bool
-    note: str  # what it is, and what is set otherwise than it was trained for
+    note: str  # description, and settings that differ from training
 
 
 def save_bundle(
     path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: OneFixerSettings, *, trained: bool, note: str = ""
 ) -> None:
-    """Write a bundle, whole or not at all.
+    """Write a bundle atomically.
 
     Args:
         path: A ``.safetensors`` file.
         parts: State dicts by part: ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``: tokens, text_width).
-        settings: What the weights were trained for.
+        settings: What the weights were trained with.
         trained: Whether they were learned.
-        note: A few words on them, for labels.
+        note: Description for labels.
 
     Raises:
         InputError: A part that is not known, or no transformer or autoencoder.
@@ -112,7 +112,7 @@ def load_tiny_vae(path: str | Path) -> TinyVAE:
 
 
 def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
-    """Return tensors by what stands before the first dot of their keys, keys without it."""
+    """Group tensors by the part of their keys before the first dot; keys lose it."""
     parts: dict[str, StateDict] = {}
     for key, value in tensors.items():
         part, _, rest = key.partition(".")

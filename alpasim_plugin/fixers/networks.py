@@ -32,7 +32,7 @@ Codec = TinyVAE | WanVAE
 
 @dataclass(frozen=True, eq=False)
 class Networks:
-    """Everything that blocks run through; read-only and free of state, so rollouts share it."""
+    """The networks of a fixer; read-only and stateless, so rollouts share them."""
 
     dit: CosmosCausalDiT  # folded where there is one step
     finalise_dit: CosmosCausalDiT  # the same weights for the cache write
@@ -40,7 +40,7 @@ class Networks:
     decoder: Codec | TinyDecoder
     text: TextContext
     trained: bool
-    note: str  # what the weights are, for labels
+    note: str  # description of the weights, for labels
 
     @property
     def device(self) -> torch.device:
@@ -57,20 +57,20 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
     """
     if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
         raise FixerError(DOING, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
-    loop = FixerSettings(name="")  # how the loop uses a fixer has no part in what its networks are
+    loop = FixerSettings(name="")  # settings of the loop do not change the networks
     return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
 
 
 def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, source: str) -> CosmosCausalDiT:
-    """Build a transformer that blocks can be streamed through.
+    """Build a transformer for streaming inference.
 
     Args:
         weights: State dict.
-        settings: Give the stretch of its rotary embedding.
+        settings: Give the NTK ratios of its rotary embedding.
         source: Where the weights come from, for errors.
 
     Raises:
-        InputError: Weights that do not fit together, or whose conditions are not those that streaming gives.
+        InputError: Weights that do not fit together, or whose map input has other channels than streaming gives.
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
     if net.sizes.map_channels != LATENT:
@@ -130,7 +130,7 @@ class Parts:
         return streaming_dit(given[0], settings, given[1])
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
-        """Return the prompt's features ``(1, tokens, text_width)``; a single zero token where none is given and none was learned."""
+        """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained weights."""
         given = self.tensors("prompt")
         if given is None:
             if self.trained and self.bundle is None:

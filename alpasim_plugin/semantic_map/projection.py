@@ -30,7 +30,7 @@ class FThetaCamera:
     cx: float
     cy: float
     lens: FTheta
-    calibrated: Literal["pixel_to_angle", "angle_to_pixel"] = "angle_to_pixel"  # the polynomial that is believed; the other is its fit
+    calibrated: Literal["pixel_to_angle", "angle_to_pixel"] = "angle_to_pixel"  # the calibrated polynomial; the other is its fit
     A: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
 
     def resized(self, width: int, height: int) -> FThetaCamera:
@@ -92,18 +92,18 @@ def project_points(camera: MapCamera, points: F64) -> F64:
 
 @dataclass(frozen=True)
 class KernelCamera:
-    """What the kernels read of a camera."""
+    """A camera as arrays for the kernels."""
 
     params: F64  # (9,) is_ftheta, A00 or fx, A01 or skew, A10, A11 or fy, cx, cy, table entries per radian, table's last angle
     table: F64  # (TABLE + 1,) radii; one entry for a pinhole
-    half_angle_rad: float  # no pixel looks further from the axis than this
+    half_angle_rad: float  # largest angle of a pixel from the axis
 
 
 def kernel_camera(camera: MapCamera) -> KernelCamera:
-    """Return the kernel's form of a camera; kept for lenses already seen.
+    """Return a camera as the kernels read it; f-theta lenses are cached.
 
     Raises:
-        InputError: An image without pixels, intrinsics that are no camera's, or a lens whose radius does not grow.
+        InputError: An image without pixels, intrinsics without positive focal lengths, or a lens whose radius does not grow.
     """
     if camera.width < 1 or camera.height < 1:
         size = f"{camera.width} x {camera.height} pixels"
