@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -54,7 +53,9 @@ def fixer(
         raise InputError("writing the fixer's bench into the docs", str(PAGE), "no such file", "run it at the root of the repository")
     own = tuple(fixer_overrides(overrides or []))
     options = BenchOptions(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
-    bench = bench_fixer(options, parse_sizes(sizes), 21 if quick else frames, (lambda row: None) if as_json else _print_row)
+    bench = bench_fixer(
+        options, [parse_size(size) for size in sizes.split(",")], 21 if quick else frames, (lambda row: None) if as_json else _print_row
+    )
     document = as_document(bench)
     if out is not None:
         write_results(bench, out)
@@ -77,20 +78,21 @@ def fixer(
     print(machine_line(bench.facts))
 
 
-def parse_sizes(text: str) -> list[tuple[int, int]]:
-    """Return widths and heights.
+def parse_size(text: str, multiple: int = 1) -> tuple[int, int]:
+    """Return width and height, pixels.
 
     Example:
-        >>> parse_sizes("256x144,64x48")
-        [(256, 144), (64, 48)]
+        >>> parse_size("256x144")
+        (256, 144)
 
     Raises:
-        InputError: Anything else.
+        InputError: Anything but two positive multiples of ``multiple``.
     """
-    found = [re.fullmatch(r"\s*(\d+)x(\d+)\s*", part) for part in text.split(",")]
-    if not all(found):
-        raise InputError("reading --sizes", f"--sizes {text}", "not WIDTHxHEIGHT", "write sizes such as 256x144,480x272")
-    return [(int(match[1]), int(match[2])) for match in found if match]
+    sides = [int(part) if part.strip().isdecimal() else 0 for part in text.split("x")]
+    if len(sides) != 2 or any(side < 1 or side % multiple for side in sides):
+        found = "not two positive numbers" + (f", multiples of {multiple}" if multiple > 1 else "")
+        raise InputError("reading an image size", text, found, "write WIDTHxHEIGHT, such as 960x544")
+    return sides[0], sides[1]
 
 
 def parse_groups(text: str) -> tuple[str, ...]:

@@ -11,12 +11,13 @@ import typer
 
 from alpasim_plugin.bench.block_speed import BlockTimes, measure_blocks
 from alpasim_plugin.bench.roofline import TEXT_TOKENS, BlockWork, Device, block_work, device_of
+from alpasim_plugin.cli.bench_fixer import parse_size
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 
-SIDE = 16
+SIDE = 16  # pixels of a token
 
 EPILOG = """
 Examples:
@@ -56,7 +57,7 @@ def roofline(
     settings = fixer_settings(name, fixer_overrides(overrides or []))
     if not isinstance(settings, OneFixerSettings):
         raise InputError("counting a fixer's work", f"--fixer {name}", "it has no networks to count", "take one of the onefixer family")
-    width, height = parse_size(size)
+    width, height = parse_size(size, SIDE)
     limits = device_of(on)
     work = block_work(settings, height, width, views, text_tokens)
     times = measure_blocks(settings, work, height, width, device, blocks, text_tokens, attention) if measure else None
@@ -72,20 +73,6 @@ def roofline(
     if times is not None:
         peak = "" if times.peak_mb is None else f", peak {times.peak_mb / 1e3:.2f} GB"
         print(f"measured on {times.device}: first block {times.first:.1f} ms{peak}; calls {times.calls or 'not recorded'}")
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height.
-
-    Raises:
-        InputError: Not two multiples of 16.
-    """
-    parts = text.split("x")
-    sides = [int(part) if part.isdigit() else 0 for part in parts]
-    if len(sides) != 2 or any(side < SIDE or side % SIDE for side in sides):
-        do = "write WIDTHxHEIGHT, both multiples of 16, such as 960x544"
-        raise InputError("reading --size", f"--size {text}", "not two multiples of 16", do)
-    return sides[0], sides[1]
 
 
 def table(work: BlockWork, limits: Device, times: BlockTimes | None = None) -> list[str]:

@@ -30,6 +30,7 @@ from alpasim_plugin.nets.picture_distance import FOLDER_VARIABLE, PictureDistanc
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json, write_bytes, write_json
 from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
+from alpasim_plugin.types import U8
 from evaluators.video.charts import plot_by_frame, plot_speed
 from evaluators.video.sheet import sheet
 from evaluators.video.summary import TRUTH, summarise
@@ -186,9 +187,7 @@ def finish(work: Work) -> dict[str, Any]:
         fixer = make_fixer(card.name, card.settings, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
     result = run_arm(clip, work.arm, fixer)
     for i in at:
-        done, png = cv2.imencode(".png", cv2.cvtColor(result.video[i], cv2.COLOR_RGB2BGR))
-        assert done
-        write_bytes(work.picture_file(i), png.tobytes())
+        _write_png(work.picture_file(i), result.video[i])
     row = measure(clip, work.arm, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
     write_json(work.row_file, {"key": key, "row": row})
     return row
@@ -219,10 +218,13 @@ def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> N
     for folder, works in shown.items():
         at = shown_frames(int(read_json(works[0].row_file)["row"]["frames"]))
         columns = {work.arm.label: [_picture(work.picture_file(i)) for i in at] for work in works}
-        laid = sheet(columns, [f"frame {i}" for i in at])
-        done_, png = cv2.imencode(".png", cv2.cvtColor(laid, cv2.COLOR_RGB2BGR))
-        assert done_
-        write_bytes(out / "sheets" / f"{folder.name}.png", png.tobytes())
+        _write_png(out / "sheets" / f"{folder.name}.png", sheet(columns, [f"frame {i}" for i in at]))
+
+
+def _write_png(path: Path, rgb: U8) -> None:
+    done, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    assert done
+    write_bytes(path, png.tobytes())
 
 
 def _picture(path: Path) -> Any:

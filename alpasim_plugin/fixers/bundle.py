@@ -65,13 +65,8 @@ def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
     Raises:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
-    header = read_metadata(path)
-    if header.get("format") != FORMAT:
-        found = f"format {header.get('format')!r} in its header"
-        do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
-        raise InputError(DOING, str(path), found, do)
-    made_for = json.loads(header.get("settings", "{}"))
-    differs = [(key, _at(made_for, key), _at(settings.model_dump(mode="json"), key)) for key in (*MUST_MATCH, *MAY_DIFFER)]
+    header, trained_with = _header(path)
+    differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*MUST_MATCH, *MAY_DIFFER)]
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in MUST_MATCH]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
@@ -92,13 +87,9 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
     Raises:
         InputError: Not a bundle.
     """
-    header = read_metadata(path)
-    made_for = json.loads(header.get("settings", "{}"))
-    if header.get("format") != FORMAT or not isinstance(made_for, dict) or "name" not in made_for:
-        found = f"format {header.get('format')!r} in its header"
-        raise InputError(DOING, str(path), found, f"give a file that save_bundle wrote ({FORMAT})")
-    name = str(made_for.pop("name"))
-    return name, (*_flat(made_for), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
+    _, trained_with = _header(path)
+    name = str(trained_with.pop("name"))
+    return name, (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
 
 
 def load_tiny_vae(path: str | Path) -> TinyVAE:
@@ -118,6 +109,21 @@ def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
         part, _, rest = key.partition(".")
         parts.setdefault(part, {})[rest] = value
     return parts
+
+
+def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
+    """Return a bundle's header and the settings in it.
+
+    Raises:
+        InputError: Not a bundle.
+    """
+    header = read_metadata(path)
+    settings = json.loads(header.get("settings", "{}"))
+    if header.get("format") != FORMAT or not isinstance(settings, dict) or "name" not in settings:
+        found = f"format {header.get('format')!r} in its header"
+        do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
+        raise InputError(DOING, str(path), found, do)
+    return header, settings
 
 
 def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:

@@ -74,22 +74,6 @@ def _inside(camera: FThetaCamera, theta: F64) -> F64:
     return np.asarray(radius, dtype=np.float64)
 
 
-def project_points(camera: MapCamera, points: F64) -> F64:
-    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)`` in float64, without a table.
-
-    A pinhole needs z > 0: points at or behind its plane give NaN. An f-theta lens sees behind itself where its radius goes on.
-    """
-    x, y, z = points.T
-    if isinstance(camera, CameraSpec):
-        z = np.where(z > 0, z, np.nan)
-        k = camera.K
-        return np.stack([k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], axis=1)
-    across = np.hypot(x, y)
-    radius = radius_of(camera, np.arctan2(across, z))
-    unit = points[:, :2] / np.where(across > 0, across, 1.0)[:, None]
-    return np.asarray((unit * radius[:, None]) @ np.array(camera.A).T + (camera.cx, camera.cy))
-
-
 @dataclass(frozen=True)
 class KernelCamera:
     """A camera as arrays for the kernels."""
