@@ -327,8 +327,8 @@ def difference(images: U8, reference: U8) -> tuple[float, int, float | None] | N
     if not len(images):
         return None
     total = Difference()
-    for image, wanted in zip(images, reference, strict=True):
-        total.add(image, wanted)
+    for image, expected in zip(images, reference, strict=True):
+        total.add(image, expected)
     return total.mean_levels, total.max_levels, total.psnr_db if total.squared else None
 
 

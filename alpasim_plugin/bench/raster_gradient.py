@@ -123,6 +123,6 @@ def _reference(scene: GaussianCloud, camera: PinholeCamera) -> tuple[list[Tensor
     return [leaf.grad for leaf in leaves if leaf.grad is not None], spent
 
 
-def _relative(found: Tensor | None, wanted: Tensor) -> float:
+def _relative(found: Tensor | None, expected: Tensor) -> float:
     assert found is not None
-    return float((found.double() - wanted).norm() / wanted.norm())
+    return float((found.double() - expected).norm() / expected.norm())

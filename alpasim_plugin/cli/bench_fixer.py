@@ -35,7 +35,7 @@ def fixer(
     passes: Annotated[int, typer.Option("--passes", min=1, help="Runs over the drive per row.")] = 3,
     quick: Annotated[bool, typer.Option("--quick", help="21 frames, one pass, without the slow networks.")] = False,
     only: Annotated[str, typer.Option("--only", help=f"Groups of settings, comma-separated: {', '.join(MARKERS)}.")] = "",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the drive, the noise and made-up weights.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the drive, the noise and stand-in weights.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for table.md, rows.json and plot.png.")] = None,

@@ -53,7 +53,7 @@ class ChunkRenderer:
             counts[request.camera.name] = counts.get(request.camera.name, 0) + 1
         if set(counts.values()) != {due}:
             raise RendererError(
-                "rendering a block", f"block {self.blocks}", f"frames by camera: {counts}; the block has {due}", "ask for whole blocks"
+                "rendering a block", f"block {self.blocks}", f"frames by camera: {counts}; the block has {due}", "request whole blocks"
             )
         self.runner.reset_times()
         fixed = self.runner.fix(self.fixer, self.fixer.step, [self.runner.render(request) for request in requests])

@@ -1,4 +1,4 @@
-"""Noise for the transparent parts of a render: one random stream per scene, seed, camera, draw and latent, whatever the batch."""
+"""Noise for the transparent parts of a render: one random stream per scene, seed, camera, draw and latent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Speculative rendering: frames are handed out one by one from blocks that were fixed along predicted poses.
+"""Speculative rendering: frames are returned one by one from blocks that were fixed along predicted poses.
 
 At a block's first frame the rest of the block is predicted from the plan in force, rendered and fixed as a draft. A later frame is taken
 from the draft if the true poses are within tolerance of the predicted ones; otherwise a new draft is made from the true frames so far and
@@ -34,7 +34,7 @@ class SpeculationStats:
     drafts: int = 0
     redrafts: int = 0  # drafts made in the middle of a block
     forecasts: list[Deviation] = field(default_factory=list)  # of predicted frames
-    shown: list[Deviation] = field(default_factory=list)  # between the pose of the frame handed out and the true one
+    shown: list[Deviation] = field(default_factory=list)  # between the pose of the frame shown and the true one
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and, in metres and degrees, the errors of the forecasts and of the frames shown."""
@@ -43,7 +43,7 @@ class SpeculationStats:
 
 
 class SpeculativeRenderer:
-    """A renderer session whose frames are fixed block by block and handed out one by one.
+    """A renderer session whose frames are fixed block by block and returned one by one.
 
     Cameras with the same frame times are one group and go through the fixer together, as views of one batch; every group has its own
     fixer.

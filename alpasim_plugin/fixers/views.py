@@ -1,6 +1,6 @@
 """Convert frames to tensors and back: grouping by camera and size, padding to the block's grid, cropping.
 
-A *view* is one camera's frames of a block. Views of one size stand side by side as a batch.
+A *view* is one camera's frames of a block. Views of one size form a batch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Views:
     """The frames of cameras of one size, oldest first."""
 
     cameras: tuple[str, ...]  # B of them, sorted
-    index: tuple[tuple[int, ...], ...]  # per camera, where its T frames stand in the block
+    index: tuple[tuple[int, ...], ...]  # per camera, positions of its T frames in the block
     t_us: tuple[tuple[int, ...], ...]  # per camera
     rgb: U8  # (B, T, H, W, 3)
     alpha: F32 | None  # (B, T, H, W), 0 to 1; None where every pixel is opaque

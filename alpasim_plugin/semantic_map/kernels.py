@@ -17,7 +17,7 @@ from alpasim_plugin.semantic_map.prepare import GROUP
 
 BEND_PX = 0.1
 DEPTH_ERROR = 0.02
-WIDE_RAD_COS = 0.94  # pieces seen under more than 20 degrees are halved whatever their middle says
+WIDE_RAD_COS = 0.94  # pieces seen under more than 20 degrees are always halved
 MAX_HALVINGS = 10
 # Entries of a view: image size, near and far plane, cone that holds the view, pixels of this image for one of the style.
 WIDTH, HEIGHT, NEAR, FAR, COS_HALF, SIN_HALF, SCALE = range(7)

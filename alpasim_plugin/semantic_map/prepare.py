@@ -228,5 +228,5 @@ def triangulate(name: str, ring: F64) -> F64:
         raise InputError(DOING, name, f"an outline of {len(ring)} points", "give at least three corners")
     outline = shapely.make_valid(shapely.Polygon(ring))
     parts = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
-    corners = shapely.get_coordinates(parts, include_z=True).reshape(-1, 4, 3)  # closed: the first corner stands again at the end
+    corners = shapely.get_coordinates(parts, include_z=True).reshape(-1, 4, 3)  # closed: the last corner repeats the first
     return np.asarray(corners[:, :3])

@@ -34,7 +34,7 @@ class FThetaCamera:
     A: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
 
     def resized(self, width: int, height: int) -> FThetaCamera:
-        """Return the camera of the same picture resized to ``width`` x ``height``."""
+        """Return the camera of the same image resized to ``width`` x ``height``."""
         sx, sy = width / self.width, height / self.height
         (a, b), (c, d) = self.A
         scaled = ((a * sx, b * sx), (c * sy, d * sy))
