@@ -290,7 +290,7 @@ def _row(of: CaseSettings, case: Case, clip: Clip, base: U8 | None, own_process:
     return replace(
         row,
         frames=n,
-        ms=spread(timing.stages | {"all-in": timing.all_in, "cpu": timing.cpu}),
+        ms=p50_p95(timing.stages | {"all-in": timing.all_in, "cpu": timing.cpu}),
         first_ms=timing.first_ms,
         load_ms=timing.load_ms,
         peak_mb=timing.peak_mb,
@@ -314,7 +314,7 @@ def _loop_row(of: CaseSettings, case: Case, frames: int, size: tuple[int, int]) 
     return replace(
         row,
         frames=len(exact),
-        ms=spread(sample.stages | {"all-in": sample.ms}),
+        ms=p50_p95(sample.stages | {"all-in": sample.ms}),
         first_ms=sample.first_ms,
         rounding=difference(sample.shown, exact),
         model=difference(sample.shown, whole),
@@ -332,11 +332,11 @@ def difference(images: U8, reference: U8) -> tuple[float, int, float | None] | N
     return total.mean_levels, total.max_levels, total.psnr_db if total.squared else None
 
 
-def spread(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+def p50_p95(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
     """Return median and 95th percentile by name; empty series are left out.
 
     Example:
-        >>> spread({"dit": [1.0, 3.0, 2.0], "encode": []})
+        >>> p50_p95({"dit": [1.0, 3.0, 2.0], "encode": []})
         {'dit': (2.0, 2.9)}
     """
     return {name: (float(np.median(ms)), float(np.percentile(ms, 95))) for name, ms in series.items() if len(ms)}

@@ -39,7 +39,7 @@ class SpeculationStats:
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and, in metres and degrees, the errors of the forecasts and of the frames shown."""
         counts = {name: getattr(self, name) for name in ("frames", "blocks", "predicted", "hits", "exact", "drafts", "redrafts")}
-        return counts | {"forecast_error": _spread(self.forecasts), "shown_error": _spread(self.shown)}
+        return counts | {"forecast_error": _percentiles(self.forecasts), "shown_error": _percentiles(self.shown)}
 
 
 class SpeculativeRenderer:
@@ -204,7 +204,7 @@ def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Fra
     return replace(frame, facts={**frame.facts, **{name: round(value, 6) for name, value in facts.items()}})
 
 
-def _spread(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | None]:
+def _percentiles(errors: Sequence[Deviation]) -> dict[str, dict[str, float] | None]:
     """Return median, 95th percentile and maximum of each kind of error; None where no value is finite."""
     out: dict[str, dict[str, float] | None] = {}
     for name in ("camera_m", "camera_deg", "actor_m"):

@@ -1,8 +1,7 @@
 """Draw the semantic map that conditions a fixer: lanes, boundaries, crossings, signs, lights and road users seen from a camera.
 
 Prepare a scene once (`prepare_map`), then draw it from any camera, pinhole or f-theta. A depth buffer resolves occlusion; colours and
-widths fade with depth along the optical axis. The reference
-implementation that tests compare with is `tests/semantic_map/draw_reference.py`.
+widths fade with depth along the optical axis. Tests compare with the reference implementation `tests/semantic_map/draw_reference.py`.
 """
 
 from __future__ import annotations
