@@ -263,10 +263,10 @@ def test_utm_sized_coordinates_draw_the_same_picture(camera):
     assert (np.abs(near.astype(int) - far).max(axis=2) > 1).mean() < 1e-3
 
 
-def test_many_lines_do_not_outgrow_the_room():
+def test_many_lines_do_not_overflow_the_buffers():
     lines = tuple(line((5 + 0.01 * k, -3, 0), (5 + 0.01 * k, 3, 0)) for k in range(9000))
     image = draw_map(prepare_map(replace(EMPTY, road_edges=lines), style=PLAIN), PIN, at())
-    assert len(conditioning._room.strokes) > 9000
+    assert len(conditioning._buffers.strokes) > 9000
     assert image[100, 128].any()
 
 
