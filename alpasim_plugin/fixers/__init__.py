@@ -1,4 +1,4 @@
-"""Fixers: what repairs a rendered frame, and what tells it where the road is."""
+"""Fixers: networks that restore rendered frames, conditioned on a semantic map."""
 
 from alpasim_plugin.fixers import identity as identity
 from alpasim_plugin.fixers import onefixer as onefixer
