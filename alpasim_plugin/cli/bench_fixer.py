@@ -90,7 +90,7 @@ def parse_size(text: str, multiple: int = 1) -> tuple[int, int]:
     """
     sides = [int(part) if part.strip().isdecimal() else 0 for part in text.split("x")]
     if len(sides) != 2 or any(side < 1 or side % multiple for side in sides):
-        found = "not two positive numbers" + (f", multiples of {multiple}" if multiple > 1 else "")
+        found = f"not two positive {f'multiples of {multiple}' if multiple > 1 else 'integers'}"
         raise InputError("reading an image size", text, found, "write WIDTHxHEIGHT, such as 960x544")
     return sides[0], sides[1]
 
