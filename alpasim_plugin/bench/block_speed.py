@@ -1,4 +1,4 @@
-"""Time steady blocks of a fixer on a device with random weights: what the floors of `work` are held against."""
+"""Time steady blocks of a fixer on a device with random weights, to be compared with the floors of `roofline`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import torch
 
-from alpasim_plugin.bench.block_work import TEXT_TOKENS, BlockWork, check_device, run_block, steady_after
-from alpasim_plugin.bench.fixer_speed import MB
 from alpasim_plugin.bench.random_networks import random_networks
-from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
+from alpasim_plugin.bench.roofline import TEXT_TOKENS, BlockWork, run_block, steady_after
+from alpasim_plugin.errors import FixerError
+from alpasim_plugin.fixers.pipeline import BlockPipeline
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.nets.attention_kernels import Kernel, attention_kernel
 from alpasim_plugin.nets.graphs import GraphedFunction
 from alpasim_plugin.nets.precision import DTYPES
+
+CONTEXT_BYTES = 0.7e9  # what a process holds on a GPU before the first tensor
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def measure_blocks(
     text_tokens: int = TEXT_TOKENS,
     attention: Kernel = "auto",
 ) -> BlockTimes:
-    """Run a fixer's networks block by block over noise.
+    """Run a fixer's networks block by block over random images.
 
     Args:
         settings: The fixer; weights that it names are not read.
@@ -63,43 +65,46 @@ def measure_blocks(
         FixerError: A GPU that is absent or too small, before anything is put on it.
         InputError: An attention kernel that is not there.
     """
-    check_device(settings, work, device)
-    with attention_kernel(attention, device, DTYPES[settings.precision], settings.dit.head_width):
-        return _measured(settings, work, height, width, device, blocks, text_tokens)
-
-
-def _measured(
-    settings: OneFixerSettings, work: BlockWork, height: int, width: int, device: str, blocks: int, text_tokens: int
-) -> BlockTimes:
-    pipeline = BlockPipeline(random_networks(settings, device, text_tokens), settings)
-    clock = StageClock(device)
-    state, index = pipeline.start(work.views, height, width), 0
-
-    def advance() -> float:
-        nonlocal state, index
-        begin = clock.now()
-        state = _block(pipeline, state, index, work, height, width)
-        index += 1
-        return 1e3 * (clock.now() - begin)
-
-    first = advance()
-    warm = steady_after(settings) + 3  # shapes settle, two eager calls, one recording
-    for _ in range(warm):
-        advance()
-    all_in = [advance() for _ in range(blocks)]
-    fix = state.history.fix
-    calls = dict(fix.counts) if isinstance(fix, GraphedFunction) else {}
-    pipeline.stage = clock
-    stages: dict[str, list[float]] = {}
-    for _ in range(blocks):
-        clock.take()
-        advance()
-        for name, ms in clock.take().items():
-            stages.setdefault(name, []).append(ms)
     on_gpu = torch.device(device).type == "cuda"
-    peak = torch.cuda.max_memory_allocated(device) / MB if on_gpu else None
+    if on_gpu:
+        require_memory(settings, work, device)
+    with attention_kernel(attention, device, DTYPES[settings.precision], settings.dit.head_width):
+        pipeline = BlockPipeline(random_networks(settings, device, text_tokens), settings)
+        clock = StageClock(device)
+        state, index = pipeline.start(work.views, height, width), 0
+
+        def advance() -> float:
+            nonlocal state, index
+            begin = clock.now()
+            _, state = run_block(pipeline, state, index, work.views, height, width)
+            index += 1
+            return 1e3 * (clock.now() - begin)
+
+        first = advance()
+        for _ in range(steady_after(settings) + 3):  # shapes settle, two eager calls, one recording
+            advance()
+        all_in = [advance() for _ in range(blocks)]
+        fix = state.history.fix
+        calls = dict(fix.counts) if isinstance(fix, GraphedFunction) else {}
+        pipeline.stage = clock
+        stages: dict[str, list[float]] = {}
+        for _ in range(blocks):
+            advance()
+            for name, ms in clock.take().items():
+                stages.setdefault(name, []).append(ms)
+    peak = torch.cuda.max_memory_allocated(device) / 1e6 if on_gpu else None
     return BlockTimes(first, all_in, stages, calls, peak, torch.cuda.get_device_name(device) if on_gpu else "cpu")
 
 
-def _block(pipeline: BlockPipeline, state: PipelineState, index: int, work: BlockWork, height: int, width: int) -> PipelineState:
-    return pipeline.keep(run_block(pipeline, state, index, work.views, height, width)[1])
+def require_memory(settings: OneFixerSettings, work: BlockWork, device: str) -> None:
+    """Raise `FixerError` with what is needed and what there is if a GPU is absent or too small."""
+    doing = f"measuring {settings.name}"
+    if not torch.cuda.is_available():
+        do = "run it on a machine with a GPU and a CUDA build of torch, or use --device cpu with a smaller fixer"
+        raise FixerError(doing, f"device {device!r}", f"torch {torch.__version__} sees no CUDA device", do)
+    free, total = torch.cuda.mem_get_info(device)
+    need = work.memory_bytes + CONTEXT_BYTES
+    if need > free:
+        found = f"{need / 1e9:.1f} GB needed, {free / 1e9:.1f} GB free of {total / 1e9:.1f} GB"
+        do = "lower --set fixer.window=, --size or precision, use vae.base=24, or free the device"
+        raise FixerError(doing, torch.cuda.get_device_name(device), found, do)

@@ -1,9 +1,10 @@
-"""Drive a scene behind a fixer and keep what went into it and what came out: the closed-loop part of the fixer's bench."""
+"""Drive a scene behind a fixer and record its input and its output: the closed-loop part of the fixer's bench."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,7 @@ import numpy as np
 from alpasim_plugin.bench.fixer_speed import Clip
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
-from alpasim_plugin.fixers.onefixer import OneFixer
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
@@ -21,20 +20,20 @@ from alpasim_plugin.types import U8, CameraSpec, Fixer, Frame, Renderer, RenderR
 from policies import make_policy
 from scenarios.load import load_scenario
 
-SPARE = 8  # frames that a drive is longer, so that the block begun last is completed
+SPARE = 8  # extra frames of a drive, so that the last block is completed
 
 
 @dataclass(frozen=True)
-class LoopSample:
+class DriveSample:
     """One drive behind a fixer.
 
     Attributes:
         clip: Frames of the true poses before the fixer, with their maps, in whole blocks.
         shown: ``(T, H, W, 3)`` uint8 what the policy saw at the same times.
-        ms: Fixer time per frame, one entry per block after the first, everything made for it included.
+        ms: Fixer time per frame, drafts included, one entry per block after the first.
         stages: The same by stage, where the fixer has stages.
         first_ms: Fixer time of the first block.
-        facts: What the mode counted, such as hits.
+        facts: Counts of the mode, such as hits.
     """
 
     clip: Clip
@@ -57,12 +56,12 @@ def drive(
     seed: int = 0,
     device: str = "cpu",
     threads: int | None = None,
-) -> LoopSample:
-    """Drive a scene until so many frames of whole blocks have gone through a fixer.
+) -> DriveSample:
+    """Drive a scene until at least ``frames`` frames of whole blocks have gone through a fixer.
 
     Args:
         scene: A shipped name or a scenario file that is long enough; its first camera is used.
-        frames: Least number of frames; a block that was begun is completed.
+        frames: Least number of frames; the last block is completed.
         size: Width and height of the camera, pixels; its field of view stays.
         settings: The fixer.
         scene_id: Key of the fixer's noise.
@@ -75,20 +74,21 @@ def drive(
     loaded = load_scenario(scene, overrides=[f"timing.duration_us={(frames + SPARE) * loaded.rates.camera_us}"])
     scenario = replace(loaded, cameras=(resized(loaded.cameras[0], *size),))
     base = make_renderer(renderer, scenario, seed, "cpu", threads)
-    tap = _Tap(make_fixer(settings.name, settings, scene_id=scene_id, seed=seed, device=device, threads=threads), device)
-    fixed = fixed_renderer(base.render, lambda: tap, settings, scenario, threads)
-    watched = _Watched(fixed)
+    fixer = _RecordingFixer(make_fixer(settings.name, settings, scene_id=scene_id, seed=seed, device=device, threads=threads))
+    fixed = fixed_renderer(base.render, lambda: fixer, settings, scenario, threads)
+    recording = _RecordingRenderer(fixed)
     with Recorder(scenario, seed, images="none") as recorder:
-        run_rollout(scenario, watched, make_policy(policy, scenario), seed, recorder)
-    given = [frame for block in tap.given for frame in block]
-    maps = [image for block in tap.maps for image in block]
-    ends = np.cumsum([len(block) for block in tap.given])
-    spent = [float(sum(watched.ms[end - len(block) : end])) for end, block in zip(ends, tap.given, strict=True)]
-    shares = [ms / len(block) for ms, block in zip(spent, tap.given, strict=True)]
-    names = sorted({name for taken in tap.stages for name in taken})
-    stages = {name: [taken.get(name, 0.0) / len(block) for taken, block in zip(tap.stages, tap.given, strict=True)][1:] for name in names}
-    shown = np.stack([frame.rgb for frame in watched.frames[: len(given)]])
-    return LoopSample(Clip.of(given, maps), shown, shares[1:], stages, spent[0], fixed.facts())
+        run_rollout(scenario, recording, make_policy(policy, scenario), seed, recorder)
+    given = [frame for block in fixer.given for frame in block]
+    maps = [image for block in fixer.maps for image in block]
+    shown = np.stack([frame.rgb for frame in recording.frames[: len(given)]])
+    ends = np.cumsum([0, *(len(block) for block in fixer.given)])
+    per_block = [recording.ms[begin:end] for begin, end in pairwise(ends)]
+    names = sorted({name for ms in recording.ms for name in ms} - {"map"})
+    series = {name: [float(np.mean([ms.get(name, 0.0) for ms in block])) for block in per_block] for name in names}
+    all_in = [sum(parts) for parts in zip(*series.values(), strict=True)]
+    stages = {name.removeprefix("fix: "): ms[1:] for name, ms in series.items() if name != "fix"}
+    return DriveSample(Clip.of(given, maps), shown, all_in[1:], stages, all_in[0] * len(fixer.given[0]), fixed.facts())
 
 
 def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
@@ -98,20 +98,19 @@ def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:
 
 
 @dataclass
-class _Tap(Fixer):
-    """A fixer that remembers the blocks it took into its history, and its stages' times."""
+class _RecordingFixer(Fixer):
+    """A fixer that records the blocks it takes into its history."""
 
     fixer: Fixer
-    device: str
     given: list[Sequence[Frame]] = field(default_factory=list)
     maps: list[Sequence[U8]] = field(default_factory=list)
-    stages: list[dict[str, float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.blocks, self.trained, self.label = self.fixer.blocks, self.fixer.trained, self.fixer.label
-        self.clock = StageClock(self.device)
-        if isinstance(self.fixer, OneFixer) and self.device == "cpu":  # elsewhere clocks at the stages would slow the whole
-            self.fixer.pipeline.stage = self.clock
+
+    @property
+    def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
+        return getattr(self.fixer, "stage_ms", {})
 
     def reset(self, seed: int) -> None:
         self.fixer.reset(seed)
@@ -120,21 +119,19 @@ class _Tap(Fixer):
         return self.fixer.preview(block, maps)
 
     def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
-        fixed = self.fixer.step(block, maps)
         self.given.append(tuple(block))
         self.maps.append(tuple(maps))
-        self.stages.append(self.clock.take())
-        return fixed
+        return self.fixer.step(block, maps)
 
 
-class _Watched(Renderer):
-    """A renderer that remembers the frames it handed out and the fixer's time for each."""
+class _RecordingRenderer(Renderer):
+    """A renderer that records its frames and, per frame, the milliseconds by stage."""
 
     def __init__(self, renderer: FixedRenderer) -> None:
         self._renderer = renderer
         self.lookahead, self.block = renderer.lookahead, renderer.block
         self.frames: list[Frame] = []
-        self.ms: list[float] = []
+        self.ms: list[dict[str, float]] = []
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
@@ -146,6 +143,5 @@ class _Watched(Renderer):
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         frames = self._renderer.render_batch(requests)
         self.frames += frames
-        spent = sum(ms for stage, ms in self._renderer.stage_ms.items() if stage != "map")
-        self.ms += [spent / len(frames)] * len(frames)
+        self.ms += [{stage: ms / len(frames) for stage, ms in self.stage_ms.items()}] * len(frames)
         return frames

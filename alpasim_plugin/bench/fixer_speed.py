@@ -1,6 +1,6 @@
 """Time a fixer stage by stage over a recorded clip, with the memory it takes.
 
-Two passes keep the numbers honest: one without any hook gives the all-in times, one with a clock at every stage gives the stages.
+Passes without any clock give the all-in times, further passes with a clock at every stage give the stages.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MB = 1e6
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames of one camera with their semantic maps, as a fixer was given them in a rollout.
+    """Frames of one camera with their semantic maps, the input of a fixer in a rollout.
 
     Attributes:
         camera: Its name.
@@ -57,7 +57,7 @@ class Clip:
         return [Frame(int(t_us), self.camera, rgb, alpha) for t_us, rgb, alpha in rows]
 
     def blocks(self, rule: Callable[[int], int]) -> Iterator[tuple[list[Frame], list[U8]]]:
-        """Yield whole blocks of frames with their maps; what is left at the end and fills none is not given out."""
+        """Yield whole blocks of frames with their maps; frames at the end that fill no block are left out."""
         frames, start, index = self.frames(), 0, 0
         while start + rule(index) <= len(frames):
             end = start + rule(index)
@@ -106,21 +106,25 @@ def measure(
     Returns:
         Times, memory and the first pass's images.
     """
-    before_mb = resident_mb() if device == "cpu" else None
+    before_mb = _status_mb("VmRSS") if device == "cpu" else 0.0
     clock = StageClock(device)
     begin = clock.now()
     fixer = OneFixer(settings, scene_id, seed, device, threads)
-    fixer.pipeline.stage = no_clock
     timing = Timing((clock.now() - begin) * 1e3, 0.0)
     images: list[U8] = []
     guarded: list[bool] = []
-    for run in range(passes):
+    for run in range(2 * passes):
+        stages = run >= passes
+        fixer.pipeline.stage = clock if stages else no_clock
         fixer.reset(seed)
         for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
             begin, used = clock.now(), time.process_time()
             fixed = fixer.step(frames, maps)
-            ms, cpu_ms = (clock.now() - begin) * 1e3, (time.process_time() - used) * 1e3
-            if index:
+            ms, cpu_ms, taken = (clock.now() - begin) * 1e3, (time.process_time() - used) * 1e3, clock.take()
+            if index and stages:
+                for name in timing.stages:
+                    timing.stages[name].append(taken[name] / len(frames))
+            elif index:
                 timing.all_in.append(ms / len(frames))
                 timing.cpu.append(cpu_ms / len(frames))
             elif not run:
@@ -128,31 +132,15 @@ def measure(
             if not run:
                 images += [frame.rgb for frame in fixed]
                 guarded += [bool(frame.events) for frame in fixed]
+        if run == passes - 1:
+            peak_mb = _status_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
+            timing.peak_mb = None if peak_mb is None or before_mb is None else peak_mb - before_mb
     timing.images, timing.guarded = np.stack(images), np.array(guarded)
-    peak = peak_mb(device)
-    timing.peak_mb = None if peak is None or (before_mb is None and device == "cpu") else peak - (before_mb or 0.0)
-    fixer.pipeline.stage = clock
-    for _ in range(passes):
-        fixer.reset(seed)
-        for index, (frames, maps) in enumerate(clip.blocks(fixer.blocks.frames)):
-            fixer.step(frames, maps)
-            for name, ms in clock.take().items():
-                if index and name in timing.stages:
-                    timing.stages[name].append(ms / len(frames))
     return timing
 
 
-def resident_mb() -> float | None:
-    """Return this process's resident memory, None where the system does not tell."""
-    return _status_mb("VmRSS")
-
-
-def peak_mb(device: str) -> float | None:
-    """Return the most memory held so far: resident, or allocated on the device."""
-    return _status_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
-
-
 def _status_mb(key: str) -> float | None:
+    """Return an entry of ``/proc/self/status`` in 1e6 bytes, None where the system has no such file."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
     return next((float(line.split()[1]) * 1024 / MB for line in lines if line.startswith(f"{key}:")), None)

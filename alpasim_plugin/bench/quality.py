@@ -1,4 +1,4 @@
-"""Open-loop quality: a fixer over a recorded clip as it runs in the closed loop, block by block, and what came of it against the truth."""
+"""Open-loop quality: a fixer over a recorded clip, block by block as in the closed loop, compared with the ground truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.refine import StreamTally, refine_frames
+from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.types import I64, U8, Fixer, Frame
@@ -19,7 +19,7 @@ from evaluators.video import clip_quality
 from evaluators.video.perceptual import ImageDistance
 from evaluators.video.summary import TRUTH
 
-RAW = "3dgs"  # the arm of the damaged render as it is
+RAW = "3dgs"  # the arm of the unfixed render
 VERSION = 1  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
@@ -27,10 +27,10 @@ DIGITS = 7  # significant, of stored values
 
 @dataclass(frozen=True)
 class QualityClip:
-    """A damaged render with everything a fixer gets, and the truth; ``T`` frames of one camera."""
+    """A degraded render with the other inputs of a fixer, and the ground truth; ``T`` frames of one camera."""
 
     name: str
-    identity: Mapping[str, Any]  # what tells this clip from another of the same name
+    identity: Mapping[str, Any]  # distinguishes this clip from others of the same name
     render: U8  # (T, H, W, 3)
     truth: U8  # (T, H, W, 3)
     opacity: U8  # (T, H, W), 255 is opaque
@@ -55,18 +55,18 @@ class Arm:
             raise InputError("choosing what to measure", f"arm {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
 
     def content(self) -> dict[str, Any]:
-        """Return everything that decides its pictures."""
+        """Return everything that determines its images."""
         return {"label": self.label, "fixer": self.spec and self.spec.digest}
 
 
 @dataclass(frozen=True)
-class Rolled:
-    """What an arm made of a clip.
+class ArmResult:
+    """Output of an arm on a clip.
 
     Args:
         video: ``(T, H, W, 3)``.
         ms_per_frame: Of every block, the first included; empty where no fixer ran.
-        events: Frames that a guard passed on unrefined, by event.
+        events: Frames that the guard replaced by the raw ones, by event.
     """
 
     video: U8
@@ -75,7 +75,7 @@ class Rolled:
 
 
 def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mapping[str, str]) -> str:
-    """Return the digest of everything that decides a row except how fast the machine is.
+    """Return the digest of everything that determines a row, except the speed of the machine.
 
     Args:
         clip: Already cut to length.
@@ -88,7 +88,7 @@ def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mappi
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def roll(clip: QualityClip, arm: Arm, fixer: Fixer | None) -> Rolled:
+def run_arm(clip: QualityClip, arm: Arm, fixer: Fixer | None) -> ArmResult:
     """Run an arm over a clip.
 
     Args:
@@ -100,19 +100,21 @@ def roll(clip: QualityClip, arm: Arm, fixer: Fixer | None) -> Rolled:
         InputError: A fixer that is missing, or given where none runs.
     """
     if (fixer is None) != (arm.spec is None):
-        raise InputError("rolling a clip", f"arm {arm.label!r}", "a fixer too many or too few", "give a session exactly for a fixer's arm")
+        raise InputError(
+            "running an arm", f"arm {arm.label!r}", "a missing or superfluous fixer", "give a session exactly for a fixer's arm"
+        )
     if fixer is None or arm.spec is None or not isinstance(arm.spec.settings, FixerSettings):
-        return Rolled(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
-    tally, frames = StreamTally(), []
+        return ArmResult(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
+    tally, frames = StreamStats(), []
     for block in refine_frames(_frames(clip, arm.spec.settings.uses_map), fixer):
         tally.add(block)
         frames += [frame.rgb for frame in block.fixed]
-    return Rolled(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
+    return ArmResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
 
 
-def measure(clip: QualityClip, arm: Arm, rolled: Rolled, seed: int, networks: Mapping[str, ImageDistance]) -> dict[str, Any]:
+def measure(clip: QualityClip, arm: Arm, result: ArmResult, seed: int, networks: Mapping[str, ImageDistance]) -> dict[str, Any]:
     """Return the row of one clip under one arm, as `evaluators.video.summary` takes it."""
-    found = clip_quality(rolled.video, None if arm.label == TRUTH else clip.truth, networks)
+    found = clip_quality(result.video, None if arm.label == TRUTH else clip.truth, networks)
     return {
         "arm": arm.label,
         "clip": clip.name,
@@ -121,9 +123,9 @@ def measure(clip: QualityClip, arm: Arm, rolled: Rolled, seed: int, networks: Ma
         "size": list(clip.truth.shape[1:3]),
         "values": found.means,
         "identical": found.identical,
-        "events": dict(rolled.events),
+        "events": dict(result.events),
         # The first block is shorter and opens the history; where there are more, it does not count.
-        "ms_per_frame": [round(ms, 4) for ms in rolled.ms_per_frame[1:] or rolled.ms_per_frame],
+        "ms_per_frame": [round(ms, 4) for ms in result.ms_per_frame[1:] or result.ms_per_frame],
         "series": {name: [float(f"{v:.{DIGITS}g}") for v in values] for name, values in found.series.items()},
     }
 

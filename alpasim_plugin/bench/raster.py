@@ -1,14 +1,7 @@
-"""Measure the rasterisers: time beside error, on a random scene with the statistics of a street.
-
-Run ``python -m alpasim_plugin.bench.raster``.
-"""
+"""Measure the rasterisers: time beside error, on a random scene with the statistics of a street."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,7 +27,7 @@ _TORCH_LIMIT = 100_000 * 256 * 144  # Gaussians x pixels up to which the torch b
 
 @dataclass(frozen=True)
 class BenchRow:
-    """Speed of one scene at one size, with the error of the very same image beside it.
+    """Speed of one scene at one size, and the error of the same image.
 
     Attributes:
         n: Gaussians in the scene.
@@ -46,11 +39,11 @@ class BenchRow:
         ms_best: Fastest frame of the prepared scene.
         ms_p50: Median time of a frame.
         ms_p95: 95th percentile of it.
-        cpu_ms: Processor time of a frame, all threads together: what remains comparable on a busy machine.
-        first_ms: Preparing the scene and drawing the first frame, kernels compiled or loaded included where they were not before.
-        max_error: Largest difference of a colour from the float64 reference, full scale 1; None where it was not asked for.
-        share_above_lsb: Share of the pixels that differ by more than 1/255; None likewise.
-        torch_ms: One frame of the torch backend; None where it was left out as too large.
+        cpu_ms: Processor time of a frame, all threads together: comparable on a busy machine too.
+        first_ms: Preparing the scene and drawing the first frame, including compiling or loading kernels.
+        max_error: Largest difference of a colour from the float64 reference, full scale 1.
+        share_above_lsb: Share of the pixels that differ by more than 1/255.
+        torch_ms: One frame of the torch backend; None where the scene is too large for it.
     """
 
     n: int
@@ -64,21 +57,18 @@ class BenchRow:
     ms_p95: float
     cpu_ms: float
     first_ms: float
-    max_error: float | None
-    share_above_lsb: float | None
+    max_error: float
+    share_above_lsb: float
     torch_ms: float | None
 
 
-def bench_raster(
-    sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequence[int] = (1, 2), with_error: bool = True, seed: int = 0
-) -> list[BenchRow]:
-    """Time the CPU rasteriser and compare the images that it made with the reference.
+def bench_raster(sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequence[int] = (1, 2), seed: int = 0) -> list[BenchRow]:
+    """Time the CPU rasteriser and compare its images with the float64 reference, which takes about 75 us per visible Gaussian.
 
     Args:
         sizes: ``(Gaussians, width, height)`` of each scene.
         repeats: Frames timed per row.
         threads: Thread counts to time.
-        with_error: Also draw the float64 reference, which takes about 75 us a visible Gaussian.
         seed: Seed of the scene.
 
     Returns:
@@ -87,7 +77,7 @@ def bench_raster(
     rows = []
     for n, width, height in sizes:
         scene, camera = driving_like_scene(n, seed), driving_camera(width, height)
-        want = rasterize_reference(scene, camera, SKY) if with_error else None
+        reference = rasterize_reference(scene, camera, SKY)
         torch_ms = _torch_ms(scene, camera) if n * width * height <= _TORCH_LIMIT else None
         for count in threads:
             begin = time.perf_counter()
@@ -97,47 +87,15 @@ def bench_raster(
             used = time.process_time()
             times = _times_ms(partial(rasterize_prepared, nodes, camera, SKY, threads=count), repeats)
             cpu_ms = (time.process_time() - used) / repeats * 1e3
-            error = None if want is None else np.abs(out.rgb - want.rgb).max(axis=2)
+            error = np.abs(out.rgb - reference.rgb).max(axis=2)
             rows.append(
                 BenchRow(
                     n, width, height, count, out.stats["visible"], out.stats["pairs"],
                     min(times), float(np.median(times)), float(np.percentile(times, 95)), cpu_ms, first_ms,
-                    None if error is None else float(error.max()), None if error is None else float(np.mean(error > _LSB)), torch_ms,
+                    float(error.max()), float(np.mean(error > _LSB)), torch_ms,
                 )
             )  # fmt: skip
     return rows
-
-
-def start_times_ms() -> tuple[float, float]:
-    """Return the time from starting Python to the first image: with nothing compiled, and with kernels cached by an earlier process."""
-    code = (
-        "import numpy as np; from alpasim_plugin.bench.raster import driving_camera, driving_like_scene;"
-        "from alpasim_plugin.gaussians import rasterize; rasterize(driving_like_scene(1000), driving_camera(64, 36))"
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        first, second = (
-            _times_ms(lambda: subprocess.run([sys.executable, "-c", code], env=environment, check=True), 1)[0] for _ in range(2)
-        )
-    return first, second
-
-
-def format_rows(rows: Sequence[BenchRow]) -> str:
-    """Return the rows as a Markdown table."""
-    lines = [
-        "| Gaussians | image | threads | visible | tile pairs | ms best | p50 | p95 | cpu | first | error, 1/255 | share above | torch |",
-        "|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
-    ]
-    for r in rows:
-        torch_ms = "-" if r.torch_ms is None else f"{r.torch_ms:.0f}"
-        worst = "-" if r.max_error is None else f"{r.max_error / _LSB:.4f}"
-        share = "-" if r.share_above_lsb is None else f"{r.share_above_lsb:.2g}"
-        times = " | ".join(f"{ms:.1f}" for ms in (r.ms_best, r.ms_p50, r.ms_p95, r.cpu_ms))
-        lines.append(
-            f"| {r.n} | {r.width}x{r.height} | {r.threads} | {r.visible} | {r.pairs} | {times} | "
-            f"{r.first_ms:.0f} | {worst} | {share} | {torch_ms} |"
-        )
-    return "\n".join(lines)
 
 
 def _times_ms(call: Callable[[], object], repeats: int) -> list[float]:
@@ -229,9 +187,3 @@ def driving_camera(width: int, height: int) -> PinholeCamera:
     T_world_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T_world_camera[:3, 3] = [0, 0, 1.6]
     return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)
-
-
-if __name__ == "__main__":
-    print(format_rows(bench_raster()))
-    cold_ms, cached_ms = start_times_ms()
-    print(f"\nstart of a process to its first image: {cold_ms:.0f} ms with nothing compiled, {cached_ms:.0f} ms with cached kernels")

@@ -1,7 +1,4 @@
-"""Measure the rasteriser's forward and backward pass: time beside the error of the gradient, on the random street of `bench`.
-
-Run ``python -m alpasim_plugin.bench.raster_gradient`` or ``simrun bench raster --gradients``.
-"""
+"""Measure the rasteriser's forward and backward pass: time beside the error of the gradient, on the random street of `raster`."""
 
 from __future__ import annotations
 
@@ -23,12 +20,12 @@ from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, ras
 
 SIZES: tuple[Size, ...] = ((10_000, 256, 144), (30_000, 256, 144), (100_000, 480, 272))
 FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
-_TWIN_LIMIT = 10_000 * 256 * 144  # Gaussians x pixels up to which the float64 twin fits into memory
+_REFERENCE_LIMIT = 10_000 * 256 * 144  # Gaussians x pixels up to which the float64 reference fits into memory
 
 
 @dataclass(frozen=True)
 class GradientBenchRow:
-    """Speed of one view's forward and backward pass, with the error of the very same gradients beside it.
+    """Speed of one view's forward and backward pass, and the error of the same gradients.
 
     Attributes:
         n: Gaussians in the scene, all of their parameters with gradients, harmonics of degree 3.
@@ -40,10 +37,10 @@ class GradientBenchRow:
         backward_ms: Median of the backward pass.
         ms_best: Fastest forward and backward pass together.
         ms_p50: Median of both together.
-        cpu_ms: Processor time of both, all threads together, median: what remains comparable on a busy machine.
-        error: Largest over the fields of ``|g - g64| / |g64|`` (Euclidean norms over a field) with ``g64`` from autograd of the torch twin
-            in float64; None where that would not fit into memory.
-        twin_ms: One forward and backward pass of the torch twin in float64; None likewise.
+        cpu_ms: Processor time of both, all threads together, median: comparable on a busy machine too.
+        error: Largest over the fields of ``|g - g64| / |g64|`` (Euclidean norms over a field) with ``g64`` from autograd of the torch
+            rasteriser in float64; None where that does not fit into memory.
+        reference_ms: One forward and backward pass of that reference; None likewise.
     """
 
     n: int
@@ -57,13 +54,13 @@ class GradientBenchRow:
     ms_p50: float
     cpu_ms: float
     error: float | None
-    twin_ms: float | None
+    reference_ms: float | None
 
 
 def bench_gradients(
     sizes: Sequence[Size] = SIZES, repeats: int = 15, threads: Sequence[int] = (1, 2), seed: int = 0
 ) -> list[GradientBenchRow]:
-    """Time both passes and compare the gradients with the twin's.
+    """Time both passes and compare the gradients with the reference.
 
     Args:
         sizes: ``(Gaussians, width, height)`` of each scene.
@@ -77,7 +74,7 @@ def bench_gradients(
     rows = []
     for n, width, height in sizes:
         scene, camera = driving_like_scene(n, seed), driving_camera(width, height)
-        twin = _twin(scene, camera) if n * width * height <= _TWIN_LIMIT else None
+        reference = _reference(scene, camera) if n * width * height <= _REFERENCE_LIMIT else None
         for count in threads:
             splats = Splats.from_cloud(scene)
             leaves = [getattr(splats, name).requires_grad_(True) for name in FIELDS]
@@ -85,18 +82,18 @@ def bench_gradients(
             forward, backward, cpu = np.median(times, axis=0)
             both = times[:, 0] + times[:, 1]
             visible = int((rasterize_gradient(splats, camera, threads=count).screen.radii > 0).sum())
-            error = None if twin is None else max(_relative(a.grad, b) for a, b in zip(leaves, twin[0], strict=True))
+            error = None if reference is None else max(_relative(a.grad, b) for a, b in zip(leaves, reference[0], strict=True))
             rows.append(
                 GradientBenchRow(
                     n, width, height, count, visible, forward, backward, float(both.min()), float(np.median(both)), cpu, error,
-                    None if twin is None else twin[1],
+                    None if reference is None else reference[1],
                 )
             )  # fmt: skip
     return rows
 
 
 def _loss(rgb: Tensor) -> Tensor:
-    """Return the squared difference to a fixed picture of stripes: no error is zero and none is alike."""
+    """Return the squared difference to a fixed image of stripes: residuals differ from pixel to pixel and none is zero."""
     target = torch.linspace(0, 40, rgb.numel(), dtype=rgb.dtype).sin().abs().reshape(rgb.shape)
     return (rgb - target).square().sum()
 
@@ -113,8 +110,8 @@ def _pass(splats: Splats, leaves: list[Tensor], camera: PinholeCamera, threads: 
     return (middle - begin) * 1e3, (end - middle) * 1e3, (time.process_time() - used) * 1e3
 
 
-def _twin(scene: GaussianCloud, camera: PinholeCamera) -> tuple[list[Tensor], float]:
-    """Return the gradients of the torch twin in float64, in the order of FIELDS, and the time for them, milliseconds."""
+def _reference(scene: GaussianCloud, camera: PinholeCamera) -> tuple[list[Tensor], float]:
+    """Return the gradients of the torch rasteriser in float64, in the order of FIELDS, and the time for them, milliseconds."""
     s = Splats.from_cloud(scene)
     leaves = [getattr(s, name).double().requires_grad_(True) for name in FIELDS]
     means, log_scales, quaternions, logits, sh = leaves
@@ -126,23 +123,6 @@ def _twin(scene: GaussianCloud, camera: PinholeCamera) -> tuple[list[Tensor], fl
     return [leaf.grad for leaf in leaves if leaf.grad is not None], spent
 
 
-def _relative(found: Tensor | None, wanted: Tensor) -> float:
+def _relative(found: Tensor | None, expected: Tensor) -> float:
     assert found is not None
-    return float((found.double() - wanted).norm() / wanted.norm())
-
-
-def format_gradient_rows(rows: Sequence[GradientBenchRow]) -> str:
-    """Return the rows as a Markdown table."""
-    lines = [
-        "| Gaussians | image | visible | threads | forward, ms | backward | both p50 | best | cpu | gradient error | torch float64 |",
-        "|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
-    ]
-    for r in rows:
-        error, twin = "-" if r.error is None else f"{r.error:.1e}", "-" if r.twin_ms is None else f"{r.twin_ms:.0f}"
-        times = " | ".join(f"{ms:.1f}" for ms in (r.forward_ms, r.backward_ms, r.ms_p50, r.ms_best, r.cpu_ms))
-        lines.append(f"| {r.n} | {r.width}x{r.height} | {r.visible} | {r.threads} | {times} | {error} | {twin} |")
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    print(format_gradient_rows(bench_gradients()))
+    return float((found.double() - expected).norm() / expected.norm())

@@ -1,7 +1,7 @@
-"""Weights for measuring: seeded, of the real sizes, and about as busy as a trained fixer's, which an identity is not.
+"""Stand-in weights for measuring: random, of the real sizes, with corrections as large as a trained fixer's.
 
-An identity shows no error of a reduced precision: its transformer's output is multiplied by zero. These weights make every layer count
-and move the latents by a quarter of their spread, as a repair would.
+An identity shows no error of a reduced precision, for its transformer's output is multiplied by zero. With these weights every layer
+contributes, and latents change by a quarter of their standard deviation.
 """
 
 from __future__ import annotations

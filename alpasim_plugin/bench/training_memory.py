@@ -1,4 +1,4 @@
-"""What a training sample takes: peak memory and time over clip length and perceptual horizon, each measured in a fresh process."""
+"""Peak memory and time of one training sample over clip length and perceptual horizon, each measured in a fresh process."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def measure_memory(
     cells = []
     for n in latents:
         for k in (k for k in horizons if k <= n):
-            with context.Pool(1) as pool:  # a process's peak never falls: every cell needs its own
+            with context.Pool(1) as pool:  # the peak of a process never falls, so every cell has its own
                 cells.append(pool.apply(_measure, (DiTSizes(**settings.dit.model_dump()), n, k, clips, rows, columns, settings.window)))
     return cells
 

@@ -1,9 +1,8 @@
-"""``simrun bench fixer``: what a fixer's settings cost, and what they do to its pictures."""
+"""``simrun bench fixer``: time and error of a fixer, setting by setting."""
 
 from __future__ import annotations
 
 import json
-import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -13,8 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.bench.fixer import Plan, Row
-from alpasim_plugin.bench.fixer_run import Bench, bench_fixer
+from alpasim_plugin.bench.fixer import Bench, BenchOptions, Row, bench_fixer
 from alpasim_plugin.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
@@ -37,7 +35,7 @@ def fixer(
     passes: Annotated[int, typer.Option("--passes", min=1, help="Runs over the drive per row.")] = 3,
     quick: Annotated[bool, typer.Option("--quick", help="21 frames, one pass, without the slow networks.")] = False,
     only: Annotated[str, typer.Option("--only", help=f"Groups of settings, comma-separated: {', '.join(MARKERS)}.")] = "",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the drive, the noise and made-up weights.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the drive, the noise and stand-in weights.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for table.md, rows.json and plot.png.")] = None,
@@ -45,7 +43,7 @@ def fixer(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Time a fixer's stages setting by setting, with the error of the same pictures beside it.
+    """Time a fixer's stages setting by setting, with the error of the same images beside it.
 
     Rounding is the error against the same setting in float32 over the whole clip at once; model is the error against the base setting
     with a window over the whole clip.
@@ -54,8 +52,10 @@ def fixer(
     if docs and not PAGE.is_file():
         raise InputError("writing the fixer's bench into the docs", str(PAGE), "no such file", "run it at the root of the repository")
     own = tuple(fixer_overrides(overrides or []))
-    plan = Plan(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
-    bench = bench_fixer(plan, parse_sizes(sizes), 21 if quick else frames, (lambda row: None) if as_json else _say)
+    options = BenchOptions(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
+    bench = bench_fixer(
+        options, [parse_size(size) for size in sizes.split(",")], 21 if quick else frames, (lambda row: None) if as_json else _print_row
+    )
     document = as_document(bench)
     if out is not None:
         write_results(bench, out)
@@ -78,20 +78,21 @@ def fixer(
     print(machine_line(bench.facts))
 
 
-def parse_sizes(text: str) -> list[tuple[int, int]]:
-    """Return widths and heights.
+def parse_size(text: str, multiple: int = 1) -> tuple[int, int]:
+    """Return width and height, pixels.
 
     Example:
-        >>> parse_sizes("256x144,64x48")
-        [(256, 144), (64, 48)]
+        >>> parse_size("256x144")
+        (256, 144)
 
     Raises:
-        InputError: Anything else.
+        InputError: Anything but two positive multiples of ``multiple``.
     """
-    found = [re.fullmatch(r"\s*(\d+)x(\d+)\s*", part) for part in text.split(",")]
-    if not all(found):
-        raise InputError("reading --sizes", f"--sizes {text}", "not WIDTHxHEIGHT", "write sizes such as 256x144,480x272")
-    return [(int(match[1]), int(match[2])) for match in found if match]
+    sides = [int(part) if part.strip().isdecimal() else 0 for part in text.split("x")]
+    if len(sides) != 2 or any(side < 1 or side % multiple for side in sides):
+        found = f"not two positive {f'multiples of {multiple}' if multiple > 1 else 'integers'}"
+        raise InputError("reading an image size", text, found, "write WIDTHxHEIGHT, such as 960x544")
+    return sides[0], sides[1]
 
 
 def parse_groups(text: str) -> tuple[str, ...]:
@@ -121,7 +122,7 @@ def write_results(bench: Bench, folder: Path) -> None:
 
 
 def machine_line(facts: dict[str, Any]) -> str:
-    """Say in one line what it was measured on, the load of the machine included."""
+    """Return one line on the fixer, the machine and its load."""
     where = facts.get("accelerator") or f"{facts['hardware']['cpu']}, {facts['threads']} thread(s) on {facts['hardware']['cores']} cores"
     before, after = facts["load_before_after"]
     chosen = f" with {', '.join(facts['overrides'])}" if facts["overrides"] else ""
@@ -131,7 +132,7 @@ def machine_line(facts: dict[str, Any]) -> str:
     )
 
 
-def _say(row: Row) -> None:
+def _print_row(row: Row) -> None:
     """Report a finished row on standard error."""
     ms = "not measured" if row.problem else f"{row.ms['all-in'][0]:.1f} ms a frame"
     print(f"{row.size[0]}x{row.size[1]} {row.group}: {row.name}, {ms}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""``simrun bench roofline``: how fast a fixer could be on a device, and how fast it is there."""
+"""``simrun bench roofline``: lower bounds of a fixer's time per block on a device, and measured times."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 import typer
 
 from alpasim_plugin.bench.block_speed import BlockTimes, measure_blocks
-from alpasim_plugin.bench.block_work import TEXT_TOKENS, BlockWork, block_work
-from alpasim_plugin.bench.roofline import Device, device_of
+from alpasim_plugin.bench.roofline import TEXT_TOKENS, BlockWork, Device, block_work, device_of
+from alpasim_plugin.cli.bench_fixer import parse_size
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 
-SIDE = 16
+SIDE = 16  # pixels of a token
 
 EPILOG = """
 Examples:
@@ -26,7 +26,7 @@ Examples:
 
 - `simrun bench roofline --fixer onefixer-2b --size 960x544 --on h200 --measure --device cuda`
 
-- `simrun bench roofline --fixer onefixer-tiny --size 256x144 --on 3:0.15:0.3:20:8 --measure`
+- `simrun bench roofline --fixer onefixer-tiny --size 256x144 --on 3:0.15:20:8 --measure --device cpu`
 """
 
 
@@ -34,10 +34,10 @@ def roofline(
     name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer-2b",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
     size: Annotated[str, typer.Option("--size", help="Width x height, multiples of 16.")] = "960x544",
-    views: Annotated[int, typer.Option("--views", min=1, help="Cameras side by side.")] = 1,
+    views: Annotated[int, typer.Option("--views", min=1, help="Cameras in the batch.")] = 1,
     text_tokens: Annotated[int, typer.Option("--text-tokens", min=1, help="Length of the prompt.")] = TEXT_TOKENS,
     on: Annotated[
-        str, typer.Option("--on", help="h200, h100, a100, rtx4090, or half:float32:int8:bandwidth:memory in TFLOP/s, TOP/s, GB/s, GB.")
+        str, typer.Option("--on", help="h200, h100, a100, rtx4090, or half:float32:bandwidth:memory in TFLOP/s, GB/s, GB.")
     ] = "h200",
     measure: Annotated[bool, typer.Option("--measure", help="Also run it, with random weights, on --device.")] = False,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where to measure.")] = "cuda",
@@ -48,16 +48,16 @@ def roofline(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Count a fixer's work per block without running it, and say what a device needs for it at best.
+    """Count a fixer's work per block without running it, and print lower bounds of its time on a device.
 
-    The compute floor lets everything but products and convolutions be free; the eager floor lets every operation wait for its own
-    arithmetic or memory traffic. Needs neither weights nor a GPU, except to measure.
+    The compute floor counts products and convolutions alone; the eager floor adds up all operations, each at its own arithmetic or
+    memory traffic. Needs neither weights nor a GPU, except to measure.
     """
     del debug
     settings = fixer_settings(name, fixer_overrides(overrides or []))
     if not isinstance(settings, OneFixerSettings):
         raise InputError("counting a fixer's work", f"--fixer {name}", "it has no networks to count", "take one of the onefixer family")
-    width, height = parse_size(size)
+    width, height = parse_size(size, SIDE)
     limits = device_of(on)
     work = block_work(settings, height, width, views, text_tokens)
     times = measure_blocks(settings, work, height, width, device, blocks, text_tokens, attention) if measure else None
@@ -68,25 +68,11 @@ def roofline(
     print("\n".join(table(work, limits, times)))
     print(
         f"\nmemory: weights {work.weight_bytes / 1e9:.2f} GB, cache {work.cache_bytes / 1e9:.2f} GB, "
-        f"codecs' memories {work.state_bytes / 1e9:.2f} GB; at least {work.memory_bytes / 1e9:.1f} GB to run"
+        f"codec states {work.state_bytes / 1e9:.2f} GB; at least {work.memory_bytes / 1e9:.1f} GB to run"
     )
     if times is not None:
         peak = "" if times.peak_mb is None else f", peak {times.peak_mb / 1e3:.2f} GB"
         print(f"measured on {times.device}: first block {times.first:.1f} ms{peak}; calls {times.calls or 'not recorded'}")
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height.
-
-    Raises:
-        InputError: Not two multiples of 16.
-    """
-    parts = text.split("x")
-    sides = [int(part) if part.isdigit() else 0 for part in parts]
-    if len(sides) != 2 or any(side < SIDE or side % SIDE for side in sides):
-        do = "write WIDTHxHEIGHT, both multiples of 16, such as 960x544"
-        raise InputError("reading --size", f"--size {text}", "not two multiples of 16", do)
-    return sides[0], sides[1]
 
 
 def table(work: BlockWork, limits: Device, times: BlockTimes | None = None) -> list[str]:

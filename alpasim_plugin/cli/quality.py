@@ -1,4 +1,4 @@
-"""``simrun bench quality``: fixers over recorded clips, open loop, against the frames that there were to see."""
+"""``simrun bench quality``: fixers over recorded clips, open loop, against ground-truth frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.atomic import write_bytes, write_json
-from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, roll, row_key
+from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, row_key, run_arm
 from alpasim_plugin.cli.jobs import spread
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
@@ -30,6 +30,7 @@ from alpasim_plugin.parts import build, resolve
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
+from alpasim_plugin.types import U8
 from evaluators.video.charts import plot_by_frame, plot_speed
 from evaluators.video.sheet import sheet
 from evaluators.video.summary import TRUTH, summarise
@@ -48,7 +49,7 @@ Examples:
 
 @dataclass(frozen=True)
 class Work:
-    """One clip under one arm, as it travels to a process."""
+    """One clip under one arm, as sent to a worker process."""
 
     folder: Path  # of the sequence
     arm: Arm
@@ -168,7 +169,7 @@ def identity(name: str, folder: Path | None) -> str:
 
 
 def finish(work: Work) -> dict[str, Any]:
-    """Bring one clip under one arm to its row, from disk where it is there already."""
+    """Return the row of one clip under one arm, from disk if it is up to date."""
     sequence = PairSequence(work.folder)
     clip = quality_clip(sequence).first(work.frames)
     key = row_key(clip, work.arm, work.seed, work.device, dict(work.networks))
@@ -184,12 +185,10 @@ def finish(work: Work) -> dict[str, Any]:
     if spec is not None:
         scene = str(sequence.info.get("scene_id", sequence.name))
         fixer = build(spec, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
-    rolled = roll(clip, work.arm, fixer)
+    result = run_arm(clip, work.arm, fixer)
     for i in at:
-        done, png = cv2.imencode(".png", cv2.cvtColor(rolled.video[i], cv2.COLOR_RGB2BGR))
-        assert done
-        write_bytes(work.picture_file(i), png.tobytes())
-    row = measure(clip, work.arm, rolled, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
+        _write_png(work.picture_file(i), result.video[i])
+    row = measure(clip, work.arm, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
     write_json(work.row_file, {"key": key, "row": row})
     return row
 
@@ -197,12 +196,12 @@ def finish(work: Work) -> dict[str, Any]:
 def quality_clip(sequence: PairSequence) -> QualityClip:
     """Return a sequence of pairs as a clip to measure on."""
     clip = sequence.clip
-    facts = {**sequence.info, CONTENT: sequence.content}  # a sequence made again is another one, whatever it says of itself
+    facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
     return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
 
 
 def shown_frames(frames: int) -> tuple[int, ...]:
-    """Return the indices of the frames that are shown."""
+    """Return the indices of the frames shown."""
     return tuple(dict.fromkeys(int(share * (frames - 1)) for share in PICTURE_SHARES))
 
 
@@ -219,10 +218,13 @@ def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> N
     for folder, works in shown.items():
         at = shown_frames(int(read_json(works[0].row_file)["row"]["frames"]))
         columns = {work.arm.label: [_picture(work.picture_file(i)) for i in at] for work in works}
-        laid = sheet(columns, [f"frame {i}" for i in at])
-        done_, png = cv2.imencode(".png", cv2.cvtColor(laid, cv2.COLOR_RGB2BGR))
-        assert done_
-        write_bytes(out / "sheets" / f"{folder.name}.png", png.tobytes())
+        _write_png(out / "sheets" / f"{folder.name}.png", sheet(columns, [f"frame {i}" for i in at]))
+
+
+def _write_png(path: Path, rgb: U8) -> None:
+    done, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    assert done
+    write_bytes(path, png.tobytes())
 
 
 def _picture(path: Path) -> Any:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -21,7 +22,7 @@ from alpasim_plugin.types import Fixer
 
 INTERRUPTED = 130
 LINE_EVERY_S = 10.0
-SCENE = "video"  # key of the noise: the same for every file, so that a renamed video gives the same result
+SCENE = "video"  # key of the noise, the same for every file: a renamed video gives the same result
 PREFIX = "fixer."
 
 EPILOG = """
@@ -65,8 +66,8 @@ def refine(
 
     files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
     try:
-        with FrameProgress(quiet or as_json) as progress:
-            summary = refine_video(files, session, progress.frames_done)
+        with frame_progress(quiet or as_json) as show:
+            summary = refine_video(files, session, show)
     except KeyboardInterrupt:
         print("interrupted; nothing was written; the same command starts again", file=sys.stderr)
         raise typer.Exit(INTERRUPTED) from None
@@ -89,7 +90,7 @@ def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
 
 
 def untrained_notice(label: str) -> str:
-    """Say that weights are missing, so that nobody takes a result for a repair."""
+    """Return a warning that the weights are untrained."""
     return f"UNTRAINED: {label}. The result shows the pipeline, not a repair."
 
 
@@ -110,31 +111,26 @@ def describe(summary: RefineSummary, out: Path) -> str:
     return "\n".join(lines)
 
 
-class FrameProgress:
-    """Show frames done on standard error: a bar on a terminal, a line every ten seconds on a pipe."""
+@contextmanager
+def frame_progress(silent: bool) -> Iterator[Callable[[int, int | None], None]]:
+    """Show frames done on standard error: a bar on a terminal, a line every ten seconds on a pipe.
 
-    def __init__(self, silent: bool) -> None:
-        self._silent, self._bar, self._last, self._begin = silent, None, time.perf_counter(), time.perf_counter()
-        if not silent and sys.stderr.isatty():
-            columns = (TextColumn("refining"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"), TimeRemainingColumn())
-            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._task = self._bar.add_task("refining", total=None, speed="")
+    Yields:
+        A function of the number of frames done and of the number that the file claims.
+    """
+    begin = last = time.perf_counter()
+    terminal = sys.stderr.isatty()
+    columns = (TextColumn("refining"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=silent or not terminal) as bar:
+        task = bar.add_task("refining", total=None, speed="")
 
-    def __enter__(self) -> Self:
-        if self._bar is not None:
-            self._bar.start()
-        return self
+        def show(done: int, claimed: int | None) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            speed = f"{done / (now - begin):.1f} frames/s"
+            bar.update(task, completed=done, total=claimed, speed=speed)
+            if not silent and not terminal and now - last > LINE_EVERY_S:
+                last = now
+                print(f"refined {done}{'' if claimed is None else f'/{claimed}'} frames, {speed}", file=sys.stderr, flush=True)
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def frames_done(self, done: int, claimed: int | None) -> None:
-        """Show that ``done`` of ``claimed`` frames are refined."""
-        now = time.perf_counter()
-        speed = f"{done / (now - self._begin):.1f} frames/s"
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, total=claimed, speed=speed)
-        elif not self._silent and now - self._last > LINE_EVERY_S:
-            self._last = now
-            print(f"refined {done}{'' if claimed is None else f'/{claimed}'} frames, {speed}", file=sys.stderr, flush=True)
+        yield show

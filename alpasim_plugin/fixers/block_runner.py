@@ -1,4 +1,4 @@
-"""Make shots and have them fixed: the base renderer, the semantic map and the fixer's calls, each checked and timed."""
+"""Render frames with their semantic maps and run a fixer over blocks of them; every call is checked and timed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DOING = "fixing a block of frames"
 
 
 @dataclass(frozen=True)
-class Shot:
+class ConditionedFrame:
     """One rendered frame with the semantic map of the same view."""
 
     request: RenderRequest
@@ -27,49 +27,49 @@ class Shot:
 
 
 @dataclass
-class Workshop:
-    """What all blocks of a rollout are made with.
+class BlockRunner:
+    """Render and fix the blocks of one rollout.
 
     Attributes:
-        render: The base renderer, checked.
+        render_base: The base renderer; its frames are checked.
         scene_map: The scene's map, or None where the fixer uses none.
         actors: The scenario's, for the sizes of their boxes.
         threads: Threads of the map rasteriser.
-        stage_ms: Time since `start_clock` by stage; the base renderer's is left out.
+        stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
-    render: Callable[[RenderRequest], Frame]
+    render_base: Callable[[RenderRequest], Frame]
     scene_map: PreparedMap | None
     actors: Sequence[Actor]
     threads: int | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
 
-    def start_clock(self) -> None:
-        """Begin a call: every stage met so far stands at zero."""
+    def reset_times(self) -> None:
+        """Set the time of every stage seen so far to zero."""
         self.stage_ms = dict.fromkeys(self.stage_ms, 0.0)
 
-    def shoot(self, request: RenderRequest) -> Shot:
+    def render(self, request: RenderRequest) -> ConditionedFrame:
         """Render one frame and draw its map."""
-        frame = self.render(request)
+        frame = self.render_base(request)
         if self.scene_map is None:
-            return Shot(request, frame, None)
+            return ConditionedFrame(request, frame, None)
         with self._timed("map"):
             boxes = actor_boxes(request.actors, self.actors)
             image = draw_map(self.scene_map, request.camera, request.T_world_camera[-1], boxes, threads=self.threads)
-        return Shot(request, frame, image)
+        return ConditionedFrame(request, frame, image)
 
-    def fix(self, fixer: Fixer, call: Call, shots: Sequence[Shot]) -> list[Frame]:
-        """Have a block fixed and check what comes back.
+    def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:
+        """Fix a block and check the result.
 
         Args:
-            fixer: Whose call it is; for messages, and for the stages it timed itself (``stage_ms``).
+            fixer: Gives its name for messages, and the stages it timed itself (``stage_ms``).
             call: Its ``preview`` or ``step``.
-            shots: The block.
+            block: Frames with their maps.
 
         Raises:
             FixerError: The fixer raised, or its frames have another number, time, camera, size or type.
         """
-        frames, maps = [shot.frame for shot in shots], [shot.map for shot in shots if shot.map is not None]
+        frames, maps = [item.frame for item in block], [item.map for item in block if item.map is not None]
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
         before = dict(fixer.stage_ms)
         with self._timed("fix"):
@@ -79,7 +79,7 @@ class Workshop:
                 raise
             except Exception as error:
                 raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
-        self._own_stages(before, fixer.stage_ms)
+        self._add_fixer_stages(before, fixer.stage_ms)
         problem = _problem(frames, fixed)
         if problem:
             raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")
@@ -91,8 +91,8 @@ class Workshop:
         yield
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
 
-    def _own_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """File what a fixer timed itself (sums that only grow) as ``fix: STAGE``, and the rest of its call as ``fix``."""
+    def _add_fixer_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+        """Add what a fixer timed itself (running sums) as ``fix: STAGE``, and the rest of its call as ``fix``."""
         for stage, total_ms in after.items():
             part_ms = total_ms - before.get(stage, 0.0)
             name = f"fix: {stage}"

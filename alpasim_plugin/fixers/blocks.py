@@ -1,10 +1,10 @@
-"""Put a fixer over a renderer: what comes out is a renderer again."""
+"""Compose a renderer and a fixer into a renderer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from alpasim_plugin.fixers.block_runner import Workshop
+from alpasim_plugin.fixers.block_runner import BlockRunner
 from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
@@ -22,25 +22,25 @@ def fixed_renderer(
     scenario: Scenario,
     threads: int | None = None,
 ) -> FixedRenderer:
-    """Return one rollout's renderer whose frames went through a fixer.
+    """Return one rollout's renderer whose frames are fixed.
 
     A fixer works in blocks (5 frames first, then 8), but the poses of a block's later frames are not known when its first frame falls
-    due. ``settings.mode`` says what to do about it: ``speculative`` (`alpasim_plugin.fixers.speculation`) or ``chunk``
+    due. ``settings.mode`` chooses between ``speculative`` (`alpasim_plugin.fixers.speculation`) and ``chunk``
     (`alpasim_plugin.fixers.chunk`).
 
     Args:
         render: The base renderer of the same rollout; its frames are checked.
-        make_fixer: Makes a fixer without history; called once, and again for cameras of another rhythm.
+        make_fixer: Makes a fixer without history; called once, and again for every further group of cameras with other frame times.
         settings: Mode, tolerances, and whether the fixer wants semantic maps.
         scenario: Its map and its actors' boxes are what the semantic map shows.
         threads: Threads of the map rasteriser; None leaves numba's number.
     """
     scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
-    workshop = Workshop(render, scene_map, scenario.actors, threads)
+    runner = BlockRunner(render, scene_map, scenario.actors, threads)
 
     def make() -> Fixer:
         return complete(make_fixer(), Fixer)
 
     if settings.mode == "chunk":
-        return ChunkRenderer(workshop, make())
-    return SpeculativeRenderer(workshop, make, settings)
+        return ChunkRenderer(runner, make())
+    return SpeculativeRenderer(runner, make, settings)

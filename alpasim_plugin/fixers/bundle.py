@@ -1,7 +1,7 @@
-"""Everything a trained fixer is, in one safetensors file: transformer, autoencoder, prompt, and what it was trained for.
+"""Weights of a fixer in one safetensors file: transformer, autoencoder, prompt, and the settings they were trained with.
 
 Keys carry their part: ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's), ``prompt.text``. The header holds ``format``,
-``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained for. Only safetensors is read: a pickle is
+``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained with. Only safetensors is read: a pickle is
 refused.
 """
 
@@ -23,31 +23,31 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 FORMAT = "simrun-fixer-1"
 PARTS = ("dit", "vae", "decoder", "prompt")
-MUST_MATCH = ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled")  # other values give wrong pictures
+MUST_MATCH = ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled")  # other values give wrong images
 MAY_DIFFER = ("steps", "history", "window", "sink", "holes", "uses_map")  # named in the label
 DOING = "loading a fixer's weights"
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a file holds."""
+    """Contents of a bundle."""
 
     parts: Mapping[str, StateDict]  # by part, keys without it
     trained: bool
-    note: str  # what it is, and what is set otherwise than it was trained for
+    note: str  # description, and settings that differ from training
 
 
 def save_bundle(
     path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: OneFixerSettings, *, trained: bool, note: str = ""
 ) -> None:
-    """Write a bundle, whole or not at all.
+    """Write a bundle atomically.
 
     Args:
         path: A ``.safetensors`` file.
         parts: State dicts by part: ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``: tokens, text_width).
-        settings: What the weights were trained for.
+        settings: What the weights were trained with.
         trained: Whether they were learned.
-        note: A few words on them, for labels.
+        note: Description for labels.
 
     Raises:
         InputError: A part that is not known, or no transformer or autoencoder.
@@ -67,13 +67,8 @@ def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
     Raises:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
-    header = read_metadata(path)
-    if header.get("format") != FORMAT:
-        found = f"format {header.get('format')!r} in its header"
-        do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
-        raise InputError(DOING, str(path), found, do)
-    made_for = json.loads(header.get("settings", "{}"))
-    differs = [(key, _at(made_for, key), _at(settings.model_dump(mode="json"), key)) for key in (*MUST_MATCH, *MAY_DIFFER)]
+    header, trained_with = _header(path)
+    differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*MUST_MATCH, *MAY_DIFFER)]
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in MUST_MATCH]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
@@ -94,13 +89,9 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
     Raises:
         InputError: Not a bundle.
     """
-    header = read_metadata(path)
-    made_for = json.loads(header.get("settings", "{}"))
-    if header.get("format") != FORMAT or not isinstance(made_for, dict) or "name" not in made_for:
-        found = f"format {header.get('format')!r} in its header"
-        raise InputError(DOING, str(path), found, f"give a file that save_bundle wrote ({FORMAT})")
-    name = str(made_for.pop("name"))
-    return name, (*_flat(made_for), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
+    _, trained_with = _header(path)
+    name = str(trained_with.pop("name"))
+    return name, (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
 
 
 def load_tiny_vae(path: str | Path) -> TinyVAE:
@@ -114,12 +105,27 @@ def load_tiny_vae(path: str | Path) -> TinyVAE:
 
 
 def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
-    """Return tensors by what stands before the first dot of their keys, keys without it."""
+    """Group tensors by the part of their keys before the first dot; keys lose it."""
     parts: dict[str, StateDict] = {}
     for key, value in tensors.items():
         part, _, rest = key.partition(".")
         parts.setdefault(part, {})[rest] = value
     return parts
+
+
+def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
+    """Return a bundle's header and the settings in it.
+
+    Raises:
+        InputError: Not a bundle.
+    """
+    header = read_metadata(path)
+    settings = json.loads(header.get("settings", "{}"))
+    if header.get("format") != FORMAT or not isinstance(settings, dict) or "name" not in settings:
+        found = f"format {header.get('format')!r} in its header"
+        do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
+        raise InputError(DOING, str(path), found, do)
+    return header, settings
 
 
 def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:

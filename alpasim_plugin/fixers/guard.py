@@ -1,4 +1,4 @@
-"""A fixer that fails is seen: every frame is looked at, and a broken one is replaced by the raw frame, with an event that says why."""
+"""Check every fixed frame. A broken one is replaced by the raw frame, with an event that names the failure."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from alpasim_plugin.types import U8
 NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"
 LIMIT = 1.5  # a quarter of the range from black to white beyond either end
 SHARE = 0.01  # of a frame's values may lie beyond the limit; decoders overshoot at a few edges
-MOVED = 0.5  # grey levels of mean change in the raw frames that an unchanged output cannot answer
+MOVED = 0.5  # grey levels of mean change in the raw frames above which an unchanged output counts as frozen
 
 
 def failures(video: Tensor) -> list[str]:
-    """Look at a view's decoded frames before they are cut to the range.
+    """Check a view's decoded frames before they are clipped.
 
     Args:
         video: ``(3, T, H, W)``, meant to lie in [-1, 1].
@@ -36,25 +36,25 @@ def failures(video: Tensor) -> list[str]:
 
 
 def black(fixed: U8, raw: U8) -> bool:
-    """Say whether an image went black that was not."""
+    """Return whether the fixed image is black and the raw one is not."""
     return is_black(fixed) and not is_black(raw)
 
 
 def frozen(fixed: U8, before: U8, raw: U8, raw_before: U8) -> bool:
-    """Say whether an output repeats the one before it bit for bit although the raw frame changed."""
+    """Return whether an output repeats the previous one bit for bit although the raw frame changed."""
     if not np.array_equal(fixed, before):
         return False
     return float(np.abs(raw.astype(np.int16) - raw_before).mean()) > MOVED
 
 
-def judge(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
-    """Name what is wrong with each frame of one view.
+def check_frames(video: Tensor, fixed: U8, raw: U8, before: tuple[U8, U8] | None) -> Sequence[str]:
+    """Return the failure of each frame of one view.
 
     Args:
         video: ``(3, T, H, W)`` as decoded.
         fixed: ``(T, H, W, 3)`` the same as images.
         raw: ``(T, H, W, 3)`` what the fixer was given.
-        before: The last fixed and raw frame of the block before, if there was one.
+        before: Last fixed and raw frame of the previous block, if there was one.
 
     Returns:
         T events, "" where a frame is fine.

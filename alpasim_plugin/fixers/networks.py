@@ -32,7 +32,7 @@ Codec = TinyVAE | WanVAE
 
 @dataclass(frozen=True, eq=False)
 class Networks:
-    """Everything that blocks run through; read-only and free of state, so rollouts share it."""
+    """The networks of a fixer; read-only and stateless, so rollouts share them."""
 
     dit: CosmosCausalDiT  # folded where there is one step
     finalise_dit: CosmosCausalDiT  # the same weights for the cache write
@@ -40,7 +40,7 @@ class Networks:
     decoder: Codec | TinyDecoder
     text: TextContext
     trained: bool
-    note: str  # what the weights are, for labels
+    note: str  # description of the weights, for labels
 
     @property
     def device(self) -> torch.device:
@@ -57,20 +57,20 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
     """
     if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
         raise FixerError(DOING, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
-    loop = FixerSettings(name="")  # how the loop uses a fixer has no part in what its networks are
+    loop = FixerSettings(name="")  # settings of the loop do not change the networks
     return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
 
 
 def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, source: str) -> CosmosCausalDiT:
-    """Build a transformer that blocks can be streamed through.
+    """Build a transformer for streaming inference.
 
     Args:
         weights: State dict.
-        settings: Give the stretch of its rotary embedding.
+        settings: Give the NTK ratios of its rotary embedding.
         source: Where the weights come from, for errors.
 
     Raises:
-        InputError: Weights that do not fit together, or whose conditions are not those that streaming gives.
+        InputError: Weights that do not fit together, or whose map input has other channels than streaming gives.
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
     if net.sizes.map_channels != LATENT:
@@ -81,22 +81,27 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, sou
 
 @lru_cache(maxsize=4)
 def _load(settings: OneFixerSettings, device: str) -> Networks:
-    parts, precision = _Parts(settings), settings.precision
-    plain = parts.dit().to(device)
+    return build_networks(Parts(settings), device, device)
+
+
+def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks:
+    """Build, fold and cast the networks; nothing is kept for the next call."""
+    settings, precision = parts.settings, parts.settings.precision
+    plain = parts.dit().to(dit_device)
     with torch.no_grad():
-        text = text_at_precision(plain.encode_text(parts.prompt(plain.sizes).to(device)), precision)
+        text = text_at_precision(plain.encode_text(parts.prompt(plain.sizes).to(dit_device)), precision)
     fold = settings.fold and len(settings.steps) == 1
     # Folded at float32 and cast after that, so that every weight is rounded once.
     dit = at_precision(plain.folded(from_names(settings.steps)[0].t) if fold else plain, precision)
     finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.history == "finalise" else dit
-    vae = codec_at_precision(parts.vae(), settings.codec_precision).to(device)
+    vae = codec_at_precision(parts.vae(), settings.codec_precision).to(codec_device)
     own = settings.decoder.kind != "taehv"
-    decoder = vae if own else codec_at_precision(parts.decoder(), settings.codec_precision).to(device)
+    decoder = vae if own else codec_at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
     return Networks(dit, finalise, vae, decoder, text, parts.trained, parts.note)
 
 
-class _Parts:
-    """Find every part's weights: in the bundle, in a file of its own, or made up as ``untrained`` says."""
+class Parts:
+    """The parts of a fixer with their weights: from the bundle, from a file of their own, or initialised as ``untrained`` says."""
 
     def __init__(self, settings: OneFixerSettings) -> None:
         self.settings, self.weights = settings, settings.weights
@@ -119,13 +124,13 @@ class _Parts:
         settings = self.settings
         given = self.tensors("dit")
         if given is None:
-            self.made_up("dit")
+            self.allow_untrained("dit")
             sizes = DiTSizes(**settings.dit.model_dump())
             given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
         return streaming_dit(given[0], settings, given[1])
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
-        """Return the prompt's features ``(1, tokens, text_width)``; a single zero token where none is given and none was learned."""
+        """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained weights."""
         given = self.tensors("prompt")
         if given is None:
             if self.trained and self.bundle is None:
@@ -142,7 +147,7 @@ class _Parts:
         given, tiny = self.tensors("vae"), self.settings.vae.kind == "tiny"
         if given is not None:
             return (TinyVAE if tiny else WanVAE).from_state_dict(given[0], source=given[1])
-        self.made_up("vae", always_random=not tiny)
+        self.allow_untrained("vae", always_random=not tiny)
         if tiny:
             return TinyVAE.random(TinySizes(*self.settings.vae.widths), self.seed)
         return WanVAE.random(WanLayout.of_base(self.settings.vae.base), self.seed)
@@ -152,11 +157,11 @@ class _Parts:
         given, scaled = self.tensors("decoder"), self.settings.decoder.scaled
         if given is not None:
             return TinyDecoder.from_state_dict(given[0], scaled=scaled, source=given[1])
-        self.made_up("decoder", always_random=True)
+        self.allow_untrained("decoder", always_random=True)
         return TinyDecoder.random(LATENT, TAEHV_WIDTHS, scaled, self.seed)
 
-    def made_up(self, part: str, always_random: bool = False) -> None:
-        """Refuse to go without weights unless the settings allow what would stand in for them."""
+    def allow_untrained(self, part: str, always_random: bool = False) -> None:
+        """Raise the error for missing weights unless the settings allow an untrained part."""
         if self.settings.untrained == "refuse":
             self.refuse(part, "no weights, and settings.untrained is 'refuse'")
         if always_random and self.settings.untrained == "identity":

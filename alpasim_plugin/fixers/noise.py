@@ -1,4 +1,4 @@
-"""The noise that fills a render's holes: one stream per scene, seed, camera, draw and latent, whatever runs beside or before it."""
+"""Noise for the transparent parts of a render: one random stream per scene, seed, camera, draw and latent."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def latent_noise(scene_id: str, seed: int, cameras: Sequence[str], draws: int, l
 
     Args:
         scene_id, seed: Key of the rollout.
-        cameras: Views of the batch, by name.
-        draws: How many a latent takes: one per flow step, and one for a cache write by a forward.
+        cameras: Names of the views in the batch.
+        draws: Per latent: one per flow step, and one for a cache write by a forward.
         latents: Absolute indices in the rollout.
         shape: Channels, height and width of a latent.
 

@@ -1,10 +1,10 @@
 """One block through the networks: encode, mix (Eq. 1), flow (Eq. 2), decode, write the history. Tensors in, tensors out.
 
-A run does not touch the past: it may be made again from the same state, with other frames, any number of times. Its result becomes the past
-when its new state is kept. Only one draft is open at a time, for the cache has one open block.
+A run leaves the history unchanged: it may be repeated from the same state, with other frames, any number of times. `BlockPipeline.keep`
+adds its result to the history. Only one draft is open at a time, for the cache has one open block.
 
-On a GPU a block is recorded once its shapes repeat, and replayed from then on (`nets.graphs`): one recording for the block, one for the
-cache write, per rollout. A clock at the stages needs every stage to run by itself, so it switches recordings off.
+On a GPU a block is recorded as CUDA graphs once its shapes repeat, and replayed from then on (`nets.graphs`): one recording for the block,
+one for the cache write, per rollout. Timing the stages runs them one by one, so it disables recordings.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ Stage = Callable[[str], AbstractContextManager[object]]
 
 
 def no_clock(name: str) -> AbstractContextManager[object]:
-    """Let a stage pass untimed."""
+    """Run a stage untimed."""
     return nullcontext()
 
 
 @dataclass(eq=False)
 class History:
-    """The transformer's cache, which of the states stands at its end, and how to keep the open block."""
+    """The transformer's cache, the state at its end, and the open block."""
 
     cache: RollingCache
     fix: Function  # the block, as it is or through a recording
     finalise: Function  # the cache write
     kept: PipelineState | None = None
     draft: PipelineState | None = None
-    write: Callable[[], None] = field(default=lambda: None, repr=False)
+    write: Callable[[], None] = field(default=lambda: None, repr=False)  # adds the open block to the cache
 
 
 @dataclass(frozen=True, eq=False)
 class PipelineState:
-    """Where a rollout stands before a block. Everything is immutable but the cache, which `History` guards."""
+    """State of a rollout before a block. Everything is immutable but the cache, which `History` guards."""
 
     latent: int  # absolute index of the next block's first latent
-    encoder: State | None  # render and map views side by side
+    encoder: State | None  # render and map views as one batch
     decoder: State | None
     with_map: bool | None  # None before the first block
     history: History
@@ -85,7 +85,7 @@ class BlockPipeline:
         """Return the state before a rollout's first block.
 
         Args:
-            batch: Views side by side.
+            batch: Number of views.
             height, width: Pixels, multiples of 16.
         """
         cache = self.networks.dit.new_cache(batch, height // 8, width // 8, self.settings.window, self.settings.sink)
@@ -110,10 +110,10 @@ class BlockPipeline:
             noise: `draws` standard normal tensors ``(B, 16, block_latents, H / 8, W / 8)``.
 
         Returns:
-            ``(B, 3, T, H, W)``, not cut to [-1, 1], and the state after the block, still a draft.
+            ``(B, 3, T, H, W)``, not clipped to [-1, 1], and the state after the block, still a draft.
 
         Raises:
-            InputError: A state that has been overtaken, a map that comes or goes within a rollout, or another shape.
+            InputError: A state that is out of date, a map in some blocks of a rollout only, or another shape.
         """
         self.keep(state)
         settings = self.settings
@@ -155,7 +155,7 @@ class BlockPipeline:
         encoder: State | None,
         decoder: State | None,
     ) -> tuple[Tensor, Tensor, Tensor, State, State]:
-        """Make frames of frames; writes to nothing but the open block of the cache.
+        """Fix the frames of a block; writes only to the open block of the cache.
 
         Returns:
             Frames, latents, the map's latents, and both codecs' states after the block.
@@ -184,10 +184,10 @@ class BlockPipeline:
 
     @torch.inference_mode()
     def keep(self, state: PipelineState) -> PipelineState:
-        """Make the block that led to ``state`` the past; nothing happens if it is already.
+        """Add the block that led to ``state`` to the history; does nothing if it is part of it already.
 
         Raises:
-            InputError: Another run has been made since, or later blocks were kept.
+            InputError: Another run or later blocks came since.
         """
         history = state.history
         if state is history.draft:
@@ -195,19 +195,19 @@ class BlockPipeline:
                 history.write()
             history.kept, history.draft, history.write = state, None, lambda: None
         elif state is not history.kept:
-            found = "a state that was overtaken by another run or by later blocks"
+            found = "an out-of-date state: another run or later blocks came since"
             do = "continue from the newest state, or start a new rollout"
             raise InputError("continuing a rollout", f"latent {state.latent}", found, do)
         return state
 
     @torch.inference_mode()
-    def forget(self, state: PipelineState) -> PipelineState:
-        """Return a state at the same latent whose past holds nothing that is not a number: no history, memories of codecs cleaned."""
+    def drop_history(self, state: PipelineState) -> PipelineState:
+        """Return a state at the same latent without NaN: the KV cache is emptied, NaN in the codecs' states becomes 0."""
         history = state.history
         history.cache.reset(state.latent)
 
-        def clean(memory: State | None) -> State | None:
-            return None if memory is None else tuple(torch.nan_to_num(part, 0.0, 0.0, 0.0) for part in memory)
+        def clean(codec: State | None) -> State | None:
+            return None if codec is None else tuple(torch.nan_to_num(part, 0.0, 0.0, 0.0) for part in codec)
 
         history.kept = PipelineState(state.latent, clean(state.encoder), clean(state.decoder), state.with_map, history)
         history.draft, history.write = None, lambda: None

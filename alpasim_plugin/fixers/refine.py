@@ -16,7 +16,7 @@ from alpasim_plugin.types import U8, Fixer, Frame
 
 @dataclass(frozen=True)
 class FixedBlock:
-    """One block: what went in, what came out, and how long the fixer took."""
+    """One block: input, output, and the fixer's time."""
 
     given: tuple[Frame, ...]
     fixed: tuple[Frame, ...]
@@ -45,7 +45,7 @@ def refine_frames(frames: Iterable[tuple[Frame, U8 | None]], fixer: Fixer) -> It
 
 @dataclass
 class Difference:
-    """Difference of two streams of images, added up: mean and largest in grey levels, and PSNR over all values.
+    """Accumulated difference of two streams of images: mean and largest in grey levels, and PSNR over all values.
 
     Example:
         >>> difference = Difference()
@@ -60,7 +60,7 @@ class Difference:
     max_levels: int = 0
 
     def add(self, a: U8, b: U8) -> None:
-        """Take in one pair of images of one shape, uint8."""
+        """Add one pair of uint8 images of one shape."""
         levels = np.bincount(np.abs(a.astype(np.int16) - b).ravel(), minlength=256)
         scale = np.arange(256)
         self.values += a.size
@@ -80,8 +80,8 @@ class Difference:
 
 
 @dataclass
-class StreamTally:
-    """What a refined stream added up to: times per frame, difference from what went in, and what the guard saw."""
+class StreamStats:
+    """Statistics of a refined stream: times per frame, difference from the input, guard events."""
 
     frames: int = 0
     ms_per_frame: list[float] = field(default_factory=list)  # one per block
@@ -89,7 +89,7 @@ class StreamTally:
     events: Counter[str] = field(default_factory=Counter)
 
     def add(self, block: FixedBlock) -> None:
-        """Take in one block."""
+        """Add one block."""
         self.frames += len(block.given)
         self.ms_per_frame.append(block.seconds * 1e3 / len(block.given))
         for given, fixed in zip(block.given, block.fixed, strict=True):

@@ -20,20 +20,20 @@ Positive = Annotated[int, Field(ge=1)]
 
 
 class Part(BaseModel):
-    """A section: frozen, and no key that the model does not know."""
+    """A section: frozen, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class FixerSettings(Part):
-    """What the closed loop needs to know of any fixer."""
+    """Settings of any fixer, read by the closed loop."""
 
     name: str = Field(description="Name in tables and reports.")
     block_latents: Positive = Field(default=2, description="Latents of a block: 2 are 8 frames, 5 at the start of a rollout.")
     mode: Literal["chunk", "speculative"] = Field(
         default="speculative",
-        description="chunk: the plan is committed for a block. speculative: a block is made along the plan and made again where "
-        "the true poses leave it.",
+        description="chunk: the plan is committed for a block. speculative: a block is fixed along the predicted poses, and again where "
+        "the true poses differ.",
     )
     tolerance_m: float = Field(default=0.02, ge=0, description="Speculative: largest camera displacement from the predicted pose.")
     tolerance_deg: float = Field(default=0.1, ge=0, description="Speculative: largest camera rotation from the predicted pose.")
@@ -121,18 +121,18 @@ class OneFixerSettings(FixerSettings):
     decoder: DecoderSettings = Field(default=DecoderSettings(), description="From latents to frames.")
     weights: WeightsSettings = Field(default=WeightsSettings(), description="Files with weights.")
     untrained: Literal["identity", "random", "refuse"] = Field(
-        default="refuse", description="What stands in for missing weights: a network that changes nothing, a random one, or an error."
+        default="refuse", description="Initialisation without weights: an identity, random, or an error (refuse)."
     )
-    window: Positive = Field(default=6, description="Latents that a block sees, itself and the sink included.")
-    sink: int = Field(default=0, ge=0, description="First latents of the rollout that stay in sight.")
+    window: Positive = Field(default=6, description="Attention window in latents, the block itself and the sink included.")
+    sink: int = Field(default=0, ge=0, description="Attention sink: first latents of the rollout that stay in the window.")
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
     history: Literal["finalise", "last-forward", "none"] = Field(
         default="last-forward",
-        description="What the history keeps of a block: keys and values of an extra forward, or of the last step. none: no history, "
+        description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step. none: no history, "
         "every frame is fixed by itself.",
     )
     holes: Literal["noise", "render"] = Field(
-        default="noise", description="What a block starts from where the render is transparent: noise (Eq. 1), or the render all the same."
+        default="noise", description="Source of a block where the render is transparent: noise (Eq. 1), or the render."
     )
     precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
     codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")

@@ -1,6 +1,6 @@
-"""Between frames and tensors: grouping by camera and size, filling up to the block's grid, and the way back.
+"""Convert frames to tensors and back: grouping by camera and size, padding to the block's grid, cropping.
 
-A *view* is one camera's frames of a block. Views of one size stand side by side as a batch.
+A *view* is one camera's frames of a block. Views of one size form a batch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Views:
     """The frames of cameras of one size, oldest first."""
 
     cameras: tuple[str, ...]  # B of them, sorted
-    index: tuple[tuple[int, ...], ...]  # per camera, where its T frames stand in the block
+    index: tuple[tuple[int, ...], ...]  # per camera, positions of its T frames in the block
     t_us: tuple[tuple[int, ...], ...]  # per camera
     rgb: U8  # (B, T, H, W, 3)
     alpha: F32 | None  # (B, T, H, W), 0 to 1; None where every pixel is opaque
@@ -43,14 +43,14 @@ class Views:
         """Height and width."""
         return self.size.height, self.size.width
 
-    def same(self, other: Views | None) -> bool:
-        """Say whether two blocks are equal bit for bit."""
+    def equals(self, other: Views | None) -> bool:
+        """Return whether two blocks are equal bit for bit."""
         return other is not None and all(_same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One block as the networks take it, filled up in time and space."""
+    """One block as the networks take it, padded in time and space."""
 
     rgb: Tensor  # (B, 3, T, H, W) in [-1, 1]
     alpha: Tensor | None  # (B, 1, T, H, W), 0 to 1; None where every pixel is opaque
@@ -94,7 +94,7 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
 
 
 def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -> Clip:
-    """Bring views to tensors: ``x / 127.5 - 1``, last frame repeated up to ``frames_due``, edges up to multiples of 16."""
+    """Convert views to tensors: ``x / 127.5 - 1``, the last frame repeated up to ``frames_due``, edges padded to multiples of 16."""
 
     def video(images: U8 | F32) -> Tensor:
         x = torch.from_numpy(images).to(device).float()
@@ -113,7 +113,7 @@ def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -
 
 
 def to_images(video: Tensor, size: ClipSize) -> U8:
-    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values beyond the range are cut."""
+    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values are clipped to the range."""
     levels = crop_clip(video, size).float().clamp(-1, 1).add_(1).mul_(HALF).round_()
     images: U8 = levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
     return images
@@ -143,7 +143,7 @@ def _check_alpha(what: str, alpha: F32, shape: tuple[int, ...]) -> None:
     if alpha.shape != shape:
         raise InputError(DOING, what, f"alpha of {alpha.shape} with rgb of {shape} (height, width)", "give both at one size")
     low, high = float(alpha.min()), float(alpha.max())
-    if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max hand on
+    if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max propagate
         found = f"opacity with {int(np.isnan(alpha).sum())} NaN, values from {np.nanmin(alpha):.4g} to {np.nanmax(alpha):.4g}"
         raise RendererError(DOING, what, found, "repair the renderer: its opacity is accumulated alpha, 0 to 1")
 

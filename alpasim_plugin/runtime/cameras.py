@@ -21,7 +21,7 @@ class CameraRig:
         clock: Ticks of the rollout.
         cadence: When the policy looks; by default at its own period.
         foresight: Source of the forecasts that requests carry, for `lookahead` frames.
-        lookahead: How many of a camera's next frames a request foretells.
+        lookahead: How many of a camera's next frames a request predicts.
 
     Raises:
         InputError: The policy asks for a camera the scenario lacks, or for a period that is no multiple of the control period.

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-COUNTS = ("foretold", "hits", "exact", "drafts", "redrafts")
+COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
 
 
 def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return per renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts``, ``frames`` and ``blocks``.
 
-    In speculative mode also the counts of `alpasim_plugin.fixers.speculation.Tally` over rollouts, ``hit_rate`` (the share of foretold
-    frames that came within tolerance), and the largest ``forecast_error`` and ``shown_error``.
+    In speculative mode also the counts of `alpasim_plugin.fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
+    predicted frames within tolerance), and the largest ``forecast_error`` and ``shown_error``.
 
     Args:
         manifests: Of finished rollouts of one policy.
@@ -26,7 +26,7 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
         entry |= {key: sum(one[key] for one in told) for key in ("frames", "blocks")}
         if entry["mode"] == "speculative":
             entry |= {key: sum(one[key] for one in told) for key in COUNTS}
-            entry["hit_rate"] = round(entry["hits"] / entry["foretold"], 4) if entry["foretold"] else None
+            entry["hit_rate"] = round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None
             entry |= {key: _largest(one[key] for one in told) for key in ("forecast_error", "shown_error")}
         out[name] = entry
     return out

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.refine import StreamTally, refine_frames
+from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.log.video_reader import TimedFrame, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
 from alpasim_plugin.types import F32, U8, Fixer, Frame
@@ -111,7 +111,7 @@ def refine_video(
     """
     check_names(files)
     begin = time.perf_counter()
-    tally = StreamTally()
+    tally = StreamStats()
     with ExitStack() as stack:
         readers = {role: stack.enter_context(VideoReader(path, DOING)) for role, path in files.inputs.items()}
         check_formats(readers)

@@ -16,7 +16,7 @@ from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
 
-# Of a fixer that foretells: the camera's distance between the frame handed out and the truth, and between forecast and truth.
+# Of a fixer that predicts: the camera's distance between the frame handed out and the truth, and between forecast and truth.
 FIXER_FACTS = ("pose_error_m", "forecast_error_m")
 
 

@@ -1,1 +1,1 @@
-"""The semantic map that conditions a fixer: what it shows, prepared once a scene, drawn once a frame."""
+"""The semantic map that conditions a fixer: its layers, prepared once per scene and drawn once per frame."""

@@ -1,7 +1,7 @@
 """Draw the semantic map that conditions a fixer: lanes, boundaries, crossings, signs, lights and road users seen from a camera.
 
-Prepare a scene once (`prepare_map`), then draw it from any camera, pinhole or f-theta. A depth buffer decides what hides what; colours and
-widths fade with depth along the optical axis. The plain twin is `alpasim_plugin.semantic_map.reference`.
+Prepare a scene once (`prepare_map`), then draw it from any camera, pinhole or f-theta. A depth buffer resolves occlusion; colours and
+widths fade with depth along the optical axis. Tests compare with the reference implementation `tests/semantic_map/draw_reference.py`.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ _MARGIN_RAD = 0.1  # half of the widest line reaches this far into the view from
 _NO_SPHERES = np.zeros((0, 4))
 
 
-class _Room(threading.local):
-    """Arrays kept between frames, one set per calling thread."""
+class _Buffers(threading.local):
+    """Arrays reused between frames, one set per calling thread."""
 
     def __init__(self) -> None:
         self.strokes = np.empty((4096, STROKE))
         self.shapes = np.empty((4096, SHAPE))
 
 
-_room = _Room()
+_buffers = _Buffers()
 
 
 def draw_map(
@@ -53,7 +53,7 @@ def draw_map(
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not depend on it.
 
     Raises:
-        InputError: A pose that is not rigid or not finite, a box of impossible size, or a camera that is none.
+        InputError: A pose that is not rigid or not finite, a box of impossible size, or an invalid camera.
     """
     lens, view, pose = view_of(scene, camera, T_world_camera)
     faces, edges = actor_geometry(actors, scene, pose)
@@ -99,9 +99,9 @@ def view_of(scene: PreparedMap, camera: MapCamera, T_world_camera: F64) -> tuple
 
 
 def actor_geometry(actors: Sequence[ActorBox], scene: PreparedMap, pose: F64) -> tuple[Triangles, Segments]:
-    """Return the faces and edges of road users, the nearest first: what they hide is then not shaded.
+    """Return the faces and edges of road users, the nearest first, so that hidden ones are not shaded.
 
-    Faces of a box that the near plane cuts show their insides; of the others those that face away are marked as left out.
+    Boxes cut by the near plane show their inner faces; other boxes are marked closed, so that faces turned away are culled.
     """
     style = scene.style
     poses, sizes = _checked(actors)
@@ -120,7 +120,7 @@ def actor_geometry(actors: Sequence[ActorBox], scene: PreparedMap, pose: F64) ->
 
 
 def _checked(actors: Sequence[ActorBox]) -> tuple[F64, F64]:
-    """Return poses ``(A, 4, 4)`` and sizes ``(A, 3)``, all tested at once; only where that fails the precise message is composed."""
+    """Return poses ``(A, 4, 4)`` and sizes ``(A, 3)``, all checked at once; box by box only for the error message."""
     sizes = np.array([(a.box.length_m, a.box.width_m, a.box.height_m) for a in actors], dtype=np.float64).reshape(-1, 3)
     if all(np.shape(actor.T_world_box) == (4, 4) for actor in actors):
         poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
@@ -137,19 +137,19 @@ def _checked(actors: Sequence[ActorBox]) -> tuple[F64, F64]:
 def _strokes(static: Segments, edges: Segments, pose: F64, lens: KernelCamera, view: F64) -> tuple[int, int, F64]:
     """Project static lines and box edges; returns the number of the first, of all, and their array."""
     while True:
-        room = _room.strokes
-        first = project_strokes(static.ends, static.style, static.spheres, pose, lens.params, lens.table, view, room, 0)
-        count = project_strokes(edges.ends, edges.style, edges.spheres, pose, lens.params, lens.table, view, room, first)
-        if count <= len(room):
-            return int(first), int(count), room
-        _room.strokes = np.empty((count + count // 4, STROKE))
+        out = _buffers.strokes
+        first = project_strokes(static.ends, static.style, static.spheres, pose, lens.params, lens.table, view, out, 0)
+        count = project_strokes(edges.ends, edges.style, edges.spheres, pose, lens.params, lens.table, view, out, first)
+        if count <= len(out):
+            return int(first), int(count), out
+        _buffers.strokes = np.empty((count + count // 4, STROKE))
 
 
 def _shapes(static: Triangles, faces: Triangles, pose: F64, lens: KernelCamera, view: F64) -> tuple[int, F64]:
     while True:
-        room = _room.shapes
-        count = project_shapes(static.corners, static.closed, static.shade, static.style, pose, lens.params, lens.table, view, room, 0)
-        count = project_shapes(faces.corners, faces.closed, faces.shade, faces.style, pose, lens.params, lens.table, view, room, count)
-        if count <= len(room):
-            return int(count), room
-        _room.shapes = np.empty((count + count // 4, SHAPE))
+        out = _buffers.shapes
+        count = project_shapes(static.corners, static.closed, static.shade, static.style, pose, lens.params, lens.table, view, out, 0)
+        count = project_shapes(faces.corners, faces.closed, faces.shade, faces.style, pose, lens.params, lens.table, view, out, count)
+        if count <= len(out):
+            return int(count), out
+        _buffers.shapes = np.empty((count + count // 4, SHAPE))

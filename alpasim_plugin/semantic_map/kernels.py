@@ -1,4 +1,4 @@
-"""From segments and triangles in space to shapes on the image: clipping, adaptive subdivision, projection.
+"""Project segments and triangles to the image: clipping, adaptive subdivision, projection.
 
 A straight line in space is straight in a pinhole's image and 1/depth is linear along it, so one piece is exact. Under an f-theta lens both
 bend: pieces are halved in space until the middle lies within `BEND_PX` of the chord and 1/depth at the middle is right to `DEPTH_ERROR`.
@@ -17,7 +17,7 @@ from alpasim_plugin.semantic_map.prepare import GROUP
 
 BEND_PX = 0.1
 DEPTH_ERROR = 0.02
-WIDE_RAD_COS = 0.94  # pieces seen under more than 20 degrees are halved whatever their middle says
+WIDE_RAD_COS = 0.94  # pieces seen under more than 20 degrees are always halved
 MAX_HALVINGS = 10
 # Entries of a view: image size, near and far plane, cone that holds the view, pixels of this image for one of the style.
 WIDTH, HEIGHT, NEAR, FAR, COS_HALF, SIN_HALF, SCALE = range(7)
@@ -67,7 +67,7 @@ def _bends(camera, table, ax, ay, az, au, av, bx, by, bz, bu, bv):
 
 @njit(cache=True, nogil=True)
 def _add_stroke(out, count, au, av, az, bu, bv, bz, half, style, view):
-    """Append a stroke unless it misses the image; beyond the room of ``out`` only count."""
+    """Append a stroke unless it misses the image; beyond the capacity of ``out`` only count."""
     width, height = view[WIDTH], view[HEIGHT]
     if max(au, bu) < -half or max(av, bv) < -half or min(au, bu) > width + half or min(av, bv) > height + half:
         return count

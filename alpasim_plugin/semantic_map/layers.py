@@ -1,7 +1,7 @@
-"""What the semantic map shows: the layers of a lane map, and those that a lane map does not hold.
+"""Layers of the semantic map: those of a lane map, and those that a lane map does not hold.
 
-A line is drawn once. Where a map gives marking lines of their own, they are believed and lane edges stay undrawn; elsewhere the painted
-edges of lanes are drawn, an edge shared by neighbours once. Edges of unknown paint are drawn as untyped lane boundaries, except inside
+A line is drawn once. Marking lines of the map replace lane edges; without them the painted edges of lanes are drawn, an edge shared by
+neighbours once. Edges of unknown paint are drawn as untyped lane boundaries, except inside
 intersections, where such edges are virtual; edges known to be unpainted are not drawn.
 """
 
@@ -43,7 +43,7 @@ class LaneLine:
 
 @dataclass(frozen=True)
 class TrafficLight:
-    """A traffic light's housing and what it shows."""
+    """A traffic light's housing and its state."""
 
     T_world_box: F64  # (4, 4)
     box: Box
@@ -64,12 +64,12 @@ class ActorBox:
 
     T_world_box: F64  # (4, 4) pose of the box centre
     box: Box
-    label: str  # see `map_style.box_class`
+    label: str  # see `style.box_class`
 
 
 @dataclass(frozen=True)
 class MapExtras:
-    """Layers that `LaneMap` has no room for. ``lane_lines``, where given, replace those derived from the lane map."""
+    """Layers that `LaneMap` does not hold. ``lane_lines``, where given, replace those derived from the lane map."""
 
     lane_lines: tuple[LaneLine, ...] | None = None
     areas: tuple[Area, ...] = ()
@@ -90,7 +90,7 @@ def actor_boxes(poses: Mapping[str, F64], actors: Sequence[Actor]) -> tuple[Acto
 
 
 def lane_lines(lane_map: LaneMap) -> tuple[LaneLine, ...]:
-    """Choose the lane lines of a map so that no place is drawn twice."""
+    """Return the lane lines of a map, each drawn once."""
     painted: list[tuple[F64, Paint]]
     if lane_map.markings:
         painted = [(m.xyz, m.paint) for m in lane_map.markings if len(m.xyz) > 1 and m.paint != "none"]

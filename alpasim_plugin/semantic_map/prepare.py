@@ -1,4 +1,4 @@
-"""Turn the layers of a scene into arrays once: straight segments with width and colour, and flat triangles."""
+"""Convert the layers of a scene to arrays: straight segments with width and colour, and flat triangles."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.semantic_map.layers import POLE_HEIGHT_M, LaneLine, MapExtras, lane_lines
 from alpasim_plugin.semantic_map.style import OPENGL, MapStyle, Rgb
-from alpasim_plugin.semantic_map.triangulate import ear_clip
 from alpasim_plugin.types import F64, Bool, Box, LaneMap
 
 GROUP = 32  # segments that share a bounding sphere
-# Ground areas are pushed this far back: lines painted on them stay visible, and so do smaller areas on larger ones.
+# Depth bias of ground areas, so that lines on them stay visible, and smaller areas on larger ones.
 GROUND_BIAS_M = {"road_marking": 0.3, "crosswalk": 0.4, "road_island": 0.5, "buffer_zone": 0.5, "intersection": 0.6}
 DOING = "preparing the semantic map"
 # Corners of a unit box: bit 2 is +x, bit 1 is +y, bit 0 is +z.
@@ -39,7 +39,7 @@ class Triangles:
     """Flat triangles, relative to the scene's origin."""
 
     corners: F64  # (T, 3, 3) metres
-    closed: Bool  # (T,) whether it is the face of a solid, wound to the left from outside, and may be left out where it faces away
+    closed: Bool  # (T,) whether it is the face of a solid, wound to the left from outside, culled where it faces away
     shade: F64  # (T, 3) position between front colour (0) and back colour (1) at the corners
     style: F64  # (T, 7) bias towards the camera in metres, front r, g, b, back r, g, b
 
@@ -91,7 +91,7 @@ def prepare_map(lane_map: LaneMap, extras: MapExtras | None = None, style: MapSt
         pieces += _lane_line(LaneLine(line.xyz - origin, line.colour, line.patterns), style)
     for name, width_px, group in plain:
         pieces += [(line - origin, width_px, 1.0 if name == "pole" else gain, style.colours[name]) for line in group]
-    corners = [_triangulate(name, ring - origin) for name, ring in areas]
+    corners = [triangulate(name, ring - origin) for name, ring in areas]
     colours = [_flat(-GROUND_BIAS_M[name], style.colours[name], len(c)) for (name, _), c in zip(areas, corners, strict=True)]
     for name, pose, box in boxes:
         corners.append(box_corners(pose, box, origin)[TRIANGLES])
@@ -149,7 +149,7 @@ def _lane_line(line: LaneLine, style: MapStyle) -> list[tuple[F64, float, float,
     offsets = (0.0,) if len(line.patterns) == 1 else (style.double_offset_m, -style.double_offset_m)
     out: list[tuple[F64, float, float, Rgb]] = []
     for pattern, left_m in zip(line.patterns, offsets, strict=True):
-        shifted = _beside(line.xyz, left_m) if left_m else line.xyz
+        shifted = _offset_left(line.xyz, left_m) if left_m else line.xyz
         width_px = style.line_px * (style.other_factor if pattern == "other" else 1.0)
         out += [(piece, width_px, style.line_width_gain, colour) for piece in cut_dashes(shifted, style.patterns[pattern])]
     return out
@@ -179,8 +179,8 @@ def cut_dashes(line: F64, pattern: Sequence[tuple[float, float]]) -> list[F64]:
     return out
 
 
-def _beside(line: F64, left_m: float) -> F64:
-    """Shift a polyline sideways in plan view; corners keep the distance up to a miter of 2."""
+def _offset_left(line: F64, left_m: float) -> F64:
+    """Offset a polyline to the left in plan view; corners keep the distance up to a miter of 2."""
     step = np.diff(line[:, :2], axis=0)
     length = np.linalg.norm(step, axis=1)
     keep = length > 1e-9
@@ -214,10 +214,19 @@ def _spheres(ends: F64) -> F64:
     return out
 
 
-def _triangulate(name: str, ring: F64) -> F64:
-    """Fill a ring ``(N, 3)`` with triangles ``(T, 3, 3)``; a concave outline stays concave."""
+def triangulate(name: str, ring: F64) -> F64:
+    """Return the triangles ``(T, 3, 3)`` that fill a ring ``(N, 3)`` in plan view; concave outlines stay concave.
+
+    The triangulation is the constrained Delaunay one. Of a ring that crosses itself, each lobe is filled.
+
+    Raises:
+        InputError: Fewer than three corners.
+    """
     if len(ring) > 1 and np.array_equal(ring[0], ring[-1]):
         ring = ring[:-1]
     if len(ring) < 3:
         raise InputError(DOING, name, f"an outline of {len(ring)} points", "give at least three corners")
-    return np.asarray(ring[ear_clip(ring[:, :2])])
+    outline = shapely.make_valid(shapely.Polygon(ring))
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
+    corners = shapely.get_coordinates(parts, include_z=True).reshape(-1, 4, 3)  # closed: the last corner repeats the first
+    return np.asarray(corners[:, :3])

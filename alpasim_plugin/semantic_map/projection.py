@@ -30,11 +30,11 @@ class FThetaCamera:
     cx: float
     cy: float
     lens: FTheta
-    calibrated: Literal["pixel_to_angle", "angle_to_pixel"] = "angle_to_pixel"  # the polynomial that is believed; the other is its fit
+    calibrated: Literal["pixel_to_angle", "angle_to_pixel"] = "angle_to_pixel"  # the calibrated polynomial; the other is its fit
     A: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
 
     def resized(self, width: int, height: int) -> FThetaCamera:
-        """Return the camera of the same picture resized to ``width`` x ``height``."""
+        """Return the camera of the same image resized to ``width`` x ``height``."""
         sx, sy = width / self.width, height / self.height
         (a, b), (c, d) = self.A
         scaled = ((a * sx, b * sx), (c * sy, d * sy))
@@ -74,36 +74,20 @@ def _inside(camera: FThetaCamera, theta: F64) -> F64:
     return np.asarray(radius, dtype=np.float64)
 
 
-def project_points(camera: MapCamera, points: F64) -> F64:
-    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)`` in float64, without a table.
-
-    A pinhole needs z > 0: points at or behind its plane give NaN. An f-theta lens sees behind itself where its radius goes on.
-    """
-    x, y, z = points.T
-    if isinstance(camera, CameraSpec):
-        z = np.where(z > 0, z, np.nan)
-        k = camera.K
-        return np.stack([k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], axis=1)
-    across = np.hypot(x, y)
-    radius = radius_of(camera, np.arctan2(across, z))
-    unit = points[:, :2] / np.where(across > 0, across, 1.0)[:, None]
-    return np.asarray((unit * radius[:, None]) @ np.array(camera.A).T + (camera.cx, camera.cy))
-
-
 @dataclass(frozen=True)
 class KernelCamera:
-    """What the kernels read of a camera."""
+    """A camera as arrays for the kernels."""
 
     params: F64  # (9,) is_ftheta, A00 or fx, A01 or skew, A10, A11 or fy, cx, cy, table entries per radian, table's last angle
     table: F64  # (TABLE + 1,) radii; one entry for a pinhole
-    half_angle_rad: float  # no pixel looks further from the axis than this
+    half_angle_rad: float  # largest angle of a pixel from the axis
 
 
 def kernel_camera(camera: MapCamera) -> KernelCamera:
-    """Return the kernel's form of a camera; kept for lenses already seen.
+    """Return a camera as the kernels read it; f-theta lenses are cached.
 
     Raises:
-        InputError: An image without pixels, intrinsics that are no camera's, or a lens whose radius does not grow.
+        InputError: An image without pixels, intrinsics without positive focal lengths, or a lens whose radius does not grow.
     """
     if camera.width < 1 or camera.height < 1:
         size = f"{camera.width} x {camera.height} pixels"

@@ -1,7 +1,7 @@
 """Draw strokes and shapes into an image with a depth buffer, band by band, several samples a pixel.
 
-What is drawn is defined by `alpasim_plugin.semantic_map.reference`; here the same rules skip what cannot be touched. A band of
-rows is drawn by one thread in the order of the lists, so the image does not depend on the number of threads.
+The rules are those of `tests/semantic_map/draw_reference.py`; here pixels that cannot be covered are skipped. A band of rows is drawn by
+one thread in the order of the lists, so the image does not depend on the number of threads.
 """
 
 # Numba's decorators are untyped.

@@ -77,7 +77,7 @@ _LUDUS_PATTERNS: Mapping[Pattern, tuple[tuple[float, float], ...]] = {
 
 @dataclass(frozen=True)
 class MapStyle:
-    """Every rule of drawing that is a number."""
+    """Numeric drawing rules."""
 
     name: str = "opengl"
     line_px: float = 12.0  # lane lines, boundaries, stop lines
@@ -103,7 +103,7 @@ STYLES: Mapping[str, MapStyle] = {style.name: style for style in (OPENGL, LUDUS)
 
 
 def box_class(label: str) -> str:
-    """Return the colour class of an actor's label; what is not known is "other".
+    """Return the colour class of an actor's label; "other" for unknown labels.
 
     Example:
         >>> box_class("bus"), box_class("motorcycle"), box_class("dog")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.bench import fixer as bench
-from alpasim_plugin.bench.fixer import Plan, Row, bench_clip, cases, difference
+from alpasim_plugin.bench.fixer import BenchOptions, Row, bench_clip, cases, difference
 from alpasim_plugin.bench.fixer_table import HEAD, markdown, plot, put_between_marks
 from alpasim_plugin.bench.stand_in import save_stand_in
 from alpasim_plugin.fixers import guard
@@ -23,9 +23,9 @@ GROUPS = ("precision", "window")
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, Row]:
-    plan = Plan(overrides=SMALL_DIT, passes=1, threads=1, only=GROUPS)
+    options = BenchOptions(overrides=SMALL_DIT, passes=1, threads=1, only=GROUPS)
     seen: list[Row] = []
-    made = bench_clip(plan, driving_clip(FRAMES, *SIZE), seen.append, apart=False)
+    made = bench_clip(options, driving_clip(FRAMES, *SIZE), seen.append, own_process=False)
     assert seen == made
     return {f"{row.group}: {row.name}": row for row in made}
 
@@ -82,8 +82,10 @@ def test_other_weights_are_not_compared_with_the_base(rows: dict[str, Row]) -> N
 
 def test_a_setting_that_given_weights_cannot_run_says_why(tmp_path: Path) -> None:
     save_stand_in(tmp_path / "w.safetensors", small_settings())
-    plan = Plan(overrides=(*SMALL_DIT, f"weights.bundle={tmp_path / 'w.safetensors'}"), passes=1, threads=1, only=("decoder",), quick=True)
-    made = {f"{row.group}: {row.name}": row for row in bench_clip(plan, driving_clip(13, *SIZE), apart=False)}
+    options = BenchOptions(
+        overrides=(*SMALL_DIT, f"weights.bundle={tmp_path / 'w.safetensors'}"), passes=1, threads=1, only=("decoder",), quick=True
+    )
+    made = {f"{row.group}: {row.name}": row for row in bench_clip(options, driving_clip(13, *SIZE), own_process=False)}
     assert "decoder.kind" in made["decoder: latent only"].problem
     assert made["decoder: latent and render"].weights == "given"
     assert made["decoder: latent and render"].problem == ""
@@ -91,17 +93,17 @@ def test_a_setting_that_given_weights_cannot_run_says_why(tmp_path: Path) -> Non
     assert "not measured: " in text
 
 
-def test_a_row_measured_apart_gives_the_same_pictures() -> None:
-    plan = Plan(overrides=SMALL_DIT, passes=1, quick=True, threads=1)
+def test_a_row_measured_in_its_own_process_gives_the_same_pictures() -> None:
+    options = BenchOptions(overrides=SMALL_DIT, passes=1, quick=True, threads=1)
     chosen = small_settings("untrained=random")
-    here, apart = bench._here(plan, chosen, driving_clip(13, *SIZE)), bench._apart(plan, chosen, driving_clip(13, *SIZE))
+    here, apart = (bench.measured(options, chosen, driving_clip(13, *SIZE), own_process) for own_process in (False, True))
     assert np.array_equal(here.images, apart.images)
 
 
 def test_frames_that_the_guard_replaced_are_counted_and_left_out_of_the_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard, "LIMIT", 0.5)  # now an ordinary picture is out of range
-    plan = Plan(overrides=(*SMALL_DIT, "untrained=random"), passes=1, quick=True, threads=1, only=("decoder",))
-    row = bench_clip(plan, driving_clip(5, *SIZE), apart=False)[0]
+    options = BenchOptions(overrides=(*SMALL_DIT, "untrained=random"), passes=1, quick=True, threads=1, only=("decoder",))
+    row = bench_clip(options, driving_clip(5, *SIZE), own_process=False)[0]
     assert row.guarded == row.frames == 5
     assert row.rounding is None
     assert "guard: 5 of 5" in markdown([row])

@@ -8,22 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.bench.fixer_drive import LoopSample, drive
+from alpasim_plugin.bench.fixer_drive import DriveSample, drive
+from alpasim_plugin.bench.whole_clip import whole_clip
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.reference import whole_clip
 from tests.fixers.fixer_cases import SMALL_DIT, small_settings
 
 SCENE = "smoke/straight"
 SIZE = (64, 48)
 
 
-def drive_small(mode: str, frames: int = 13, *overrides: str) -> LoopSample:
+def drive_small(mode: str, frames: int = 13, *overrides: str) -> DriveSample:
     settings = small_settings("untrained=identity", f"mode={mode}", *overrides)
     return drive(SCENE, frames, SIZE, settings, "bench", renderer="clean", threads=1)
 
 
-def check(sample: LoopSample, frames: int) -> None:
+def check(sample: DriveSample, frames: int) -> None:
     assert sample.shown.shape == sample.clip.rgb.shape == (len(sample.clip.t_us), SIZE[1], SIZE[0], 3)
     assert len(sample.clip.t_us) >= frames
     assert (np.diff(sample.clip.t_us) == 100_000).all()
@@ -46,7 +46,7 @@ def test_a_speculative_drive_without_tolerance_shows_them_too_and_hits_less() ->
     sample = drive_small("speculative", 13, "tolerance_m=0", "tolerance_deg=0")
     check(sample, 13)
     loose = drive_small("speculative", 13, "tolerance_m=10", "tolerance_deg=90")
-    assert loose.facts["hits"] == loose.facts["foretold"] > sample.facts["hits"]
+    assert loose.facts["hits"] == loose.facts["predicted"] > sample.facts["hits"]
     assert loose.facts["redrafts"] == 0 < sample.facts["redrafts"]
 
 

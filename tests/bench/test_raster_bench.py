@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 
-from alpasim_plugin.bench.raster import bench_raster, driving_camera, driving_like_scene, format_rows, start_times_ms
+from alpasim_plugin.bench.raster import bench_raster, driving_camera, driving_like_scene
 
 
 def test_rows_pair_each_time_with_the_error_of_its_image():
@@ -19,16 +24,6 @@ def test_rows_pair_each_time_with_the_error_of_its_image():
         assert row.share_above_lsb == 0
         assert row.torch_ms > 0
     assert rows[0].max_error == rows[1].max_error
-    table = format_rows(rows)
-    assert table.count("\n") == 3
-    assert "| 2000 | 64x36 | 2 |" in table
-
-
-def test_error_that_was_not_measured_is_none_and_prints_as_a_dash():
-    row = bench_raster(sizes=[(500, 32, 18)], repeats=1, threads=(1,), with_error=False)[0]
-    assert row.max_error is None
-    assert row.share_above_lsb is None
-    assert "| - | - |" in format_rows([row])
 
 
 def test_scene_depends_on_its_seed_alone_and_covers_the_view():
@@ -41,6 +36,16 @@ def test_scene_depends_on_its_seed_alone_and_covers_the_view():
 
 
 @pytest.mark.slow
-def test_kernels_are_compiled_once_and_then_cached():
-    cold_ms, cached_ms = start_times_ms()
-    assert cached_ms < 0.5 * cold_ms
+def test_kernels_are_compiled_once_and_then_cached(tmp_path):
+    code = (
+        "from alpasim_plugin.bench.raster import driving_camera, driving_like_scene;"
+        "from alpasim_plugin.gaussians import rasterize; rasterize(driving_like_scene(1000), driving_camera(64, 36))"
+    )
+
+    def start_s():
+        begin = time.perf_counter()
+        subprocess.run([sys.executable, "-c", code], env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True)
+        return time.perf_counter() - begin
+
+    compiled_s, cached_s = start_s(), start_s()
+    assert cached_s < 0.5 * compiled_s

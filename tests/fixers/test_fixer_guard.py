@@ -46,13 +46,13 @@ def test_frozen_counts_only_where_the_render_moves() -> None:
     raw = pixels(FRAMES[:3])
     out = np.stack([raw[0], raw[0], raw[1]])
     fine = torch.zeros(3, 3, *raw.shape[1:3])
-    assert guard.judge(fine, out, raw, None) == ["", "fixer-frozen", ""]
+    assert guard.check_frames(fine, out, raw, None) == ["", "fixer-frozen", ""]
     standing = np.stack([raw[0]] * 3)
-    assert guard.judge(fine, standing, standing, (raw[0], raw[0])) == ["", "", ""]
-    assert guard.judge(fine, out, raw, (raw[0], raw[2]))[0] == "fixer-frozen", "also across blocks"
+    assert guard.check_frames(fine, standing, standing, (raw[0], raw[0])) == ["", "", ""]
+    assert guard.check_frames(fine, out, raw, (raw[0], raw[2]))[0] == "fixer-frozen", "also across blocks"
     flicker = standing.copy()
     flicker[1, 0, 0, 0] ^= 1
-    assert guard.judge(fine, standing, flicker, None) == ["", "", ""]
+    assert guard.check_frames(fine, standing, flicker, None) == ["", "", ""]
 
 
 def test_numbers_that_are_none_are_replaced_and_do_not_stay(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,13 +69,13 @@ def test_equal_blocks_are_told_from_others() -> None:
     maps = maps_of(frames)
     (views,) = group_views(frames, maps, 5)
     copies = [replace(f, rgb=f.rgb.copy(), alpha=f.alpha.copy()) for f in frames]
-    assert views.same(group_views(copies, [m.copy() for m in maps], 5)[0])
-    assert not views.same(None)
-    assert not views.same(group_views(frames, [], 5)[0])
-    assert not views.same(group_views(frames[:2], maps[:2], 5)[0])
+    assert views.equals(group_views(copies, [m.copy() for m in maps], 5)[0])
+    assert not views.equals(None)
+    assert not views.equals(group_views(frames, [], 5)[0])
+    assert not views.equals(group_views(frames[:2], maps[:2], 5)[0])
     copies[1].rgb[0, 0, 0] ^= 1
-    assert not views.same(group_views(copies, maps, 5)[0])
-    assert not views.same(group_views([replace(f, t_us=f.t_us + 1) for f in frames], maps, 5)[0])
+    assert not views.equals(group_views(copies, maps, 5)[0])
+    assert not views.equals(group_views([replace(f, t_us=f.t_us + 1) for f in frames], maps, 5)[0])
 
 
 def test_pixels_are_copied_so_that_a_renderer_may_reuse_its_buffers() -> None:

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from alpasim_plugin.atomic import write_safetensors
+from alpasim_plugin.bench.whole_clip import whole_clip
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.reference import whole_clip
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from tests.fixers.fixer_cases import Recorded, fixer, maps_of, moving_picture, pixels, run_blocks
 

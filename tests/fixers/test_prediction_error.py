@@ -1,4 +1,4 @@
-"""How far a request lies from the foretold one."""
+"""How far a request lies from the predicted one."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.fixers.refine import Difference, StreamTally, refine_frames
+from alpasim_plugin.fixers.refine import Difference, StreamStats, refine_frames
 from alpasim_plugin.types import Frame
 
 
@@ -42,7 +42,7 @@ def test_blocks_are_made_as_they_are_asked_for() -> None:
             taken.append(i)
             yield Frame(i, "video", np.zeros((16, 16, 3), np.uint8)), None
 
-    tally = StreamTally()
+    tally = StreamStats()
     for block in refine_frames(frames(), make_fixer("identity", scene_id="video")):  # type: ignore[arg-type]
         tally.add(block)
         assert len(taken) == tally.frames

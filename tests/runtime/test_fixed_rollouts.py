@@ -106,7 +106,7 @@ def assert_same_pictures(one: Sequence[Frame], other: Sequence[Frame]) -> None:
 def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straight_road: Scenario) -> None:
     run = drive(straight_road)
     facts = run.session.facts()
-    assert facts["hits"] == facts["foretold"] == 30 - 5  # all but the first frame of each of five blocks
+    assert facts["hits"] == facts["predicted"] == 30 - 5  # all but the first frame of each of five blocks
     assert facts["redrafts"] == 0
     assert facts["exact"] >= 4  # while the log is forced forecasts are equal to the last bit
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
@@ -156,10 +156,10 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road: Scenario
 def test_the_shown_frame_of_a_hit_is_the_one_of_the_foretold_pose(straight_road: Scenario) -> None:
     run = drive(straight_road, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
     for start, size in ((13, 8), (21, 8)):
-        foretold = [run.requests[start], *run.requests[start].ahead[: size - 1]]
+        predicted = [run.requests[start], *run.requests[start].ahead[: size - 1]]
         fixer = Blend()
         fixed_offline(fixer, rendered(straight_road, run.requests[:start]))
-        draft = fixer.preview(rendered(straight_road, foretold), [])
+        draft = fixer.preview(rendered(straight_road, predicted), [])
         assert_same_pictures(run.frames[start : start + size - 1], draft[:-1])
 
 
@@ -203,14 +203,14 @@ def test_an_actor_that_appears_by_its_track_is_foretold(straight_road: Scenario)
     late = slice(160, None)  # from 1.6 s on, in the middle of a block
     track = replace(ahead.track, t_us=ahead.track.t_us[late], xyz=ahead.track.xyz[late], quat=ahead.track.quat[late])
     facts = drive(replace(straight_road, actors=(replace(ahead, track=track), parked))).session.facts()
-    assert facts["hits"] == facts["foretold"]
+    assert facts["hits"] == facts["predicted"]
 
 
 def test_a_delayed_plan_is_foretold_until_the_next_question_takes_effect(straight_road: Scenario) -> None:
     scenario = replace(straight_road, warmup_us=0, latency=Latency("fixed", 400_000))
     run = drive(scenario, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
     errors = [frame.facts.get("forecast_error_m") for frame in run.frames]
-    assert errors[1:5] == [0.0, 0.0, 0.0, 0.0]  # nothing is in force yet: the vehicle coasts, and the first plan is not foretold
+    assert errors[1:5] == [0.0, 0.0, 0.0, 0.0]  # nothing is in force yet: the vehicle coasts, and the first plan is not predicted
     # The block from 0.5 s on knows the plans of 0.1 to 0.4 s, the last of which takes effect at 0.8 s.
     assert max(errors[6:10]) < 1e-9 < min(errors[10:13])
 
@@ -222,7 +222,7 @@ def test_a_slower_camera_has_its_own_blocks(straight_road: Scenario) -> None:
     run = drive(straight_road, Slow)
     assert [request.t_us for request in run.requests] == list(range(0, 3_000_000, 200_000))
     assert run.session.facts()["blocks"] == 2  # 5 + 8 of 15 frames
-    assert run.session.facts()["hits"] == run.session.facts()["foretold"] == 15 - 3
+    assert run.session.facts()["hits"] == run.session.facts()["predicted"] == 15 - 3
     assert_same_pictures(run.frames, fixed_offline(Blend(), rendered(straight_road, run.requests)))
 
 

@@ -100,9 +100,9 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
     summary = json.loads((finished / "summary.json").read_text())
     entry = summary["fixers"]["onefixer+clean"]
     assert entry["frames"] == 15
-    assert entry["foretold"] == 15 - 3
-    assert 0 < entry["hits"] <= entry["foretold"]
-    assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["foretold"], abs=1e-4)
+    assert entry["predicted"] == 15 - 3
+    assert 0 < entry["hits"] <= entry["predicted"]
+    assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["predicted"], abs=1e-4)
     stages = summary["speed"]["onefixer+clean"]["stages"]
     assert {"render", "map", "fix", "fix: encode", "fix: dit", "fix: decode", "fix: cache write"} <= set(stages)
     assert sum(stage["share"] for stage in stages.values()) == pytest.approx(1.0, abs=0.001)

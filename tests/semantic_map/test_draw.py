@@ -14,10 +14,10 @@ from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import ActorBox, Area, LaneLine, MapExtras, TrafficLight, actor_boxes
 from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.semantic_map.projection import FThetaCamera
-from alpasim_plugin.semantic_map.reference import draw_map_reference, draw_reference
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL
 from alpasim_plugin.types import Actor, Box, CameraSpec, FTheta, LaneMap, Trajectory
 from tests.examples import examples
+from tests.semantic_map.draw_reference import draw_map_reference, draw_reference
 
 # Camera axes in a rig that looks along x.
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -264,10 +264,10 @@ def test_utm_sized_coordinates_draw_the_same_picture(camera):
     assert (np.abs(near.astype(int) - far).max(axis=2) > 1).mean() < 1e-3
 
 
-def test_many_lines_do_not_outgrow_the_room():
+def test_many_lines_do_not_overflow_the_buffers():
     lines = tuple(line((5 + 0.01 * k, -3, 0), (5 + 0.01 * k, 3, 0)) for k in range(9000))
     image = draw_map(prepare_map(replace(EMPTY, road_edges=lines), style=PLAIN), PIN, at())
-    assert len(conditioning._room.strokes) > 9000
+    assert len(conditioning._buffers.strokes) > 9000
     assert image[100, 128].any()
 
 

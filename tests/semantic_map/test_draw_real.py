@@ -13,13 +13,14 @@ from alpasim_plugin.geometry import se2
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import ActorBox
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.semantic_map.projection import kernel_camera, project_points
+from alpasim_plugin.semantic_map.projection import kernel_camera
 from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.types import Box
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
 from scenarios.reading import SourceFiles
 from tests.scenarios.ftheta import project_ftheta
 from tests.semantic_map.cosmos_agreement import AS_PUBLISHED, OPENGL, SOLID, compare, mounts, read_clip
+from tests.semantic_map.draw_reference import project_points
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
-"""The semantic map drawn the slow way: the definition that the fast kernels are held to.
+"""Reference implementation of the semantic map, which the fast kernels are compared with.
 
 Lines and triangles are halved until their pieces are short and seen under a small angle; every point is projected by the exact formula in
-float64. Then each stroke and shape asks every pixel whether it covers it: no bands, no shortcuts.
+float64. Then every pixel is tested against each stroke and shape: no bands, no shortcuts.
 
 - A stroke covers a sample when the sample's distance to the line, measured with vertical pixels stretched, is at most the radius that the
   line has at the point nearest to the pixel's centre. 1/depth is linear along a stroke and over a shape.
@@ -32,9 +32,9 @@ from alpasim_plugin.semantic_map.kernels import (
 )
 from alpasim_plugin.semantic_map.layers import ActorBox
 from alpasim_plugin.semantic_map.prepare import PreparedMap, Segments, Triangles
-from alpasim_plugin.semantic_map.projection import MapCamera, project_points
+from alpasim_plugin.semantic_map.projection import MapCamera, radius_of
 from alpasim_plugin.semantic_map.style import WIDTH_DEFINED_AT_PX, MapStyle
-from alpasim_plugin.types import F32, F64, U8, Bool
+from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec
 
 
 def draw_map_reference(
@@ -58,6 +58,22 @@ def draw_map_reference(
     strokes = np.concatenate([first, strokes_reference(edges, T_camera_scene, camera, scene.style, step_m, angle_rad)])
     shapes = [shapes_reference(part, T_camera_scene, camera, scene.style, step_m, angle_rad) for part in (scene.triangles, faces)]
     return draw_reference(strokes, len(first), np.concatenate(shapes), camera, scene.style)
+
+
+def project_points(camera: MapCamera, points: F64) -> F64:
+    """Project camera-frame points ``(N, 3)``, metres, to pixels ``(N, 2)`` in float64, without a table.
+
+    A pinhole needs z > 0: points at or behind its plane give NaN. An f-theta lens sees behind itself where its radius goes on.
+    """
+    x, y, z = points.T
+    if isinstance(camera, CameraSpec):
+        z = np.where(z > 0, z, np.nan)
+        k = camera.K
+        return np.stack([k[0, 0] * x / z + k[0, 1] * y / z + k[0, 2], k[1, 1] * y / z + k[1, 2]], axis=1)
+    across = np.hypot(x, y)
+    radius = radius_of(camera, np.arctan2(across, z))
+    unit = points[:, :2] / np.where(across > 0, across, 1.0)[:, None]
+    return np.asarray((unit * radius[:, None]) @ np.array(camera.A).T + (camera.cx, camera.cy))
 
 
 def strokes_reference(segments: Segments, T_camera_scene: F64, camera: MapCamera, style: MapStyle, step_m: float, angle_rad: float) -> F64:

@@ -1,17 +1,16 @@
-"""The slow readable twin of the streaming fixer: a whole clip at once in float32, nothing streamed, cached, folded or reused.
+"""Reference implementation of the streaming fixer: a whole clip at once in float32, nothing streamed, cached, folded or reused.
 
-The history of a block is what the network was last given of the blocks before it, all of it, in one forward under the block-causal rule.
-The cost grows with the square of the clip.
+Every block sees all blocks before it in one forward pass under the block-causal mask, so the cost grows with the square of the clip.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from alpasim_plugin.bench.fixer_speed import Clip
 from alpasim_plugin.fixers.networks import LATENT, Networks, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -20,26 +19,13 @@ from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.clips import on_grid
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names
-from alpasim_plugin.types import U8, BlockRule, Frame
-
-
-class Recording(Protocol):
-    """A recorded clip of one camera; `measure.Clip` is one."""
-
-    @property
-    def maps(self) -> Sequence[U8] | U8:
-        """``(T, H, W, 3)``, or nothing."""
-        ...
-
-    def frames(self) -> Sequence[Frame]:
-        """Return T frames."""
-        ...
+from alpasim_plugin.types import U8, BlockRule
 
 
 def refine_latents(
     networks: Networks, settings: OneFixerSettings, z_render: Tensor, mask: Tensor, z_map: Tensor, noise: Sequence[Tensor]
 ) -> Tensor:
-    """Repair the latents of a whole clip.
+    """Fix the latents of a whole clip.
 
     Args:
         networks: In float32, not folded.
@@ -76,10 +62,10 @@ def refine_latents(
 def refine_clip(
     networks: Networks, settings: OneFixerSettings, rgb: Tensor, alpha: Tensor | None, sdmap: Tensor | None, noise: Sequence[Tensor]
 ) -> Tensor:
-    """Repair a whole clip; arguments as `BlockPipeline.run`, for all frames.
+    """Fix a whole clip; arguments as `BlockPipeline.run`, for all frames.
 
     Returns:
-        ``(B, 3, T, H, W)``, not cut to [-1, 1].
+        ``(B, 3, T, H, W)``, not clipped to [-1, 1].
     """
     z_render = networks.vae.encode(rgb)
     z_map = torch.zeros_like(z_render) if sdmap is None else networks.vae.encode(sdmap)
@@ -91,12 +77,12 @@ def refine_clip(
     return networks.decoder.decode(clean, render=rgb, opacity=alpha, clamp=False)
 
 
-def whole_clip(settings: OneFixerSettings, clip: Recording, scene_id: str, seed: int) -> U8:
-    """Repair a clip as a streaming fixer with these settings and this key would in exact arithmetic.
+def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int) -> U8:
+    """Fix a clip as a streaming fixer with these settings and this key would in exact arithmetic.
 
     Args:
         settings: Their precision is set to float32.
-        clip: Any number of frames of one camera; the last block is filled up.
+        clip: Any number of frames of one camera; the last block is padded.
         scene_id, seed: Key of the noise.
 
     Returns:
