@@ -1,4 +1,4 @@
-"""When the policy is asked, and with it which frames are wanted and when they are rendered."""
+"""When the policy is queried, and with it which frames are wanted and when they are rendered."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ DOING = "setting up a loop in whole blocks of frames"
 
 @dataclass(frozen=True)
 class Cadence:
-    """The instants at which the policy is asked.
+    """The instants at which the policy is queried.
 
-    With ``whole_blocks`` all frames since the last question are wanted and are rendered together at the next one; otherwise a frame is
+    With ``whole_blocks`` all frames since the last query are wanted and are rendered together at the next one; otherwise a frame is
     rendered at its own instant, and only if no newer one of that camera will exist when the policy looks.
     """
 
-    questions_us: I64  # (Q,) increasing
+    query_times_us: I64  # (Q,) increasing
     whole_blocks: bool = False
 
-    def asks(self, t_us: int) -> bool:
-        """Tell whether the policy is asked at ``t_us``."""
-        return self.next_question_us(t_us) == t_us
+    def queries_at(self, t_us: int) -> bool:
+        """Tell whether the policy is queried at ``t_us``."""
+        return self.next_query_us(t_us) == t_us
 
-    def next_question_us(self, t_us: int) -> int | None:
-        """Return the first question at or after ``t_us``; None after the last."""
-        i = int(np.searchsorted(self.questions_us, t_us))
-        return int(self.questions_us[i]) if i < len(self.questions_us) else None
+    def next_query_us(self, t_us: int) -> int | None:
+        """Return the first query at or after ``t_us``; None after the last."""
+        i = int(np.searchsorted(self.query_times_us, t_us))
+        return int(self.query_times_us[i]) if i < len(self.query_times_us) else None
 
     def wants(self, t_us: int, period_us: int) -> bool:
         """Tell whether the policy will take a frame of ``t_us`` from a camera of that period."""
-        question = self.next_question_us(t_us)
-        return question is not None and (self.whole_blocks or question - t_us < period_us)
+        query = self.next_query_us(t_us)
+        return query is not None and (self.whole_blocks or query - t_us < period_us)
 
 
 def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], block: BlockRule | None = None) -> Cadence:
-    """Return the cadence of a rollout: the policy's own period, or with ``block`` one question at the end of each block of frames.
+    """Return the cadence of a rollout: the policy's own period, or with ``block`` one query at the end of each block of frames.
 
     ``block`` is AlpaSim's rule for video models: the control step is the block, and a plan is committed for the whole next one. The
-    recorded drive has to be forced until the first block is complete, since nobody was asked before. A policy without cameras has no
-    blocks and keeps its own period. Nothing is asked at the last instant: no drive follows it.
+    recorded drive has to be forced until the first block is complete, since there was no query before. A policy without cameras has no
+    blocks and keeps its own period. There is no query at the last instant: no drive follows it.
 
     Args:
         clock: Ticks of the rollout.
@@ -77,12 +77,12 @@ def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec]
             f"the first block of {first} frames ends after {warm_up_us} us, the warm-up after {scenario.warmup_us} us",
             f"--set timing.warmup_us={warm_up_us}, or use the mode 'speculative'",
         )
-    questions = np.arange(clock.start_us + warm_up_us, end_us, then * period_us, dtype=np.int64)
-    if not len(questions):
+    queries = np.arange(clock.start_us + warm_up_us, end_us, then * period_us, dtype=np.int64)
+    if not len(queries):
         raise InputError(
             DOING,
             f"scene {scenario.scene_id!r}",
             f"it ends after {end_us - clock.start_us} us, before the first block of {first} frames",
             "lengthen timing.duration_us, or use the mode 'speculative'",
         )
-    return Cadence(questions, whole_blocks=True)
+    return Cadence(queries, whole_blocks=True)

@@ -8,7 +8,7 @@ from itertools import islice
 from alpasim_plugin.clock import Clock, Tick
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.cadence import Cadence, make_cadence
-from alpasim_plugin.runtime.forecast import Ahead, Foresight, shutter_poses
+from alpasim_plugin.runtime.forecast import Ahead, Forecaster, shutter_poses
 from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
 
 
@@ -20,7 +20,7 @@ class CameraRig:
         sensors: Which of them, at which period.
         clock: Ticks of the rollout.
         cadence: When the policy looks; by default at its own period.
-        foresight: Source of the forecasts that requests carry, for `lookahead` frames.
+        forecaster: Source of the forecasts that requests carry, for `lookahead` frames.
         lookahead: How many of a camera's next frames a request predicts.
 
     Raises:
@@ -33,7 +33,7 @@ class CameraRig:
         sensors: Sequence[SensorSpec],
         clock: Clock,
         cadence: Cadence | None = None,
-        foresight: Foresight | None = None,
+        forecaster: Forecaster | None = None,
         lookahead: int = 0,
     ) -> None:
         known = {camera.name: camera for camera in scenario.cameras}
@@ -41,7 +41,7 @@ class CameraRig:
         self._held: list[RenderRequest] = []
         self._clock = clock
         self._cadence = cadence or make_cadence(clock, scenario, sensors)
-        self._foresight, self._lookahead = foresight, lookahead
+        self._forecaster, self._lookahead = forecaster, lookahead
         for sensor in sensors:
             if sensor.camera not in known:
                 raise InputError(
@@ -70,12 +70,12 @@ class CameraRig:
 
         In a cadence of whole blocks requests are held until the block's last frame is due and then handed over together.
         """
-        forecast = self._foresight.now() if self._foresight and self._lookahead else None
+        forecast = self._forecaster.now() if self._forecaster and self._lookahead else None
         for camera, period in self._due:
             if self._is_due(tick.t_us, period):
                 ahead = Ahead(forecast, camera, self._next_us(tick.t_us, period)) if forecast else ()
                 self._held.append(RenderRequest(tick.t_us, camera, shutter_poses(history, camera, tick.t_us), actors, ahead))
-        if self._cadence.whole_blocks and not self._cadence.asks(tick.t_us):
+        if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
         ready, self._held = self._held, []
         return ready

@@ -26,7 +26,7 @@ def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
     return np.asarray(interpolate(history, np.array([start_us, t_us])) @ camera.T_rig_camera)
 
 
-class Foresight:
+class Forecaster:
     """Takes forecasts of a running loop."""
 
     def __init__(self, scenario: Scenario, controller: Controller, plans: PlanQueue, actors: Actors, state: LoopState) -> None:

@@ -1,7 +1,7 @@
 """Ask one policy at the same poses behind several renderers: what a renderer alone changes in the plans, frame by frame.
 
 The logged rollout is made again by its own parts and compared with its log. At every camera frame each renderer under test renders the
-same request; at every question a policy of its own, with the history of its own frames, answers. Only the logged renderer's policy drives.
+same request; at every query a policy of its own, with the history of its own frames, queries. Only the logged renderer's policy drives.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ DOING = "probing renderers along a logged rollout"
 
 
 @dataclass(frozen=True)
-class Answer:
-    """The plans of one question and the pictures they were made from, by renderer."""
+class PolicyQuery:
+    """The plans of one query and the pictures they were made from, by renderer."""
 
     t_us: int
     plans: Mapping[str, Plan]
@@ -43,7 +43,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Pair:
-    """A renderer against the reference over all questions ``(Q,)``.
+    """A renderer against the reference over all queries ``(Q,)``.
 
     Attributes:
         gap_m: Distance between the plans at `HORIZONS_S` ``(Q, 2)``; NaN where a plan ends earlier.
@@ -66,11 +66,11 @@ class Pair:
 class Probe:
     """What a probe found."""
 
-    answers: tuple[Answer, ...]
+    queries: tuple[PolicyQuery, ...]
     pairs: tuple[Pair, ...]
 
 
-class _Eyes(Renderer):
+class _AllRenderers(Renderer):
     """Renders every request with all renderers and gives the loop the driving one's frames."""
 
     def __init__(self, renderers: Mapping[str, Renderer], driver: str) -> None:
@@ -96,26 +96,28 @@ class _Eyes(Renderer):
 
 
 @dataclass
-class _Asked(Policy):
+class _PolicyPerRenderer(Policy):
     """Asks one policy per renderer and gives the loop the driving one's plan."""
 
     policies: Mapping[str, Policy]
-    eyes: _Eyes
-    answers: list[Answer] = field(default_factory=list)
+    renderers_together: _AllRenderers
+    queries: list[PolicyQuery] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.sensors: Sequence[SensorSpec] = self.policies[self.eyes.driver].sensors
+        self.sensors: Sequence[SensorSpec] = self.policies[self.renderers_together.driver].sensors
 
     def reset(self, seed: int, route: Route) -> None:
         for policy in self.policies.values():
             policy.reset(seed, route)
 
     def act(self, observation: Observation) -> Plan:
-        seen = {name: replace(observation, frames=dict(self.eyes.latest[name])) for name in self.policies}
+        seen = {name: replace(observation, frames=dict(self.renderers_together.latest[name])) for name in self.policies}
         plans = {name: checked_plan(policy, seen[name]) for name, policy in self.policies.items()}
         camera = self.sensors[0].camera
-        self.answers.append(Answer(observation.t_us, plans, {name: self.eyes.latest[name][camera] for name in self.policies}))
-        return plans[self.eyes.driver]
+        self.queries.append(
+            PolicyQuery(observation.t_us, plans, {name: self.renderers_together.latest[name][camera] for name in self.policies})
+        )
+        return plans[self.renderers_together.driver]
 
 
 def probe_rollout(past: PastRollout, renderers: Sequence[str]) -> Probe:
@@ -141,13 +143,13 @@ def probe_rollout(past: PastRollout, renderers: Sequence[str]) -> Probe:
         name: resolve_renderer(name, past.options.fixer) for name in renderers if name != own.renderer.name
     }
     parts = {name: own_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
-    eyes = _Eyes({name: p.renderer for name, p in parts.items()}, own.renderer.name)
-    asked = _Asked({name: p.policy for name, p in parts.items()}, eyes)
-    if not asked.sensors:
+    renderers_together = _AllRenderers({name: p.renderer for name, p in parts.items()}, own.renderer.name)
+    policies_together = _PolicyPerRenderer({name: p.policy for name, p in parts.items()}, renderers_together)
+    if not policies_together.sensors:
         raise InputError(DOING, past.name, f"the policy {own.policy.name!r} takes no camera", "probe a rollout of a policy that sees")
     with tempfile.TemporaryDirectory(prefix="simrun-probe-") as folder:
         with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
-            run_rollout(past.scenario, eyes, asked, own.seed, recorder, parts[own.renderer.name].controller)
+            run_rollout(past.scenario, renderers_together, policies_together, own.seed, recorder, parts[own.renderer.name].controller)
         one, other = (trace_log(f / LOG_NAME, read_facts(f / FRAMES_NAME)) for f in (past.folder, Path(folder)))
     difference = first_difference(one, other, past.scenario.start_us, past.scenario.rates.control_us)
     if difference is not None:
@@ -157,33 +159,33 @@ def probe_rollout(past: PastRollout, renderers: Sequence[str]) -> Probe:
             f"its replay differs from the log: {difference}",
             "probe it on the machine and with the versions that run.json names, or run the rollout again",
         )
-    answers = tuple(asked.answers)
-    return Probe(answers, tuple(_pair(answers, renderers[0], name) for name in renderers[1:]))
+    queries = tuple(policies_together.queries)
+    return Probe(queries, tuple(_pair(queries, renderers[0], name) for name in renderers[1:]))
 
 
-def _pair(answers: Sequence[Answer], reference: str, renderer: str) -> Pair:
-    n, first, first_gap = len(answers), None, None
+def _pair(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair:
+    n, first, first_gap = len(queries), None, None
     gap, turn, levels = np.full((n, len(HORIZONS_S)), np.nan), np.full((n, len(HORIZONS_S)), np.nan), np.zeros(n)
-    for row, answer in enumerate(answers):
-        a, b = (_trajectory(answer.plans[name]) for name in (reference, renderer))
-        end_us = min(answer.t_us + HORIZON_US, int(a.t_us[-1]), int(b.t_us[-1]))
-        distances, turns = plan_gap(a, b, [*(answer.t_us + round(h * 1e6) for h in HORIZONS_S), end_us])
+    for row, query in enumerate(queries):
+        a, b = (_trajectory(query.plans[name]) for name in (reference, renderer))
+        end_us = min(query.t_us + HORIZON_US, int(a.t_us[-1]), int(b.t_us[-1]))
+        distances, turns = plan_gap(a, b, [*(query.t_us + round(h * 1e6) for h in HORIZONS_S), end_us])
         gap[row], turn[row] = distances[:-1], turns[:-1]
         if first is None and distances[-1] > DIVERGED_M:
             first, first_gap = row, float(distances[-1])
-        pictures = (answer.frames[name].rgb.astype(np.int16) for name in (reference, renderer))
+        pictures = (query.frames[name].rgb.astype(np.int16) for name in (reference, renderer))
         levels[row] = float(np.mean(np.abs(np.subtract(*pictures))))
     return Pair(reference, renderer, gap, turn, levels, first, first_gap)
 
 
 def _trajectory(plan: Plan) -> Trajectory:
-    """Return a plan as rig poses in the frame of the question, which all renderers share."""
+    """Return a plan as rig poses in the frame of the query, which all renderers share."""
     return Trajectory(plan.times_us, np.column_stack([plan.xy, np.zeros(len(plan.times_us))]), quat_from_yaw(plan.yaw))
 
 
-def summarise(pair: Pair, answers: Sequence[Answer], start_us: int) -> dict[str, Any]:
+def summarise(pair: Pair, queries: Sequence[PolicyQuery], start_us: int) -> dict[str, Any]:
     """Return the numbers of a pair for JSON, without the pictures."""
-    out: dict[str, Any] = {"reference": pair.reference, "renderer": pair.renderer, "questions": len(answers)}
+    out: dict[str, Any] = {"reference": pair.reference, "renderer": pair.renderer, "queries": len(queries)}
     for j, horizon in enumerate(HORIZONS_S):
         known = pair.gap_m[np.isfinite(pair.gap_m[:, j]), j]
         turns = np.abs(pair.turn_rad[np.isfinite(pair.turn_rad[:, j]), j])
@@ -193,6 +195,6 @@ def summarise(pair: Pair, answers: Sequence[Answer], start_us: int) -> dict[str,
     out["levels_mean"] = round(float(np.mean(pair.levels)), 3) if len(pair.levels) else None
     out["first_divergence"] = None
     if pair.first is not None and pair.first_gap_m is not None:
-        t_us = answers[pair.first].t_us
+        t_us = queries[pair.first].t_us
         out["first_divergence"] = {"t_us": t_us, "after_us": t_us - start_us, "gap_m": round(pair.first_gap_m, 4)}
     return out

@@ -39,16 +39,16 @@ def write_probe(probe: Probe, past: PastRollout, renderers: tuple[str, ...], out
     start_us = past.scenario.start_us
     pairs, rows = [], []
     for number, pair in enumerate(probe.pairs):
-        entry = summarise(pair, probe.answers, start_us)
+        entry = summarise(pair, probe.queries, start_us)
         if pair.first is not None:
-            frames = probe.answers[pair.first].frames
+            frames = probe.queries[pair.first].frames
             names = {name: f"first-{number}-{side}.jpg" for side, name in enumerate((pair.reference, pair.renderer))}
             for name, file in names.items():
                 write_bytes(folder / file, encode_image(frames[name].rgb, "jpeg", 85))
             entry["first_divergence"]["frames"] = names
         pairs.append(entry)
-        for i, answer in enumerate(probe.answers):
-            row = {"reference": pair.reference, "renderer": pair.renderer, "t_us": answer.t_us, "after_us": answer.t_us - start_us}
+        for i, query in enumerate(probe.queries):
+            row = {"reference": pair.reference, "renderer": pair.renderer, "t_us": query.t_us, "after_us": query.t_us - start_us}
             for j, h in enumerate(HORIZONS_S):
                 row |= {f"gap_{h:g}s_m": _number(pair.gap_m[i, j]), f"turn_{h:g}s_rad": _number(pair.turn_rad[i, j])}
             rows.append(row | {"levels": float(pair.levels[i])})
@@ -65,7 +65,7 @@ def _number(value: float) -> float | None:
 
 def _plot(path: Path, probe: Probe, past: PastRollout) -> None:
     start_us, warmup_s = past.scenario.start_us, past.scenario.warmup_us * 1e-6
-    seconds = np.array([answer.t_us - start_us for answer in probe.answers]) * 1e-6
+    seconds = np.array([query.t_us - start_us for query in probe.queries]) * 1e-6
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
     above, middle, below = figure.subplots(3, 1, sharex=True)

@@ -55,7 +55,7 @@ class Recorder:
         self._times = StageTimes()
         self._frames: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
-        self._told_us = -1
+        self._last_query_us = -1
         self._steps = self._first_call = 0
         self._writer: AslWriter | None = None
 
@@ -109,18 +109,18 @@ class Recorder:
             if self._pictures is not None:
                 self._pictures.add(frame)
 
-    def question(self, observation: Observation, clock: Clock) -> None:
-        """Log what the policy was told."""
+    def policy_query(self, observation: Observation, clock: Clock) -> None:
+        """Log a query of the policy: the ego motion and the route that it gets."""
         with self.stage("log"):
             log, history = self._scenario.ego_log, observation.history.t_us
-            untold = history[(history > self._told_us) & (history < clock.start_us)]
-            context = [ego_state_from_log(log, int(t), self._scenario.vehicle) for t in untold]
+            unlogged = history[(history > self._last_query_us) & (history < clock.start_us)]
+            context = [ego_state_from_log(log, int(t), self._scenario.vehicle) for t in unlogged]
             self._log.ego_trajectory([*context, observation.ego])
-            self._told_us = observation.t_us
+            self._last_query_us = observation.t_us
             self._log.route(observation.t_us, observation.route_rig)
             self._log.driver_request(observation.t_us, observation.t_us + clock.rates.control_us)
 
-    def answer(self, plan: Trajectory, samples: Sequence[Trajectory]) -> None:
+    def policy_plan(self, plan: Trajectory, samples: Sequence[Trajectory]) -> None:
         """Log the policy's plan and its alternatives, in the world."""
         with self.stage("log"):
             self._log.driver_return(plan, samples)

@@ -9,7 +9,7 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.parts import complete
 from alpasim_plugin.runtime.cadence import make_cadence
 from alpasim_plugin.runtime.cameras import CameraRig
-from alpasim_plugin.runtime.forecast import Foresight
+from alpasim_plugin.runtime.forecast import Forecaster
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan
 from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState
@@ -50,8 +50,8 @@ def run_rollout(
     plans = PlanQueue(scenario.latency)
     state = LoopState.at_start(scenario, clock.n_steps)
     cadence = make_cadence(clock, scenario, policy.sensors, renderer.block)
-    foresight = Foresight(scenario, controller, plans, actors, state)
-    rig = CameraRig(scenario, policy.sensors, clock, cadence, foresight, renderer.lookahead)
+    forecaster = Forecaster(scenario, controller, plans, actors, state)
+    rig = CameraRig(scenario, policy.sensors, clock, cadence, forecaster, renderer.lookahead)
     policy.reset(seed, scenario.route)
     recorder.start(clock, rig.specs)
 
@@ -67,15 +67,15 @@ def run_rollout(
             recorder.frame(frame, request)
         if tick.is_last:
             break
-        if cadence.asks(tick.t_us):
+        if cadence.queries_at(tick.t_us):
             observation = state.observe(rig.specs)
-            recorder.question(observation, clock)
+            recorder.policy_query(observation, clock)
             began = time.perf_counter()
             with recorder.stage("policy"):
                 plan = checked_plan(policy, observation)
             plan_world, *alternatives = state.to_world(plan)
             plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
-            recorder.answer(plan_world, alternatives)
+            recorder.policy_plan(plan_world, alternatives)
         before, in_force = state.ego, plans.active(tick.t_us)
         with recorder.stage("control"):
             forced = state.advance(controller, in_force, tick.t_us + clock.rates.control_us)

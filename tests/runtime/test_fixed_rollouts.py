@@ -206,7 +206,7 @@ def test_an_actor_that_appears_by_its_track_is_foretold(straight_road: Scenario)
     assert facts["hits"] == facts["predicted"]
 
 
-def test_a_delayed_plan_is_foretold_until_the_next_question_takes_effect(straight_road: Scenario) -> None:
+def test_a_delayed_plan_is_predicted_until_the_next_query_takes_effect(straight_road: Scenario) -> None:
     scenario = replace(straight_road, warmup_us=0, latency=Latency("fixed", 400_000))
     run = drive(scenario, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
     errors = [frame.facts.get("forecast_error_m") for frame in run.frames]

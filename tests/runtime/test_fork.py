@@ -157,7 +157,7 @@ def test_a_scenario_that_has_changed_is_refused(root: Path, past: PastRollout, t
 def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(past: PastRollout, root: Path) -> None:
     probe = probe_rollout(past, ["clean", "broken-frozen", "3dgs"])
     frozen, surrogate = probe.pairs
-    assert len(probe.answers) == 12
+    assert len(probe.queries) == 12
     assert frozen.levels[0] == 0.0  # the first frame is the true one
     np.testing.assert_array_equal(frozen.gap_m[0], 0.0)
     assert (frozen.levels[1:] > 0).all()
