@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import MethodType
 from typing import Any, TypeVar
 
@@ -70,7 +70,8 @@ def complete(part: T, interface: Any, what: str = "") -> T:
         )
     for name, default in optional.items():
         if not hasattr(part, name):
-            setattr(part, name, MethodType(default, part) if inspect.isfunction(default) else default)
+            value = dict(default) if isinstance(default, Mapping) else default
+            setattr(part, name, MethodType(value, part) if inspect.isfunction(value) else value)
     return part
 
 

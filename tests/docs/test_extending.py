@@ -29,8 +29,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     "words",
     [
         ("--renderer", "my_parts.py:Brighten+my_parts.py:Night", "--policy", "lane-camera", *SHORT, "smoke/curve"),
-        ("--renderer", "clean", "--policy", "my_parts.py:Weighted", "--controller", "my_parts.py:Lag", "--evaluator", "my_parts.py:Jerk", *SHORT,
-         "smoke/curve"),
+        ("--renderer", "clean", "--policy", "my_parts.py:Weighted", "--controller", "my_parts.py:Lag", "--evaluator", "my_parts.py:Jerk",
+         *SHORT, "smoke/curve"),
         ("--renderer", "clean", "--policy", "log-replay", "--source", "my_parts.py:Csv", "drive.csv"),
     ],
     ids=["renderer and fixer", "policy, controller and metric", "source"],

@@ -1,0 +1,116 @@
+"""What a name stands for, what a part declares, and what its digest sees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.interfaces import BlockRule, Fixer, Renderer
+from alpasim_plugin.parts import complete, names, resolve, resolve_renderer
+from alpasim_plugin.parts.builtin import BUILTIN
+from alpasim_plugin.parts.kinds import KINDS
+from alpasim_plugin.parts.loading import load
+from alpasim_plugin.parts.resolve import PLAIN_KINDS
+from alpasim_plugin.parts.source import code_digest, reached
+
+DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "metrics", "controller")
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> None:
+    for name, text in names(kind).items():  # type: ignore[arg-type]
+        spec = resolve(kind, name)  # type: ignore[arg-type]
+        assert spec.digest is not None
+        assert text
+        assert "\n" not in text
+
+
+@pytest.mark.parametrize("kind", PLAIN_KINDS)
+def test_shipped_parts_of_plain_kinds_declare_nothing(kind: str) -> None:
+    for target, _ in BUILTIN[kind].values():
+        factory = load(target, kind)
+        own = {name for name in DECLARED if getattr(factory, name, None)}
+        assert own == set(), target
+
+
+def test_a_step_count_at_the_end_belongs_to_the_fixer() -> None:
+    assert str(resolve_renderer("onefixer+clean@2")) == "onefixer@2+clean"
+
+
+def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text(
+        "class Shows:\n    def render(self, request): ...\n\nclass Fixes:\n    def reset(self, seed): ...\n    def step(self, block, maps): ...\n"
+    )
+    assert resolve_renderer(f"{file}:Shows").fixer is None
+    assert str(resolve_renderer(f"{file}:Fixes")) == f"{file}:Fixes+3dgs"
+    assert str(resolve_renderer(f"{file}:Fixes+{file}:Shows")) == f"{file}:Fixes+{file}:Shows"
+
+
+def test_a_module_that_raises_is_told_with_what_it_raised(tmp_path: Path) -> None:
+    file = tmp_path / "raises.py"
+    file.write_text("raise RuntimeError('no licence')\n")
+    with pytest.raises(InputError, match="RuntimeError: no licence"):
+        resolve("policy", f"{file}:Mine")
+
+
+def test_the_digest_follows_imports_wherever_they_stand(tmp_path: Path) -> None:
+    package = tmp_path / "pack"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "part.py").write_text(
+        "from typing import TYPE_CHECKING\n\nfrom . import near\nfrom pack.other import (\n    one,  # a comment, with a comma\n    two,\n)\n\n"
+        "if TYPE_CHECKING:\n    from pack.typed import Unused\n\n\ndef late():\n    import beside\n"
+    )
+    for name in ("near", "other", "typed"):
+        (package / f"{name}.py").write_text(f"NAME = '{name}'\n")
+    (tmp_path / "beside.py").write_text("import pack.part\n")
+    part = package / "part.py"
+    assert {Path(path).name for path in reached(part)} == {"__init__.py", "part.py", "near.py", "other.py", "beside.py"}
+    before = code_digest(part)
+    (package / "typed.py").write_text("NAME = 'another'\n")
+    assert code_digest(part) == before
+    (tmp_path / "beside.py").write_text("import pack.part  # edited\n")
+    assert code_digest(part) != before
+
+
+def test_an_installed_part_does_not_reach_other_distributions(tmp_path: Path) -> None:
+    site = tmp_path / "site-packages"
+    site.mkdir()
+    (site / "mine.py").write_text("import theirs\nimport alpasim_plugin.types\n")
+    (site / "theirs.py").write_text("")
+    found = {Path(path).name for path in reached(site / "mine.py")}
+    assert "theirs.py" not in found
+    assert {"mine.py", "types.py"} <= found
+
+
+def test_optional_members_get_their_defaults_and_required_ones_are_named() -> None:
+    class Bare:
+        def render(self, request: object) -> object:
+            return request
+
+    renderer = complete(Bare(), Renderer)
+    assert (renderer.lookahead, renderer.block, dict(renderer.stage_ms), renderer.facts()) == (0, None, {}, {})  # type: ignore[attr-defined]
+    assert renderer.render_batch([1, 2]) == [1, 2]  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match="a Bare without reset, step"):
+        complete(Bare(), Fixer)
+
+
+def test_a_fixer_without_preview_previews_on_a_copy_of_itself() -> None:
+    class Counts:
+        blocks = BlockRule(2, 2)
+        seen = 0
+
+        def reset(self, seed: int) -> None:
+            self.seen = 0
+
+        def step(self, block: list[int], maps: list[object]) -> list[int]:
+            self.seen += len(block)
+            return [self.seen] * len(block)
+
+    fixer = complete(Counts(), Fixer)
+    assert fixer.preview([1], []) == [1]  # type: ignore[attr-defined]
+    assert fixer.seen == 0
+    assert fixer.step([1, 2], []) == [2, 2]
