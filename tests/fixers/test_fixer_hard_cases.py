@@ -105,7 +105,7 @@ def drive(count: int, size: tuple[int, int] = SIZE) -> Iterator[tuple[list[Frame
 
 def state_bytes(session: OneFixer) -> int:
     """Return what a rollout holds between blocks."""
-    (past,) = session._past
+    (past,) = session._history
     cache = past.state.history.cache
     tensors = [*(past.state.encoder or ()), *(past.state.decoder or ()), cache.keys, cache.values]
     return sum(t.numel() * t.element_size() for t in tensors)

@@ -35,7 +35,7 @@ def test_recorded_blocks_equal_eager_ones(weights: Path, overrides: tuple[str, .
     recorded.pipeline = BlockPipeline(recorded.networks, settings, recorder=EagerRecorder())
     for ours, due in zip(frames_of(recorded, frames, redo=(2, 6)), frames_of(plain, frames), strict=True):
         assert (ours == due).all()
-    history = recorded._past[0].state.history
+    history = recorded._history[0].state.history
     assert isinstance(history.fix, GraphedFunction)
     assert history.fix.counts["replayed"] >= 1
     assert history.fix.counts["beyond limit"] == 0
@@ -61,7 +61,7 @@ def test_a_clock_at_the_stages_runs_them_one_by_one(weights: Path) -> None:
     frames = moving_picture(5 + 8)
     run_blocks(session, frames, maps_of(frames))
     assert set(seen) == {"encode", "source", "dit", "decode", "cache write"}
-    assert session._past[0].state.history.fix.counts == {"unrecorded": 2}
+    assert session._history[0].state.history.fix.counts == {"unrecorded": 2}
 
 
 @pytest.mark.gpu
@@ -75,5 +75,5 @@ def test_cuda_graphs_equal_eager_blocks(weights: Path, precision: str) -> None:
     assert sessions[1].pipeline.recorder is None
     for ours, due in zip(*(frames_of(session, frames, redo=(6,)) for session in sessions), strict=True):
         assert (ours == due).all()
-    assert sessions[0]._past[0].state.history.fix.counts["replayed"] >= 3
+    assert sessions[0]._history[0].state.history.fix.counts["replayed"] >= 3
     torch.cuda.synchronize()
