@@ -8,9 +8,9 @@ from pathlib import Path
 
 import yaml
 
-from docs.scripts.scenario_keys import key_tables
 from scenarios.load import LIBRARY, load_scenario, shipped_names
 from scenarios.schema import SCHEMA_FILE, ScenarioSpec, json_schema, models
+from scenarios.schema_docs import key_tables
 
 
 def test_committed_schema_is_current() -> None:
@@ -33,7 +33,7 @@ def test_every_key_has_a_description() -> None:
 def test_documented_tables_are_current(repo: Path) -> None:
     text = (repo / "docs" / "scenarios.md").read_text(encoding="utf-8")
     begin, end = "<!-- keys: begin -->\n", "<!-- keys: end -->"
-    assert text.split(begin)[1].split(end)[0] == key_tables(), "run python docs/scripts/scenario_keys.py docs/scenarios.md"
+    assert text.split(begin)[1].split(end)[0] == key_tables(), "run python -m scenarios.schema_docs docs/scenarios.md"
 
 
 def test_examples_in_the_docs_load(repo: Path, tmp_path: Path) -> None:

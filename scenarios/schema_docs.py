@@ -1,4 +1,4 @@
-"""The key tables of docs/scenarios.md, made from the schema. ``python docs/scripts/scenario_keys.py docs/scenarios.md`` rewrites them."""
+"""The key tables of docs/scenarios.md, made from the schema. ``python -m scenarios.schema_docs docs/scenarios.md`` rewrites them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def key_tables() -> str:
     for where, model in models().items():
         title = f"`{where}`" if where else "Top level"
         summary = (model.__doc__ or "").strip().split("\n")[0]
-        implied = "kind" if " kind: " in where else ""  # the heading names it
-        rows = [f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |" for name, f in model.model_fields.items() if name != implied]
+        told = "kind" if " kind: " in where else ""  # the heading says it where a union is told apart by it
+        rows = [f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |" for name, f in model.model_fields.items() if name != told]
         out.append("\n".join([f"### {title}", "", summary, "", "| key | type | default | meaning |", "|---|---|---|---|", *rows, "", ""]))
     return "".join(out)
 
