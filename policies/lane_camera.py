@@ -54,7 +54,7 @@ def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
 
 @POLICIES.register("lane-camera", "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior")
 class LaneCamera:
-    """Keep the lane that the markings show and stop for obstacles in it.
+    """Keep the lane that the paint shows and stop for what stands on it.
 
     It reads the newest frame of one camera, its own motion, and the route. The lateral position comes from the paint: the route's weight
     is its variance against the paint's, which near the car is below one percent. The route decides which lane, where to turn, and
