@@ -186,3 +186,14 @@ def project(line: F64, xy: F64) -> tuple[float, float]:
     side = d[i, 0] * offset[i, 1] - d[i, 1] * offset[i, 0]
     s = arc_lengths(line)
     return float(s[i] + f[i] * np.sqrt(length2[i])), float(np.copysign(np.sqrt(distance2[i]), side))
+
+
+UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # front-left, front-right, rear-right, rear-left
+
+
+def rectangle_corners(xy: F64, yaw: F64, size: F64) -> F64:
+    """Return the corners ``(N, 4, 2)`` of boxes with centres ``(N, 2)``, headings ``(N,)`` and (length, width) ``(N, 2)``."""
+    local = UNIT_CORNERS * size[:, None, :]  # (N, 4, 2)
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = local[..., 0], local[..., 1]
+    return np.stack([xy[:, None, 0] + c * x - s * y, xy[:, None, 1] + s * x + c * y], axis=-1)

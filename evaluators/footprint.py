@@ -13,13 +13,11 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from alpasim_plugin.geometry import slerp, yaw_from_quat
+from alpasim_plugin.geometry import UNIT_CORNERS, rectangle_corners, slerp, yaw_from_quat
 from alpasim_plugin.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.presets import Preset
 
 Geometries = npt.NDArray[Any]  # of shapely geometries
-
-_UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # along x, y of the box
 
 
 def origin_of(track: Trajectory, preset: Preset) -> F64:
@@ -32,19 +30,11 @@ def held(values: F64, preset: Preset) -> F64:
     return values.astype(np.float32).astype(np.float64) if preset.float32 else values
 
 
-def corners(xy: F64, yaw: F64, size: F64) -> F64:
-    """Return the corners ``(N, 4, 2)`` of boxes with centres ``(N, 2)``, headings ``(N,)`` and (length, width) ``(N, 2)``."""
-    local = _UNIT_CORNERS * size[:, None, :]  # (N, 4, 2)
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    x, y = local[..., 0], local[..., 1]
-    return np.stack([xy[:, None, 0] + c * x - s * y, xy[:, None, 1] + s * x + c * y], axis=-1)
-
-
 def _corners_float32(xy: F64, yaw: F64, size: F64) -> F64:
     """Return corners rounded to float32 after each step, the centre first, as AlpaSim does: half a millimetre 8 km from the origin."""
     x, y = (xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
     c, s = np.cos(yaw.astype(np.float32))[:, None], np.sin(yaw.astype(np.float32))[:, None]
-    along, across = ((_UNIT_CORNERS[:, d] * size[:, [d]]).astype(np.float32) for d in (0, 1))  # (N, 4)
+    along, across = ((UNIT_CORNERS[:, d] * size[:, [d]]).astype(np.float32) for d in (0, 1))  # (N, 4)
     return np.stack([(x + along * c) - across * s, (y + along * s) + across * c], axis=-1).astype(np.float64)
 
 
@@ -76,7 +66,7 @@ class Footprints:
         """Return the corners ``(N, 4, 2)``."""
         if self.float32:
             return _corners_float32(self.xy, self.yaw, self.size)
-        return corners(self.xy, self.yaw, self.size)
+        return rectangle_corners(self.xy, self.yaw, self.size)
 
     def centres(self) -> F64:
         """Return the reference point ``(N, 2)`` of the body: the box centre, or for float32 presets the rounded shape's centroid."""

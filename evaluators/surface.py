@@ -27,7 +27,7 @@ _N_FEATURES = 6
 
 
 class Surface:
-    """Everything drivable of one map, metres relative to its origin."""
+    """The drivable surface of one map, metres relative to its origin."""
 
     def __init__(self, areas: Geometries, outlines: Sequence[F64], seam_m: float, level_m: float) -> None:
         """Take shapes and their outlines in space.

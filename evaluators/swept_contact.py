@@ -17,9 +17,9 @@ import numpy as np
 import shapely
 from rtree import index
 
-from alpasim_plugin.geometry import wrap_angle
+from alpasim_plugin.geometry import rectangle_corners, wrap_angle
 from alpasim_plugin.types import F64, I64, Bool
-from evaluators.footprint import ActorTable, Footprints, corners
+from evaluators.footprint import ActorTable, Footprints
 from evaluators.step_contact import FRONT, LATERAL, REAR, Contacts
 from evaluators.sweep import Motions, first_contact, gaps
 
@@ -212,8 +212,8 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     seen = np.stack([c * at[:, 0] + s * at[:, 1], c * at[:, 1] - s * at[:, 0]], axis=1)
     half = pairs.half[:, 0]
     flat = np.zeros(len(tau))
-    own = shapely.polygons(corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))
-    other = shapely.polygons(corners(seen, yaw[:, 1] - yaw[:, 0], 2 * pairs.half[:, 1]))
+    own = shapely.polygons(rectangle_corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))
+    other = shapely.polygons(rectangle_corners(seen, yaw[:, 1] - yaw[:, 0], 2 * pairs.half[:, 1]))
     shared = shapely.intersection(own, other)
     middle = shapely.get_coordinates(shapely.centroid(shared)).reshape(-1, 2)
     return _sides(pairs, tau), np.clip(middle, -half, half)

@@ -57,7 +57,7 @@ class LaneCamera(Policy):
 
     It reads the newest frame of one camera, its own motion, and the route. The lateral position comes from the paint: the route's weight
     is its variance against the paint's, which near the car is below one percent. The route decides which lane, where to turn, and
-    everything when no paint is seen for long. ``Plan.debug["mode"]`` says what the plan stands on: ``lane`` (paint in this
+    everything when no paint is seen for long. ``Plan.debug["mode"]`` names the source of the plan: ``lane`` (paint in this
     frame), ``memory`` (the estimate of earlier frames), ``route`` or ``straight`` (neither).
     """
 
@@ -86,7 +86,7 @@ class LaneCamera(Policy):
         self.other_lane_frames = 0
 
     def act(self, observation: Observation) -> Plan:
-        """Return the plan that the newest frame supports.
+        """Return a plan from the newest frame.
 
         Raises:
             PolicyError: The observation has no frame of the camera, or one of another size.
@@ -122,13 +122,13 @@ class LaneCamera(Policy):
         return Plan(observation.t_us, times, xy, yaw, tuple(others), debug)
 
     def _navigation(self, route: F64) -> F64:
-        """Return the route ``(M, 2)`` as the car's navigation has it: beside the true one by an error that lasts the whole drive."""
+        """Return the route ``(M, 2)`` with a lateral navigation error that is constant over the drive."""
         step = np.gradient(route, axis=0)
         normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
         return np.asarray(route + self.navigation_error_m * normal)
 
     def _look(self, frame: Frame, pose: F64, route: F64 | None, pose_now: F64, speed: float) -> None:
-        """Bring lane, road colour and obstacle up to a new frame."""
+        """Update lane, road colour and obstacle from a new frame."""
         dt_s = 0.0 if self.seen_us is None else (frame.t_us - self.seen_us) * 1e-6
         if self.lane is not None:
             self.lane = _moved(self.lane, self.seen_pose, pose)
@@ -192,7 +192,7 @@ class LaneCamera(Policy):
             turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(np.array([at]))[0])
             if abs(turn) > TURN_OFF_RAD:
                 return True
-            # Beside the route a lane must be well seen, on both sides: one line may be anything.
+            # Beside the route, a lane needs both borders: a single line is ambiguous.
             beside_m = route.offset_m + at * route.heading_rad + at**2 / 2 * route.curvature_1pm - float(lane.centre(np.array([at]))[0])
             if abs(beside_m) > UNCERTAIN_M and min(lane.left_m, lane.right_m) < UNCERTAIN_PAINT_M:
                 return True
@@ -201,7 +201,7 @@ class LaneCamera(Policy):
         return sigma > LOST_SIGMA_M or lane.blind_m > LOST_BLIND_M or abs(heading) > MAX_HEADING_RAD or not 2.4 < width < 4.8
 
     def _obstacle_now(self, observation: Observation) -> ObstacleTrack | None:
-        """Return the confirmed thing ahead, moved from the frame's time to now."""
+        """Return the confirmed obstacle ahead, moved from the frame's time to now."""
         if self.obstacle is None or not self.obstacle.confirmed or self.seen_us is None:
             return None
         age_s = (observation.t_us - self.seen_us) * 1e-6

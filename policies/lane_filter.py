@@ -1,4 +1,4 @@
-"""The lane over time: a Kalman filter whose measurements are points of paint.
+"""Lane tracking: a Kalman filter whose measurements are points of lane markings.
 
 In the rig frame the lane's centre is ``y(x) = offset + heading x + curvature x^2 / 2 + bend x^3 / 6`` (the cubic of a clothoid for small
 angles; Dickmanns and Mysliwetz 1992) and its two painted borders lie half a width to either side, measured across the
@@ -163,7 +163,7 @@ def search(points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float,
         return None
     centre, width = float(centres[i]), float(widths[j])
     if min(left[i, j], right[i, j]) < ONE_SIDED_M:
-        # One border says nothing about the width: a usual one, measured from the border that is seen.
+        # One border does not determine the width: use the mean width from the border that is seen.
         side = 1.0 if left[i, j] > right[i, j] else -1.0
         centre, width = centre + side * (width - MEAN_WIDTH_M) / 2, MEAN_WIDTH_M
     return start(centre, float(shapes[best, 0]), float(shapes[best, 1]), width)

@@ -100,9 +100,9 @@ def blend(lane: LaneState | None, route: F64 | None, speed_mps: float) -> Blend:
 
 
 def idm_progress(speed_mps: float, limits: F64, t_s: F64, obstacle: ObstacleTrack | None, bumper_m: float, cruise_mps: float) -> F64:
-    """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance to what is ahead.
+    """Return the progress ``(T,)`` of a car that keeps the limits along its path and its distance to the obstacle ahead.
 
-    Intelligent driver model (Treiber, Hennecke, Helbing 2000), the thing ahead continuing at its speed.
+    Intelligent driver model (Treiber, Hennecke, Helbing 2000), the obstacle ahead continuing at its speed.
     """
     ahead = limits.tolist()
     progress, s, v = [0.0], 0.0, max(speed_mps, 0.0)

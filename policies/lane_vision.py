@@ -1,4 +1,4 @@
-"""From a frame to points of lane paint on the ground."""
+"""Detect points of lane markings on the ground in a frame."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class RidgeFilter:
     """Contrast of each ground cell against the road on *both* sides of it.
 
     The stroke's width and the distance of the two flanks grow with the pixel's size on the ground, so far paint, blurred over a
-    pixel or two, still stands out. A step (kerb, shadow, the side of a car) outshines one side only and gives nothing.
+    pixel or two, still stands out. A step (kerb, shadow, the side of a car) outshines one side only and gives no response.
     """
 
     def __init__(self, grid: GroundGrid) -> None:

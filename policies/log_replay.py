@@ -1,4 +1,4 @@
-"""The recorded drive as a policy: the upper bound, and a check of everything around it."""
+"""Replay of the recorded drive: the upper bound, and a check of the simulation loop."""
 
 from __future__ import annotations
 

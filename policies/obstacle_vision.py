@@ -1,8 +1,8 @@
-"""Obstacles from pixels: what rises from the ground in front of the car does not look like the road, from its foot up.
+"""Obstacles from pixels: regions in front of the car that do not look like the road, from their ground contact up.
 
-A thing of height ``H`` standing at distance ``d`` from a camera of height ``h`` hides the ground behind it up to ``d h / (h - H)``. On
-the ground grid it is therefore a patch that starts at its foot and goes on far; paint, a shadow or a patch of new asphalt ends
-soon. The foot gives the distance by the ground plane.
+An obstacle of height ``H`` at distance ``d`` from a camera of height ``h`` hides the ground behind it up to ``d h / (h - H)``. On the
+ground grid it is therefore a long patch that starts at its foot (the ground contact point); paint, a shadow or new asphalt makes a short
+one. The foot gives the distance by the ground plane.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FILLED, FILLED_TOP, CLEAR = 0.7, 0.55, 0.35
 
 @dataclass(frozen=True)
 class RoadColour:
-    """What the road looks like: centre and tolerance per Lab channel."""
+    """Colour model of the road: centre and tolerance per Lab channel."""
 
     centre: F64  # (3,)
     tolerance: F64  # (3,)
@@ -39,7 +39,7 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
     """Refine the road's colour from the patch in front of the car, as far as it is known to be free.
 
     Args:
-        colour: What was learned so far.
+        colour: Current estimate.
         lab: ``(R, C, 3)`` warped frame in Lab.
         grid: The grid of the frame.
         centre_y: ``(R,)`` lateral position of the ego's path.
@@ -59,13 +59,13 @@ def learn_road(colour: RoadColour | None, lab: U8, grid: GroundGrid, centre_y: F
     new = RoadColour(middle, np.maximum(np.array([22.0, 7.0, 7.0]), 4.0 * spread))
     if colour is None:
         return new
-    # A sudden change is more likely a thing than a new road: follow it slowly.
+    # A sudden change is more likely an obstacle than a new road surface: adapt slowly.
     step = np.clip(new.centre - colour.centre, -20.0, 20.0)
     return RoadColour(colour.centre + LEARN * step, colour.tolerance + LEARN * (new.tolerance - colour.tolerance))
 
 
 def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
-    """Return 0..255 per cell ``(R, C)``: how little it looks like the road, by its worst channel."""
+    """Return 0..255 per cell ``(R, C)``: how far its colour is from the road's, by the worst channel."""
     level = np.arange(256, dtype=np.float64)[:, None]
     away = np.abs(level - colour.centre) / colour.tolerance
     table = (255 * np.clip((away - 0.7) / 0.6, 0.0, 1.0)).astype(np.uint8)
@@ -76,12 +76,12 @@ def anomaly(lab: U8, colour: RoadColour, grid: GroundGrid) -> U8:
 
 
 def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_m: float) -> tuple[float, float] | None:
-    """Return (distance, its standard deviation) of the nearest thing in the corridor along ``centre_y`` (R,), or None.
+    """Return (distance, its standard deviation) of the nearest obstacle in the corridor along ``centre_y`` (R,), or None.
 
     The corridor is cut into strips. In each, a row is a foot if the ground in front of it is clear and what lies behind it on the
-    camera's line of sight is filled, up to where a thing of `TALL` times the camera's height would hide the ground: a crosswalk does
+    camera's line of sight is filled, up to where an obstacle of `TALL` times the camera's height would hide the ground: a crosswalk does
     not reach that far, so the furthest quarter must be filled as well. In a curve the line of sight leaves the lane, and what is seen
-    there says nothing; such a row must be filled by something wider than the bars of a crosswalk, and it is no candidate where even
+    there is not evidence; such a row must be filled by something wider than the bars of a crosswalk, and it is no candidate where even
     an object of `LOW` could not be detected.
 
     Args:
@@ -117,7 +117,7 @@ def find_foot(value: U8, grid: GroundGrid, centre_y: F64, min_x_m: float, max_x_
         return None
     first = int(np.argmax(hit.any(axis=1)))
     strips = np.flatnonzero(hit[first])
-    # A box that is mostly filled may begin before the thing does: the foot is where its rows become anomalous.
+    # A box that is mostly filled may begin before the obstacle does: the foot is where its rows become anomalous.
     behind = np.repeat(np.arange(first, int(last[first, strips].max()))[:, None], STRIPS, axis=1)
     level = _box_mean(narrow, behind, behind + 1, np.repeat(u[first : first + 1], len(behind), axis=0))[:, strips].mean(axis=1)
     i = first + int(np.argmax(level > 0.5))
@@ -145,7 +145,7 @@ def _box_mean(table: F64, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp
 
 @dataclass(frozen=True)
 class ObstacleTrack:
-    """The thing ahead over time: distance from the rear axle and its own speed."""
+    """Track of the obstacle ahead: distance from the rear axle and its own speed."""
 
     distance_m: float
     speed_mps: float  # along the ego's path, over ground
@@ -162,7 +162,7 @@ class ObstacleTrack:
 def track_obstacle(
     track: ObstacleTrack | None, foot: tuple[float, float] | None, ego_mps: float, dt_s: float, nearest_m: float = 0.0
 ) -> ObstacleTrack | None:
-    """Carry the track over ``dt_s`` and correct it by a new foot; None when there is nothing (any more).
+    """Predict the track over ``dt_s`` and correct it by a new detection; None where there is no obstacle.
 
     A foot at ``nearest_m``, the lower edge of the image, may be nearer than that: it confirms a track that says so.
     """

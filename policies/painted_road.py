@@ -1,6 +1,6 @@
 """A painted road seen through a pinhole camera, by casting every pixel onto the ground plane.
 
-It needs no renderer, so it serves to check a policy before there is a scene, and to check the renderers' policy tests from outside.
+It needs no renderer, so a policy can be checked without a scene.
 """
 
 from __future__ import annotations

@@ -28,38 +28,17 @@ VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheel
 # height is 0.324, 0.324 and 0.321 m.
 WHEEL_RADIUS_M = 0.33
 POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-LABELS = {
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "VEHICULAR_TRAILER": "truck",
-    "BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "WHEELCHAIR": "pedestrian",
-    "BICYCLE": "cyclist",
-    "BICYCLIST": "cyclist",
-    "WHEELED_RIDER": "cyclist",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "motorcycle",
-    "RAILED_VEHICLE": "other",
-    "ANIMAL": "other",
-    "DOG": "other",
-    "STROLLER": "other",
-    "WHEELED_DEVICE": "other",
-    "MESSAGE_BOARD_TRAILER": "other",
-    "TRAFFIC_LIGHT_TRAILER": "other",
-    "BOLLARD": "other",
-    "CONSTRUCTION_BARREL": "other",
-    "CONSTRUCTION_CONE": "other",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "other",
-    "SIGN": "other",
-    "STOP_SIGN": "other",
+_CATEGORIES = {
+    "car": "REGULAR_VEHICLE",
+    "truck": "LARGE_VEHICLE BOX_TRUCK TRUCK TRUCK_CAB VEHICULAR_TRAILER",
+    "bus": "BUS ARTICULATED_BUS SCHOOL_BUS",
+    "pedestrian": "PEDESTRIAN OFFICIAL_SIGNALER WHEELCHAIR",
+    "cyclist": "BICYCLE BICYCLIST WHEELED_RIDER",
+    "motorcycle": "MOTORCYCLE MOTORCYCLIST",
+    "other": "RAILED_VEHICLE ANIMAL DOG STROLLER WHEELED_DEVICE MESSAGE_BOARD_TRAILER TRAFFIC_LIGHT_TRAILER BOLLARD "
+    "CONSTRUCTION_BARREL CONSTRUCTION_CONE MOBILE_PEDESTRIAN_CROSSING_SIGN SIGN STOP_SIGN",
 }
+LABELS = {category: label for label, names in _CATEGORIES.items() for category in names.split()}
 FIXED = frozenset({"BOLLARD", "CONSTRUCTION_BARREL", "CONSTRUCTION_CONE", "MOBILE_PEDESTRIAN_CROSSING_SIGN", "SIGN", "STOP_SIGN"})
 
 

@@ -9,6 +9,7 @@ import shapely
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, I64, Actor, LaneMap, Trajectory, Vehicle
 
 MIN_GAP_M = 0.3
@@ -24,8 +25,8 @@ def check_drive(lane_map: LaneMap, ego_log: Trajectory, vehicle: Vehicle, actors
     """
     t_us = np.arange(int(ego_log.t_us[0]), min(end_us, int(ego_log.t_us[-1])) + 1, STEP_US, dtype=np.int64)
     ego = footprints(interpolate(ego_log, t_us), vehicle.box.length_m, vehicle.box.width_m, vehicle.rear_axle_to_centre_m)
-    road = shapely.union_all([shapely.buffer(lane_polygon(lane.left, lane.right), SEAM_M) for lane in lane_map.lanes.values()
-                              if lane.kind == "vehicle" and lane.left is not None and lane.right is not None])  # fmt: skip
+    lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle" and lane.left is not None and lane.right is not None]
+    road = shapely.union_all([shapely.buffer(lane_polygon(lane), SEAM_M) for lane in lanes])
     shapely.prepare(road)
     off = np.flatnonzero(~shapely.covers(road, ego))
     if len(off):
@@ -48,11 +49,6 @@ def footprints(poses: F64, length_m: float, width_m: float, ahead_m: float = 0.0
     corners = np.array([[ahead_m + x, y, 0, 1], [ahead_m - x, y, 0, 1], [ahead_m - x, -y, 0, 1], [ahead_m + x, -y, 0, 1]])
     rings: F64 = shapely.polygons((corners @ np.swapaxes(poses, -1, -2))[..., :2])
     return rings
-
-
-def lane_polygon(left: F64, right: F64) -> shapely.Polygon:
-    """Return the polygon between two lane edges in plan view."""
-    return shapely.polygons(np.concatenate([left[:, :2], right[::-1, :2]]))
 
 
 def _least_gap(ego: F64, t_us: I64, actor: Actor) -> tuple[float, int]:

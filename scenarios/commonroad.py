@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import offset_trajectory
+from alpasim_plugin.geometry import offset_trajectory, rectangle_corners
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat, from_points
@@ -141,7 +141,7 @@ def _choose_ego(
     corridors = _corridors(lane_map)
     on_road: list[Obstacle] = []
     for candidate in always:
-        footprints = _footprints(candidate, least=DEFAULT.box)
+        footprints = _rectangles(candidate, least=DEFAULT.box)
         if not shapely.covers(surface, footprints).all() or _touches(candidate, footprints, obstacles):
             continue
         on_road.append(candidate)
@@ -178,18 +178,12 @@ def _corridors(lane_map: LaneMap) -> Any:
     return np.array(joined, dtype=object)
 
 
-def _footprints(obstacle: Obstacle, least: Box) -> Any:
+def _rectangles(obstacle: Obstacle, least: Box | None = None) -> Any:
     """Return the plan-view rectangles ``(T,)`` of an obstacle, at least as large as ``least``."""
-    half_l, half_w = max(obstacle.box.length_m, least.length_m) / 2, max(obstacle.box.width_m, least.width_m) / 2
-    return _rectangles(obstacle, half_l, half_w)
-
-
-def _rectangles(obstacle: Obstacle, half_l: float, half_w: float) -> Any:
-    c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
-    corners = np.array([[half_l, half_w], [half_l, -half_w], [-half_l, -half_w], [-half_l, half_w]])
-    x = obstacle.centre[:, :1] + c[:, None] * corners[:, 0] - s[:, None] * corners[:, 1]
-    y = obstacle.centre[:, 1:2] + s[:, None] * corners[:, 0] + c[:, None] * corners[:, 1]
-    return shapely.polygons(np.stack([x, y], axis=-1))  # (T,) of rings (4, 2)
+    size = np.array([obstacle.box.length_m, obstacle.box.width_m])
+    size = size if least is None else np.maximum(size, [least.length_m, least.width_m])
+    corners = rectangle_corners(obstacle.centre[:, :2], obstacle.yaw, np.broadcast_to(size, (len(obstacle.centre), 2)))
+    return shapely.polygons(corners)
 
 
 def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) -> bool:
@@ -197,7 +191,7 @@ def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) ->
     for other in obstacles:
         if other is ego:
             continue
-        shapes = _rectangles(other, other.box.length_m / 2, other.box.width_m / 2)
+        shapes = _rectangles(other)
         if other.static and len(other.steps) == 1:
             if shapely.intersects(footprints, shapes[0]).any():
                 return True

@@ -22,7 +22,7 @@ from scenarios.road_edges import border_lines, merge_areas
 STEP_M = 0.5  # stations on bends and where widths change
 STRAIGHT_STEP_M = 2.0
 MAX_ASIDE_M = 1000.0  # no lane is farther beside its reference line
-MIN_WIDTH_M = 0.1  # lanes that nowhere get this wide exist on paper only
+MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
 KINDS = {
     **dict.fromkeys(("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane", "bidirectional"), "vehicle"),
     **dict.fromkeys(("bus", "taxi", "HOV"), "bus"),

@@ -37,11 +37,11 @@ def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:
     edges: dict[str, F64] = {}
     for road in odr.roads:
         _add_road(road, lanes, edges)
-    kept = _without_twins(_without_crossing(edges, lanes))
+    kept = _without_duplicates(_without_crossing(edges, lanes))
 
     def local(line: F64) -> F64:
         moved = transform_points(T_local_map, line)
-        # A width that is read far beyond its section can be astronomic; AlpaSim would then fill the memory with vertices.
+        # A width that is read far beyond its section can be very large; AlpaSim would then fill the memory with vertices.
         return with_vertices(moved) if np.abs(moved - moved[0]).max() <= MAX_ROAD_M else moved
 
     return LaneMap(
@@ -106,7 +106,7 @@ def _without_crossing(edges: Mapping[str, F64], lanes: Mapping[str, tuple[F64, F
         near = segments[tree.query(line, predicate="dwithin", distance=CROSSING_M)]
         low_x, low_y, high_x, high_y = shapely.bounds(line)
         box = shapely.bounds(near).reshape(-1, 4)
-        # The loader asks its tree by bounding box only, and takes a segment with the edge's own box for a parallel one.
+        # The loader queries its tree by bounding box only, and takes a segment with the edge's own box for a parallel one.
         looked_at = (box[:, 0] <= high_x) & (box[:, 2] >= low_x) & (box[:, 1] <= high_y) & (box[:, 3] >= low_y)
         looked_at &= ~np.all(box == (low_x, low_y, high_x, high_y), axis=1)
         if not np.any(shapely.distance(line, near[looked_at]) < CROSSING_M):
@@ -114,7 +114,7 @@ def _without_crossing(edges: Mapping[str, F64], lanes: Mapping[str, tuple[F64, F
     return out
 
 
-def _without_twins(edges: Mapping[str, F64]) -> dict[str, F64]:
+def _without_duplicates(edges: Mapping[str, F64]) -> dict[str, F64]:
     """Drop of two edges whose middles are within 2 m the shorter one, if they are within 11 degrees or their middles within 1 m."""
     keys = list(edges)
     lines = np.array([shapely.linestrings(edges[k][:, :2]) for k in keys], dtype=object)

@@ -13,9 +13,9 @@ def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
     """Return the lanes with their successors in driving direction; links to lanes that are not in ``lanes`` are left out."""
     roads = {road.road_id: road for road in odr.roads}
     turns: dict[tuple[str, int], list[tuple[str, bool, int]]] = {}
-    for way in odr.connections:
-        for here, there in way.lanes:
-            turns.setdefault((way.incoming, here), []).append((way.connecting, way.at_start, there))
+    for connection in odr.connections:
+        for here, there in connection.lanes:
+            turns.setdefault((connection.incoming, here), []).append((connection.connecting, connection.at_start, there))
     out = dict(lanes)
     for road in odr.roads:
         for index, section in enumerate(road.sections):

@@ -68,7 +68,7 @@ class IdmActor(_InLane):
 
 
 class DriveActor(_InLane):
-    """A vehicle that drives a given speed over time and does not react to others."""
+    """A vehicle that drives a given speed over time and reacts to nobody."""
 
     kind: Literal["drive"]
     speeds: tuple[tuple[NonNegative, NonNegative], ...] = Field(

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
+from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_from_quat, yaw_of
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, Actor, Lane, RolloutLog, Scene
-from evaluators.footprint import corners, origin_of
+from evaluators.footprint import origin_of
 from evaluators.presets import Preset
 
 Point = tuple[Fraction, Fraction]
@@ -71,11 +71,11 @@ def actor_corners(actor: Actor, t_us: int, preset: Preset, origin: F64) -> F64 |
     if len(exact):
         return _corners(track.xyz[exact[0]], track.quat[exact[0]], size, origin)
     pose = interpolate(track, t_us)
-    return np.asarray(corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0])
+    return np.asarray(rectangle_corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0])
 
 
 def _corners(xyz: F64, quat: F64, size: F64, origin: F64) -> F64:
-    return np.asarray(corners((xyz[:2] - origin[:2])[None], np.array([yaw_from_quat(quat)]), size[None])[0])
+    return np.asarray(rectangle_corners((xyz[:2] - origin[:2])[None], np.array([yaw_from_quat(quat)]), size[None])[0])
 
 
 def touch(a: F64, b: F64) -> bool:

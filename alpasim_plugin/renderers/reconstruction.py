@@ -1,4 +1,4 @@
-"""The renderer ``3dgs``: a model fitted to the logged drive, or what the scenario's degradation names in its place."""
+"""The renderer ``3dgs``: a model fitted to the logged drive, or the scenario's degradation instead."""
 
 from __future__ import annotations
 

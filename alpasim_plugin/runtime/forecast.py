@@ -17,7 +17,7 @@ from alpasim_plugin.geometry import interpolate, quat_from_matrix
 from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState, moved_ego
 from alpasim_plugin.types import F64, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory
-from alpasim_plugin.world.actors import Actors, Outlook
+from alpasim_plugin.world.actors import ActorForecast, Actors
 
 
 def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
@@ -35,7 +35,7 @@ class Forecaster:
     def now(self) -> Forecast:
         """Return the forecast of the present instant; it costs next to nothing until it is read."""
         scenario, controller, plans, actors, state = self._parts
-        return Forecast(scenario, controller, plans.copy(), actors.outlook(), state.history, state.ego)
+        return Forecast(scenario, controller, plans.copy(), actors.forecast(), state.history, state.ego)
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Forecast:
     scenario: Scenario
     controller: Controller
     plans: PlanQueue
-    actors: Outlook
+    actors: ActorForecast
     history: Trajectory  # rig poses up to the instant; grows by predicted ones
     ego: EgoState  # at the end of the history
 

@@ -79,10 +79,10 @@ class Actors:
         self.t_us = t_us
         return poses
 
-    def outlook(self) -> Outlook:
+    def forecast(self) -> ActorForecast:
         """Return a forecast from the present instant, which does not change as the actors move on."""
         reactive = [(d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present]
-        return Outlook(self.replay, self.replay.cursor.copy(), tuple(reactive), self.t_us, self.closed_us)
+        return ActorForecast(self.replay, self.replay.cursor.copy(), tuple(reactive), self.t_us, self.closed_us)
 
     def _advance(self, from_us: int, to_us: int, ego: EgoState, poses: Mapping[str, F64]) -> None:
         n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
@@ -101,7 +101,7 @@ class Actors:
 
 
 @dataclass(frozen=True)
-class Outlook:
+class ActorForecast:
     """Predicted poses of road users, from what is known at one instant.
 
     Replayed ones follow their track, reactive ones keep their speed along their line.

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 
 from alpasim_plugin.bench.evaluators_reference import actor_corners, exact, point_to_segment, sides_of, touch
-from alpasim_plugin.geometry import interpolate, yaw_of
+from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.types import F64, RolloutLog
-from evaluators.footprint import corners, origin_of
+from evaluators.footprint import origin_of
 from evaluators.presets import PRESETS, Preset
 from evaluators.route import recorded_path
 
@@ -82,7 +82,7 @@ def open_loop_by_plan(rollout: RolloutLog, preset: Preset) -> list[bool]:
             if not plan.now_us < t_us <= plan.now_us + preset.open_loop_horizon_us:
                 continue
             pose = interpolate(plan.trajectory, t_us) @ rollout.T_rig_box
-            ego = corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0]
+            ego = rectangle_corners(pose[None, :2, 3] - origin[:2], np.array([yaw_of(pose)]), size[None])[0]
             boxes = [actor_corners(actor, t_us, preset, origin) for actor in rollout.actors.values()]
             hit = hit or any(box is not None and touch(ego, box) for box in boxes)
         if len(plan.trajectory):

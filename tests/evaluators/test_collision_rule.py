@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.bench.evaluators_reference import contacts_by_step
+from alpasim_plugin.geometry import rectangle_corners
 from alpasim_plugin.types import Box
 from evaluators import PRESETS, score
-from evaluators.footprint import ActorTable, corners, ego_footprints, origin_of
+from evaluators.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 from tests.examples import examples
@@ -150,7 +151,7 @@ def test_footprint_size_is_the_papers_and_not_the_logged_one():
 
 
 def test_corners_run_from_front_left_clockwise():
-    at = corners(np.array([[10.0, 5.0]]), np.array([np.pi / 2]), np.array([[4.0, 2.0]]))[0]
+    at = rectangle_corners(np.array([[10.0, 5.0]]), np.array([np.pi / 2]), np.array([[4.0, 2.0]]))[0]
     np.testing.assert_allclose(at, [[9.0, 7.0], [11.0, 7.0], [11.0, 3.0], [9.0, 3.0]], atol=1e-15)
 
 

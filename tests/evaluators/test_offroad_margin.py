@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.geometry import rectangle_corners
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import Lane, LaneMap
 from evaluators import PRESETS, reduce_rollout, score, surface
-from evaluators.footprint import corners
 from evaluators.surface import MARGIN_M, Region, Surface, closed_union
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference_strict import depth_by_points
@@ -33,7 +33,7 @@ def margins(log, lane_map=TWO_LANES):
 
 
 def box(x, y, yaw=0.0, size=(4.855, 1.88)):
-    return corners(np.array([[x, y]]), np.array([yaw]), np.array([size]))[0]
+    return rectangle_corners(np.array([[x, y]]), np.array([yaw]), np.array([size]))[0]
 
 
 def test_inside_the_margin_is_the_gap_to_the_border_of_all_lanes_together():

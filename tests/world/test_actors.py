@@ -178,8 +178,8 @@ def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:
     actors = Actors([replayed, idm("driver", 0.0, 10.0)], Vehicle(), 0, None, flat())
     for t in (0, 100_000):
         actors.step(t, FAR_AWAY)
-    outlook = actors.outlook()
-    expected = {t: outlook.at(t) for t in (100_000, 500_000, 1_000_000)}
+    forecast = actors.forecast()
+    expected = {t: forecast.at(t) for t in (100_000, 500_000, 1_000_000)}
     for t in range(200_000, 1_500_000, 100_000):
         moved = actors.step(t, FAR_AWAY)
         if t == 1_000_000:
@@ -188,7 +188,7 @@ def test_an_outlook_stays_as_it_is_while_the_actors_move_on() -> None:
             assert abs(moved["driver"][0, 3] - expected[t]["driver"][0, 3]) < 0.5
     for t, poses in expected.items():
         for name, pose in poses.items():
-            np.testing.assert_array_equal(outlook.at(t)[name], pose)
+            np.testing.assert_array_equal(forecast.at(t)[name], pose)
     assert expected[1_000_000]["driver"][0, 3] - expected[500_000]["driver"][0, 3] == pytest.approx(5.0, abs=0.1)
 
 
@@ -198,5 +198,5 @@ def test_an_outlook_ends_with_the_track_and_with_the_drivers_way() -> None:
     actors = Actors([replayed, short], Vehicle(), 0)
     for t in (0, 100_000):
         actors.step(t, FAR_AWAY)
-    assert set(actors.outlook().at(900_000)) == {"replayed", "driver"}
-    assert set(actors.outlook().at(1_100_000)) == set()
+    assert set(actors.forecast().at(900_000)) == {"replayed", "driver"}
+    assert set(actors.forecast().at(1_100_000)) == set()

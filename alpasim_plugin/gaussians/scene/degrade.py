@@ -2,10 +2,10 @@
 
 Nothing is trained here. A reconstruction from one drive is right where its cameras were and wrong elsewhere, and this module models the
 causes one by one (fact sheet on splatting, section 9): surfaces that no log camera saw are missing; depth along the log cameras' rays is
-uncertain, so Gaussians slide along those rays, with their size, and look right from the log only; some slide far and hang in the air as
-floaters; the log's poses are centimetres off, so the road sways; thin things such as lane paint are fitted late, so stretches of them are
-lost; Gaussians are too large, lose view dependence and change colour; moving actors are blurred, incomplete and doubled; exposure and white
-balance wander from frame to frame.
+uncertain, so Gaussians slide along those rays, with their size, and look right from the log only; some slide far and become floaters; the
+log's poses are centimetres off, so the road sways; thin structures such as lane paint are fitted late, so stretches of them are lost;
+Gaussians are too large, lose view dependence and change colour; moving actors are blurred, incomplete and doubled; exposure and white
+balance drift from frame to frame.
 
 Every amount is ``severity * (on + off * w)``: a small part that is there on the path (mild softness) and a part that grows with
 ``w``, 0 within ``onset_m`` of the path and 1 beyond ``full_m``. ``w`` is quantised to `STEPS` so that clouds are prepared once per step.
@@ -32,10 +32,10 @@ from alpasim_plugin.types import F32, F64, Degradation, Scenario
 
 STEPS = 8
 BEHIND_M = 6.0  # a Gaussian's log camera is the one this far before it
-KNOT_US = 400_000  # spacing of the wandering of exposure and poses
+KNOT_US = 400_000  # spacing of the drift of exposure and poses
 SWAY_M, SWAY_ON = 0.32, 0.35  # sideways error of the log's poses when full, and its share on the path
 THIN_M = 0.075  # Gaussians thinner than this are detail that is fitted late: lane paint, poles, rails
-LOST_ABOVE, LOST_OFF = 0.5, 0.7  # thin things are lost where a field of unit spread exceeds the first, less the second times w
+LOST_ABOVE, LOST_OFF = 0.5, 0.7  # thin structures are lost where a field of unit spread exceeds the first, less the second times w
 GHOST = "~ghost"
 
 

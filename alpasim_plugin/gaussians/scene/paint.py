@@ -1,8 +1,8 @@
-"""Decide where road paint lies: from lane edges, marking lines, crosswalks and stop lines to short straight strokes.
+"""Road paint as short straight strokes, from lane edges, marking lines, crosswalks and stop lines.
 
-Where a map does not know the paint of a lane's edge, a plausible rule stands in: an edge shared by two lanes of one direction is a dashed
+Where a map does not give the paint of a lane's edge, a default rule applies: an edge shared by two lanes of one direction is a dashed
 white line, one between opposing lanes a double yellow one, an outer edge a solid white line; inside intersections nothing is painted.
-Maps that give marking lines of their own are believed: their lane edges of unknown paint stay bare.
+In maps with marking lines of their own, lane edges of unknown paint stay unpainted.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class SkyView:
 
 
 class SkyMask:
-    """What the nearest log view of a like direction saw of the sky.
+    """Sky mask from the nearest log view of a similar direction.
 
     Args:
         views: Of cameras that may look in different directions; without any, nothing is sky.
