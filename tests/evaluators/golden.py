@@ -27,8 +27,13 @@ CASES = ("failed-rollout", "no-actors", "rails-stripped", "no-map", "no-road-edg
 SETS = ("rollouts", "other-settings", *CASES)
 
 
+read_log = lru_cache(maxsize=64)(read_asl)
+read_scene = lru_cache(maxsize=32)(read_usdz_scene)
+
+
 def read_case(log: Path, scene: Path, rails: bool = True) -> tuple[RolloutLog, Scene]:
-    return read_asl(log), read_usdz_scene(scene, rails)
+    """Return a log and its scene; several settings score the same ones."""
+    return read_log(log), read_scene(scene, rails)
 
 
 @lru_cache(maxsize=128)

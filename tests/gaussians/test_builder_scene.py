@@ -116,8 +116,8 @@ def test_environment_without_houses_trees_and_poles_builds_none() -> None:
 
 
 def test_everything_follows_a_sloping_ground() -> None:
-    scenario = curve()
-    for node in built(scenario).background:
+    scenario, graph = empty_street(curve)
+    for node in graph.background:
         if node.name.startswith(("ground/", "paint/")):
             means = node.levels[0].cloud.means.astype(np.float64)
             above = means[:, 2] - height_at(scenario.ground, means)
@@ -127,7 +127,7 @@ def test_everything_follows_a_sloping_ground() -> None:
 
 def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
     shift = np.array([4.0e5, -3.0e5, 0.0])
-    near = straight(actors=())
+    near, graph = empty_street(straight)
     lanes = {}
     for k, v in near.lane_map.lanes.items():
         assert v.left is not None
@@ -140,7 +140,7 @@ def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
         ego_log=replace(near.ego_log, xyz=near.ego_log.xyz + shift),
         route=Route(near.route.xyz + shift),
     )
-    a, b = built(near).render(view(near, 5), {}), built(far).render(view(far, 5), {})
+    a, b = graph.render(view(near, 5), {}), built(far).render(view(far, 5), {})
     assert np.abs(a.rgb - b.rgb).mean() < 1e-3
 
 

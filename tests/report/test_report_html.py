@@ -65,8 +65,14 @@ def page_of(folder: Path) -> Page:
     return page
 
 
-def test_report_is_one_well_formed_file_without_outside_addresses(usual_run: Path) -> None:
-    page = page_of(usual_run)
+@pytest.fixture(scope="module")
+def usual_page(usual_run: Path) -> Page:
+    """Give the page of the usual run; it stays beside its tables as ``report.html``."""
+    return page_of(usual_run)
+
+
+def test_report_is_one_well_formed_file_without_outside_addresses(usual_run: Path, usual_page: Page) -> None:
+    page = usual_page
     assert all(LOCAL.match(address) for address in page.addresses)
     assert len(page.ids) == len(set(page.ids))
     assert not page.handlers
@@ -76,8 +82,8 @@ def test_report_is_one_well_formed_file_without_outside_addresses(usual_run: Pat
     assert "@import" not in text
 
 
-def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path) -> None:
-    page = page_of(usual_run)
+def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path, usual_page: Page) -> None:
+    page = usual_page
     for address in page.addresses:
         if address.startswith("#"):
             assert address[1:] in page.ids
@@ -85,8 +91,8 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path) -> N
             assert (usual_run / unquote(address)).exists(), address
 
 
-def test_verdict_comes_first(usual_run: Path) -> None:
-    page = page_of(usual_run)
+def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
+    page = usual_page
     heads = ["Results", "Paired differences", "Changed outcomes", "Over time", "What the camera saw", "From above", "Scene by scene"]
     heads += ["By distance and by opacity", "Speed", "Failures", "Not in the numbers", "Repeatability", "Provenance"]
     assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == heads
@@ -106,8 +112,8 @@ def test_hostile_names_stay_text(hostile_run: Path) -> None:
             assert (hostile_run / unquote(address)).resolve().is_relative_to(hostile_run.resolve())
 
 
-def test_numbers_that_are_missing_are_dashes_with_a_reason(usual_run: Path) -> None:
-    text = write_report(usual_run).read_text()
+def test_numbers_that_are_missing_are_dashes_with_a_reason(usual_run: Path, usual_page: Page) -> None:
+    text = (usual_run / "report.html").read_text()
     reasons = re.findall(r'<span class="missing" title="([^"]*)"[^>]*>([^<]*)</span>', text)
     assert reasons
     assert all(reason and dash == "\u2014" for reason, dash in reasons)
@@ -171,8 +177,9 @@ def test_unreadable_strip_is_left_out_and_said(usual_run: Path, tmp_path: Path) 
     assert "No frames from 3dgs in this cell." in page_of(folder).text
 
 
-def test_same_folder_gives_the_same_bytes(usual_run: Path) -> None:
-    assert write_report(usual_run).read_bytes() == write_report(usual_run).read_bytes()
+def test_same_folder_gives_the_same_bytes(usual_run: Path, usual_page: Page) -> None:
+    first = (usual_run / "report.html").read_bytes()
+    assert write_report(usual_run).read_bytes() == first
 
 
 def test_charts_take_their_colours_from_the_page() -> None:
