@@ -98,7 +98,7 @@ class DegradationSpec(Part):
 
     kind: Literal["reconstruction", "cycle", "surrogate", "none"] = Field(
         default="reconstruction",
-        description="A model fitted to the logged drive and stopped early; a model fitted to views beside it; seeded perturbations; nothing.",
+        description="A model fitted to the logged drive and stopped early; one fitted to views beside it; seeded perturbations; none.",
     )
     share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
     shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
