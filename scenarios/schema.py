@@ -19,7 +19,7 @@ SCHEMA_FILE = Path(__file__).with_name("schema.json")
 class LaneChangeSpec(Part):
     """A lane change of the ego."""
 
-    at_m: NonNegative = Field(description="Start of the change, metres along the ego's way from where it starts.")
+    at_m: NonNegative = Field(description="Start of the change, metres along the ego's path from where it starts.")
     to_lane: int = Field(ge=0, description="Target forward lane; 0 is next to the centre line.")
     length_m: Positive = Field(default=60.0, description="Length of the change along the road.")
 
@@ -37,7 +37,7 @@ class EgoSpec(Part):
 
 
 class EnvironmentSpec(Part):
-    """What stands around the road when the scene is dressed."""
+    """Surroundings generated beside the road."""
 
     buildings: float = Field(default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
     building_height_m: tuple[Positive, Positive] = Field(default=(6.0, 18.0), description="Least and greatest height of facades.")
@@ -56,7 +56,7 @@ class EnvironmentSpec(Part):
 class CameraModel(Part):
     """A pinhole camera on the rig."""
 
-    name: str = Field(default="front", min_length=1, description="Name that policies ask for.")
+    name: str = Field(default="front", min_length=1, description="Name that policies request.")
     width: int = Field(default=256, ge=8, le=8192, description="Image width in pixels.")
     height: int = Field(default=144, ge=8, le=8192, description="Image height in pixels.")
     hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
@@ -98,7 +98,7 @@ class DegradationSpec(Part):
 
     kind: Literal["reconstruction", "cycle", "surrogate", "none"] = Field(
         default="reconstruction",
-        description="A model fitted to the logged drive and stopped early; a model fitted to views from aside; seeded stand-ins; nothing.",
+        description="A model fitted to the logged drive and stopped early; one fitted to views beside it; seeded perturbations; none.",
     )
     share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
     shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
@@ -124,7 +124,7 @@ DEGRADATION_KEYS = {
 
 
 class BackgroundSpec(Part):
-    """A Gaussian file (.ply, .splat, .spz) used as background instead of the dressed map."""
+    """A Gaussian file (.ply, .splat, .spz) used as background instead of generated surroundings."""
 
     file: str = Field(min_length=1, description="Path, relative to this file.")
     transform: tuple[tuple[float, float, float, float], ...] | None = Field(
@@ -183,8 +183,8 @@ class ScenarioSpec(Part):
     scene_id: str | None = Field(
         default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Name of the scene; none: the file's folder and name."
     )
-    description: str = Field(default="", description="One sentence for people.")
-    tags: tuple[str, ...] = Field(default=(), description="Words to find it by.")
+    description: str = Field(default="", description="One sentence.")
+    tags: tuple[str, ...] = Field(default=(), description="Keywords.")
     seed: int = Field(default=0, ge=0, description="Scene seed: geometry, textures, scripted actors.")
     road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
     log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
@@ -197,7 +197,7 @@ class ScenarioSpec(Part):
     rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
     timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
     latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
-    degradation: DegradationSpec = Field(default=DegradationSpec(), description="What the renderer 3dgs gets wrong.")
+    degradation: DegradationSpec = Field(default=DegradationSpec(), description="Degradation of the renderer 3dgs.")
     background: BackgroundSpec | None = Field(default=None, description="A Gaussian file as background.")
     vehicle: VehicleSpec | None = Field(default=None, description="The ego vehicle; none: the log's own, or the default one.")
     jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of different seeds differ.")
@@ -205,7 +205,7 @@ class ScenarioSpec(Part):
         default={}, description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed."
     )
     samples: tuple[dict[str, Any], ...] = Field(
-        default=(), description="Explicit samples, each dotted key to value; the scene seed picks one, round and round."
+        default=(), description="Explicit samples, each dotted key to value; the scene seed picks one, cyclically."
     )
 
     @model_validator(mode="after")

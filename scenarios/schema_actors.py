@@ -88,7 +88,7 @@ class OncomingActor(_Actor):
 
     kind: Literal["oncoming"]
     lane: int = Field(default=0, ge=0, description="Oncoming lane; 0 is next to the centre line.")
-    s_m: float = Field(description="Centre at the start, metres along the ego's way from the ego's start.")
+    s_m: float = Field(description="Centre at the start, metres along the ego's path from the ego's start.")
     speed_mps: NonNegative = Field(description="Speed.")
     offset_m: float = Field(default=0.0, description="Metres left of the lane's middle, in its driving direction.")
 

@@ -91,12 +91,12 @@ SegmentSpec = Annotated[
 
 
 class RoadSpec(Part):
-    """A road built from segments that follow one another along the ego's way. Driving is on the right."""
+    """A road built from segments that follow one another along the ego's path. Driving is on the right."""
 
     lanes_forward: int = Field(default=1, ge=1, le=6, description="Lanes in the ego's direction at the start.")
     lanes_backward: int = Field(default=1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
     lane_width_m: float = Field(default=3.5, ge=2.2, le=6, description="Width of every lane.")
-    median_m: float = Field(default=0.0, ge=0, le=30, description="Raised median between the directions; 0: paint only.")
+    median_m: float = Field(default=0.0, ge=0, le=30, description="Raised median between the directions; 0: markings only.")
     shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the outer lanes.")
     parking_m: float = Field(default=0.0, ge=0, le=6, description="Parking strip outside the outer lanes, instead of the shoulder.")
     speed_limit_mps: Positive | None = Field(default=None, description="Speed limit of all lanes.")
