@@ -78,10 +78,11 @@ def test_published_conditioning_videos_hold_our_colours(shared_data, name):
     with av.open(str(next(folder.glob("av_002b815b*.mp4")))) as video:
         image = next(frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
     inner = cv2.erode((image.max(axis=2) > 40).astype(np.uint8), np.ones((3, 3))) > 0  # rims mix two colours
-    pixels = image[inner].astype(float)
+    pixels = image[inner]
+    assert len(pixels) > 20_000
+    pixels = pixels[::4].astype(float)
     fade = np.clip(pixels @ palette.T / (palette**2).sum(axis=1), 0, 1)
     off = np.abs(pixels[:, None] - fade[..., None] * palette).max(axis=2).min(axis=1)
-    assert len(pixels) > 20_000
     assert (off <= 14).mean() > 0.94
 
 
