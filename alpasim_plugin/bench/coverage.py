@@ -1,6 +1,6 @@
-"""The tables of docs/statistics.md, from the study of the intervals.
+"""The tables of docs/experiments/interval-coverage.md, from the study of the intervals.
 
-``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write docs/statistics.md`` puts them between their markers.
+``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write docs/experiments/interval-coverage.md`` puts them between their markers.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The definition is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to unit length over the channels, squared
 difference, a non-negative weight per channel, mean over the image, sum over the stages. Values cannot be compared with published LPIPS
-numbers. docs/video-metrics.md describes training and validation.
+numbers. docs/perceptual-syn.md describes training and validation.
 """
 
 from __future__ import annotations
