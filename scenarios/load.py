@@ -32,13 +32,13 @@ from alpasim_plugin.types import (
 from alpasim_plugin.world.ground import flat
 from scenarios.build import build, last_us
 from scenarios.cameras import camera_spec
+from scenarios.library import shipped_names
 from scenarios.schema import ScenarioSpec, VehicleSpec
 from scenarios.schema_road import SHIPPED
 from scenarios.sources import detect, read_log, source_digest
 from scenarios.variation import draw, jitter
 
 DOING = "reading a scenario"
-LIBRARY = Path(__file__).resolve().parent
 
 
 def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = (), source: str | None = None) -> Scenario:
@@ -99,15 +99,6 @@ def find(path_or_name: str | Path) -> Path:
         DOING, str(path_or_name), "no such file or folder, and no shipped scenario has that name",
         f"{hint}give a path, or a name that 'simrun list scenarios' shows",
     )  # fmt: skip
-
-
-def shipped_names() -> dict[str, Path]:
-    """Return the shipped scenarios: name without ending, to file. Suites are not among them."""
-    out = {}
-    for file in sorted(LIBRARY.glob("*/*.yaml")):
-        if file.parent.name not in ("suites", "base"):
-            out[f"{file.parent.name}/{file.stem}"] = file
-    return out
 
 
 def _document(path: Path, source: str | None) -> Document:
@@ -277,4 +268,4 @@ def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: st
     return digest.hexdigest()
 
 
-__all__ = ["find", "load_scenario", "shipped_names"]
+__all__ = ["find", "load_scenario"]

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from alpasim_plugin.config import Document, load_yaml, validate
 from alpasim_plugin.errors import InputError
-from scenarios.load import LIBRARY, shipped_names
+from scenarios.library import shipped_names, suites
 from scenarios.schema_base import Part
 from scenarios.sources import source_of
 
@@ -66,17 +66,6 @@ def expand(item: str, overrides: Sequence[str] = (), source: str | None = None) 
     if source is not None:
         return [ScenarioRef(item, None, tuple(overrides), source)]
     return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
-
-
-def shipped() -> dict[str, str]:
-    """Return every shipped scenario and suite with its one-line description."""
-    names = {**shipped_names(), **suites()}
-    return {name: str(_head(file).get("description", "")) for name, file in names.items()}
-
-
-def suites() -> dict[str, Path]:
-    """Return the shipped suites: ``suites/NAME`` to file."""
-    return {f"suites/{file.stem}": file for file in sorted((LIBRARY / "suites").glob("*.yaml"))}
 
 
 def _expand(text: str, base: Path | None, chain: tuple[Path, ...]) -> list[ScenarioRef]:

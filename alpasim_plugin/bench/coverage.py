@@ -1,6 +1,6 @@
 """The tables of docs/experiments/interval-coverage.md, from the study of the intervals.
 
-``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write docs/experiments/interval-coverage.md`` puts them between their markers.
+``python -m alpasim_plugin.bench.coverage`` prints the tables; ``--write PAGE`` puts them between the markers of that page.
 """
 
 from __future__ import annotations

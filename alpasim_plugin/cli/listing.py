@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from alpasim_plugin.parts import names, resolve
+from alpasim_plugin.parts import names, unidentified
+from alpasim_plugin.parts.loading import load
+from alpasim_plugin.parts.resolve import declaration_of, note_of
 
 EPILOG = "Example: `simrun list scenarios`"
 
@@ -43,11 +46,15 @@ def list_parts(
 
 def _fixers() -> dict[str, str]:
     """Return every fixer with its help and whose weights it has; as a renderer each stands for ``NAME+3dgs``."""
-    return {name: f"{help_text} [{resolve('fixer', name).note}]" for name, help_text in names("fixer").items()}
+    listed = {}
+    for name, help_text in names("fixer").items():
+        spec = unidentified("fixer", name)
+        listed[name] = f"{help_text} [{note_of(spec, declaration_of(load(spec.target, 'fixer'), spec.settings, Path()))}]"
+    return listed
 
 
 def _scenarios() -> dict[str, str]:
-    from scenarios.suite import shipped
+    from scenarios.library import shipped
 
     return shipped()
 

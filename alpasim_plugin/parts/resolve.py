@@ -140,19 +140,24 @@ def _declares_nothing(kind: KindName, target: str) -> bool:
     return kind in PLAIN_KINDS and any(target == shipped for shipped, _ in BUILTIN[kind].values())
 
 
+def note_of(spec: PartSpec, declared: Declaration) -> str:
+    """Return what a part is in a few words, where it does not say so itself."""
+    trained = "" if declared.trained is None else "trained" if declared.trained else "untrained"
+    return declared.note or trained or ("no network" if spec.kind == "fixer" else "")
+
+
 def _described(spec: PartSpec, factory: Any) -> PartSpec:
     module = file_of(spec.target)
     declared = declaration_of(factory, spec.settings, module.parent if module else Path())
     shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}") for key, path in declared.files.items()}
     attribute = spec.target.rpartition(":")[2]
-    trained = "" if declared.trained is None else "trained" if declared.trained else "untrained"
     return PartSpec(
         spec.kind,
         spec.name,
         spec.target,
         spec.settings,
         None if declared.is_remote else part_digest(module, attribute, spec.settings, shas),
-        declared.note or trained or ("no network" if spec.kind == "fixer" else ""),
+        note_of(spec, declared),
         declared.trained,
         {str(declared.files[key]): sha for key, sha in shas.items()},
         dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},

@@ -42,7 +42,8 @@ def test_a_step_count_at_the_end_belongs_to_the_fixer() -> None:
 def test_an_import_path_is_a_renderer_or_a_fixer_by_what_it_can_do(tmp_path: Path) -> None:
     file = tmp_path / "own.py"
     file.write_text(
-        "class Shows:\n    def render(self, request): ...\n\nclass Fixes:\n    def reset(self, seed): ...\n    def step(self, block, maps): ...\n"
+        "class Shows:\n    def render(self, request): ...\n"
+        "class Fixes:\n    def reset(self, seed): ...\n    def step(self, block, maps): ...\n"
     )
     assert resolve_renderer(f"{file}:Shows").fixer is None
     assert str(resolve_renderer(f"{file}:Fixes")) == f"{file}:Fixes+3dgs"
@@ -61,7 +62,8 @@ def test_the_digest_follows_imports_wherever_they_stand(tmp_path: Path) -> None:
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "part.py").write_text(
-        "from typing import TYPE_CHECKING\n\nfrom . import near\nfrom pack.other import (\n    one,  # a comment, with a comma\n    two,\n)\n\n"
+        "from typing import TYPE_CHECKING\n\nfrom . import near\n"
+        "from pack.other import (\n    one,  # a comment, with a comma\n    two,\n)\n\n"
         "if TYPE_CHECKING:\n    from pack.typed import Unused\n\n\ndef late():\n    import beside\n"
     )
     for name in ("near", "other", "typed"):

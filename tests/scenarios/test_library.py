@@ -14,7 +14,8 @@ from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
 from alpasim_plugin.types import F64, Box, Scenario
 from alpasim_plugin.world.actors import make_actors
 from alpasim_plugin.world.ego import ego_state_from_log
-from scenarios.load import LIBRARY, load_scenario, shipped_names
+from scenarios.library import LIBRARY, shipped_names
+from scenarios.load import load_scenario
 from scenarios.suite import load_suite, shipped, suites
 
 BUILT = [name for name in shipped_names() if not name.startswith("real/")]

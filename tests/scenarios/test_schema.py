@@ -8,7 +8,8 @@ from pathlib import Path
 
 import yaml
 
-from scenarios.load import LIBRARY, load_scenario, shipped_names
+from scenarios.library import LIBRARY, shipped_names
+from scenarios.load import load_scenario
 from scenarios.schema import SCHEMA_FILE, ScenarioSpec, json_schema, models
 from scenarios.schema_docs import BEGIN, END, PAGES, key_tables
 
