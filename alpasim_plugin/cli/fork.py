@@ -12,7 +12,7 @@ import typer
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import resolve, resolve_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
-from alpasim_plugin.runtime.past import find_rollout
+from alpasim_plugin.runtime.logged_rollout import find_rollout
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.probe import probe_rollout
 from alpasim_plugin.runtime.probe_files import PROBE_JSON
