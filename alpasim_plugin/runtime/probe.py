@@ -132,7 +132,7 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
         raise InputError(
-            DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two different renderers"
+            DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers"
         )
     past.check_repeatable(DOING)
     own, threads = past.cell, thread_budget(1, 1).per_worker

@@ -21,7 +21,7 @@ from alpasim_plugin.runtime.probe import probe_rollout
 from alpasim_plugin.runtime.probe_write import write_probe
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from alpasim_plugin.runtime.store import read_json
-from alpasim_plugin.runtime.switch import joined_sensors
+from alpasim_plugin.runtime.switch import merge_sensors
 from alpasim_plugin.types import SensorSpec
 from scenarios.suite import expand
 from tests.runtime.test_certificate import BARE
@@ -184,7 +184,7 @@ def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: LoggedRollout)
 
 def test_two_policies_share_a_camera_at_the_shorter_period() -> None:
     first, then = (SensorSpec("front"), SensorSpec("left", 200_000)), (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
-    assert joined_sensors(first, then, 100_000) == (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
+    assert merge_sensors(first, then, 100_000) == (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
 
 
 def test_flips_are_written_for_a_run_without_any(root: Path) -> None:
