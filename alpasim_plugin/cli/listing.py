@@ -1,4 +1,4 @@
-"""``simrun list``: what can be named on the command line."""
+"""``simrun list``: names for the command line."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def list_parts(
 
 
 def _fixers() -> dict[str, str]:
-    """Return every fixer with its help and whose weights it has; as a renderer each stands for ``NAME+3dgs``."""
+    """Return every fixer with its help and the origin of its weights; as a renderer each means ``NAME+3dgs``."""
     return {name: f"{help_text} [{resolve('fixer', name).note}]" for name, help_text in names("fixer").items()}
 
 

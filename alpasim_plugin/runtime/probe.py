@@ -131,9 +131,7 @@ def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
         PolicyError: The policy failed with one of them.
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
-        raise InputError(
-            DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers"
-        )
+        raise InputError(DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers")
     past.check_repeatable(DOING)
     own, threads = past.cell, thread_budget(1, 1).per_worker
     specs = {own.renderer.name: own.renderer} | {
