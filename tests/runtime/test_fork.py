@@ -12,6 +12,7 @@ import pytest
 
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_asl, read_facts, write_facts
+from alpasim_plugin.parts import resolve
 from alpasim_plugin.runtime.certificate import rollout_trace
 from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.fork import Change, fork_rollout
@@ -177,8 +178,8 @@ def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_anothe
 def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: LoggedRollout) -> None:
     with pytest.raises(InputError, match="fewer than two"):
         probe_rollout(past, ["clean"])
-    blind = replace(past, cell=replace(past.cell, policy="pure-pursuit"))
-    with pytest.raises(InputError, match="takes no camera"):
+    blind = replace(past, cell=replace(past.cell, policy=resolve("policy", "pure-pursuit")))
+    with pytest.raises(InputError, match="has no camera"):
         probe_rollout(blind, ["clean", "3dgs"])
 
 
