@@ -1,7 +1,7 @@
 """Errors with four parts: doing what, with what, found what, do this.
 
-Every failure a user can meet is a `SimrunError`. The class decides the process exit code (docs/cli.md) and the failure
-class written to ``rollouts.parquet``, so the printed text, the table and the exit code cannot disagree.
+Every failure that a user can meet is a `SimrunError`. Its class sets the process exit code (docs/cli.md) and the failure class in
+``rollouts.parquet``, so the printed text, the table and the exit code agree.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from typing import ClassVar
 
 
 class SimrunError(Exception):
-    """Say what was attempted, with which object, what was found, and what the user can do.
+    """State what was attempted, with which object, what was found, and what the user can do.
 
     Args:
         doing: The attempted action, as a verb phrase ("reading a scenario").
         with_what: The object of the action: file with line and column, option, renderer name.
-        found: What was actually met, with the offending value.
+        found: What was found instead, with the offending value.
         do_this: One action that would help.
     """
 
@@ -45,7 +45,7 @@ class InputError(SimrunError):
 
 
 class InfrastructureError(SimrunError):
-    """The machine failed us: disk full, lost worker, unreachable server."""
+    """The machine or a service failed: disk full, lost worker, unreachable server."""
 
     exit_code: ClassVar[int] = 4
     failure_class: ClassVar[str] = "infrastructure"
@@ -58,19 +58,19 @@ class RendererError(InfrastructureError):
 
 
 class FixerError(InfrastructureError):
-    """A fixer produced no usable frame and the raw frame could not be passed on."""
+    """A fixer returned no usable frame, and the raw frame could not replace it."""
 
     failure_class: ClassVar[str] = "fixer"
 
 
 class PolicyError(InfrastructureError):
-    """A policy raised, or answered something that breaks its contract."""
+    """A policy raised, or returned a plan that breaks its contract."""
 
     failure_class: ClassVar[str] = "policy"
 
 
 class EvaluatorError(SimrunError):
-    """An evaluator could not give a value where one is due."""
+    """An evaluator could not compute a required value."""
 
     exit_code: ClassVar[int] = 5
     failure_class: ClassVar[str] = "evaluator"

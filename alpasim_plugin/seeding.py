@@ -1,7 +1,8 @@
 """Random streams keyed by (scene, seed, component, step).
 
-The key is hashed to a Philox counter-based generator, so a stream depends on nothing but its key: not on call order, worker count or
-platform. The renderer's name is never part of the key of a shared component: two renderers meet the same noise and pairs stay sharp.
+The hashed key seeds a Philox counter-based generator. A stream depends on its key alone: not on call order, worker count or platform.
+The renderer's name is not part of the key of a shared component: all renderers get common random numbers, which reduces the variance of
+paired differences.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def derive_seed(scene_id: str, seed: int, component: str, step: int = 0) -> int:
 
 
 def stream(scene_id: str, seed: int, component: str, step: int = 0) -> np.random.Generator:
-    """Return the generator of one component at one step."""
+    """Return the random generator of one component at one step."""
     key = np.frombuffer(_digest(scene_id, seed, component, step)[:16], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
 

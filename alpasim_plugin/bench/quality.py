@@ -19,7 +19,7 @@ from evaluators.video import clip_quality
 from evaluators.video.perceptual import ImageDistance
 from evaluators.video.summary import TRUTH
 
-RAW = "3dgs"  # the arm of the unfixed render
+RAW = "3dgs"  # the variant of the unfixed render
 VERSION = 1  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
@@ -44,7 +44,7 @@ class QualityClip:
 
 
 @dataclass(frozen=True)
-class Arm:
+class Variant:
     """One row of the table: the render as it is (``3dgs``), the truth, or a fixer under a label."""
 
     label: str
@@ -52,7 +52,7 @@ class Arm:
 
     def __post_init__(self) -> None:
         if self.spec is None and self.label not in (RAW, TRUTH):
-            raise InputError("choosing what to measure", f"arm {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
+            raise InputError("choosing what to measure", f"variant {self.label!r}", "no fixer", f"name a fixer, or one of {RAW}, {TRUTH}")
 
     def content(self) -> dict[str, Any]:
         """Return everything that determines its images."""
@@ -60,8 +60,8 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class ArmResult:
-    """Output of an arm on a clip.
+class VariantResult:
+    """Output of a variant on a clip.
 
     Args:
         video: ``(T, H, W, 3)``.
@@ -74,49 +74,52 @@ class ArmResult:
     events: Mapping[str, int]
 
 
-def row_key(clip: QualityClip, arm: Arm, seed: int, device: str, networks: Mapping[str, str]) -> str:
+def row_key(clip: QualityClip, variant: Variant, seed: int, device: str, networks: Mapping[str, str]) -> str:
     """Return the digest of everything that determines a row, except the speed of the machine.
 
     Args:
         clip: Already cut to length.
-        arm: With the digests of its weights.
+        variant: With the digests of its weights.
         seed: Of the fixer's noise.
         device: Where the fixer computes.
         networks: Perceptual distances by name, each with what identifies its weights.
     """
-    facts = [VERSION, clip.name, len(clip.t_us), dict(clip.identity), arm.content(), seed, device, dict(networks)]
+    facts = [VERSION, clip.name, len(clip.t_us), dict(clip.identity), variant.content(), seed, device, dict(networks)]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def run_arm(clip: QualityClip, arm: Arm, fixer: Fixer | None) -> ArmResult:
-    """Run an arm over a clip.
+def run_variant(clip: QualityClip, variant: Variant, fixer: Fixer | None) -> VariantResult:
+    """Run a variant over a clip.
 
     Args:
         clip: The clip.
-        arm: Which.
-        fixer: A session at the start of a rollout, for arms that are fixers.
+        variant: Which.
+        fixer: A session at the start of a rollout, for variants that are fixers.
 
     Raises:
         InputError: A fixer that is missing, or given where none runs.
     """
-    if (fixer is None) != (arm.spec is None):
+    if (fixer is None) != (variant.spec is None):
         raise InputError(
-            "running an arm", f"arm {arm.label!r}", "a missing or superfluous fixer", "give a session exactly for a fixer's arm"
+            "running a variant",
+            f"variant {variant.label!r}",
+            "a missing or superfluous fixer",
+            "give a session exactly for a fixer's variant",
         )
-    if fixer is None or arm.spec is None or not isinstance(arm.spec.settings, FixerSettings):
-        return ArmResult(np.array(clip.truth if arm.label == TRUTH else clip.render), (), {})
+    if fixer is None or variant.spec is None or not isinstance(variant.spec.settings, FixerSettings):
+        return VariantResult(np.array(clip.truth if variant.label == TRUTH else clip.render), (), {})
     tally, frames = StreamStats(), []
-    for block in refine_frames(_frames(clip, arm.spec.settings.uses_map), fixer):
+    for block in refine_frames(_frames(clip, variant.spec.settings.uses_map), fixer):
         tally.add(block)
         frames += [frame.rgb for frame in block.fixed]
-    return ArmResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
+    return VariantResult(np.stack(frames), tuple(tally.ms_per_frame), dict(tally.events))
 
 
-def measure(clip: QualityClip, arm: Arm, result: ArmResult, seed: int, networks: Mapping[str, ImageDistance]) -> dict[str, Any]:
-    """Return the row of one clip under one arm, as `evaluators.video.summary` takes it."""
-    found = clip_quality(result.video, None if arm.label == TRUTH else clip.truth, networks)
+def measure(clip: QualityClip, variant: Variant, result: VariantResult, seed: int, networks: Mapping[str, ImageDistance]) -> dict[str, Any]:
+    """Return the row of one clip under one variant, as `evaluators.video.summary` takes it."""
+    found = clip_quality(result.video, None if variant.label == TRUTH else clip.truth, networks)
     return {
-        "arm": arm.label,
+        "arm": variant.label,
         "clip": clip.name,
         "seed": seed,
         "frames": len(clip.t_us),

@@ -27,7 +27,7 @@ Examples:
 - `simrun compare runs/main runs/change --gate configs/gates/default.yaml --json`
 """
 EVERY_MISSING = 10**9
-SHOWN, NAMED = 10, 3  # lines about what has no pair; cells named in each
+SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
 
 
 def compare(
@@ -70,7 +70,7 @@ def _print(result: Comparison, only: Sequence[str] | None) -> None:
 
 
 def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Lay out one line a metric; wide, so that a line is never broken in the middle of a number."""
+    """Return one line per metric; lines are not wrapped."""
     lines = [("metric", "difference", "95 %", "p", "margin", "pairs", "verdict")]
     for row in rows:
         entry = entries[row.metric]
@@ -86,15 +86,15 @@ def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]]) ->
 
 
 def _missing(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Say what has no pair: metrics without any, cells that lack every metric, and metrics that lack some cells."""
+    """List missing pairs: metrics without any, cells without any, and metrics that lack some cells."""
     paired = {metric: entry for metric, entry in entries.items() if entry["n_cells"]}
     lines = [f"  no pair: {metric}: {entry.get('reason')}" for metric, entry in entries.items() if metric not in paired]
-    lacking: dict[tuple[str, str], list[str]] = {}  # (cell, why) -> metrics
+    lacking: dict[tuple[str, str], list[str]] = {}  # (cell, reason) -> metrics
     for metric, entry in paired.items():
         for cell in entry["missing"]:
             name = f"{cell['policy']}, {cell['scene']}, seed {cell['seed']}"
             lacking.setdefault((name, cell["why"]), []).append(metric)
-    partly: dict[tuple[str, str], list[str]] = {}  # (metrics, why) -> cells
+    partly: dict[tuple[str, str], list[str]] = {}  # (metrics, reason) -> cells
     for (name, why), metrics in lacking.items():
         if len(metrics) == len(paired):
             lines.append(f"  no pair: {name}: every metric: {why}")

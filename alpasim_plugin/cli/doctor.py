@@ -1,4 +1,4 @@
-"""``simrun doctor``: is this machine able to run, and what would make it better."""
+"""``simrun doctor``: check that this machine can run each part."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Try each part on a small case and say what works, what does not, and what to do about it."""
+    """Test each part on a small case and report what works, what does not, and what to do."""
     del debug
     checks: dict[str, Callable[[], str]] = {
         "rasteriser (cpu)": lambda: _raster("cpu"),

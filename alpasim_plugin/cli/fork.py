@@ -1,4 +1,4 @@
-"""``simrun fork`` and ``simrun probe``: go back into a logged rollout and ask what would have been."""
+"""``simrun fork`` and ``simrun probe``: counterfactuals of a logged rollout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import resolve, resolve_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
-from alpasim_plugin.runtime.past import find_rollout
+from alpasim_plugin.runtime.logged_rollout import find_rollout
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.probe import probe_rollout
 from alpasim_plugin.runtime.probe_files import PROBE_JSON
@@ -24,13 +24,13 @@ Examples:
 
 - `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 4.2 --renderer clean`
 
-- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 4.2` continues with nothing changed and says whether it is equal to the log
+- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 4.2` continues unchanged and checks that the result equals the log
 """
 PROBE_EPILOG = "Example: `simrun probe runs/us101 --cell clean/lane-camera/us101/0 --renderers clean,3dgs`"
 
 Run = Annotated[Path, typer.Argument(help="A run folder.")]
 Name = Annotated[str, typer.Option("--cell", help="RENDERER/POLICY/SCENE/SEED as in the tables, or the rollout's folder.")]
-Where = Annotated[str | None, typer.Option("--scenario", help="The rollout's scenario, if it does not lie where it lay.")]
+Where = Annotated[str | None, typer.Option("--scenario", help="The rollout's scenario, if it has moved.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
@@ -39,9 +39,9 @@ def fork(
     run: Run,
     cell: Name,
     at: Annotated[float, typer.Option("--at", help="Seconds after the first frame at which the change takes effect.")],
-    renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer from then on.")] = None,
-    policy: Annotated[str | None, typer.Option("--policy", help="Policy from then on; it has seen what the logged one saw.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the parts that take over.")] = None,
+    renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer after the change.")] = None,
+    policy: Annotated[str | None, typer.Option("--policy", help="Policy after the change; it has the history of observations.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the new parts.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder to write; by default one below RUN/forks/.")] = None,
     video: Annotated[bool, typer.Option("--video", help="Write front.mp4 of the continuation.")] = False,
     scenario: Where = None,
@@ -50,7 +50,7 @@ def fork(
 ) -> None:
     """Continue a logged rollout from an instant on with another renderer, policy or seed.
 
-    Writes a run folder with the original and the continuation, scored and reported as any run.
+    Writes a run folder with the original and the continuation, scored and reported like any run.
     """
     del debug
     _check_names([renderer] if renderer else [], policy)
@@ -58,17 +58,17 @@ def fork(
     change = Change(round(at * 1e6), renderer, policy, seed)
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
     result = fork_rollout(past, change, root, "all" if video else "none", ["simrun", *sys.argv[1:]])
-    told = read_json(root / "run.json")["fork"]
+    fork_facts = read_json(root / "run.json")["fork"]
     if as_json:
-        print(json.dumps({"out": str(root), "fork": told, "exit_code": result.exit_code, "summary": result.summary}))
+        print(json.dumps({"out": str(root), "fork": fork_facts, "exit_code": result.exit_code, "summary": result.summary}))
         raise typer.Exit(result.exit_code)
     for failed in result.summary["failures"]["cells"]:
         print(f"failed: {failed['path']}: {failed['error']['found']} -> {failed['error']['do']}", file=sys.stderr)
-    if told:
-        print(f"replay to {at:g} s   equal to the log, to the bit")
-        after = told.get("continuation")
+    if fork_facts:
+        print(f"replay to {at:g} s   equal to the log, bit for bit")
+        after = fork_facts.get("continuation")
         if after == "equal":
-            print("continuation      equal to the log, to the bit")
+            print("continuation      equal to the log, bit for bit")
         elif after is not None:
             print(f"continuation      differs first in {after['component']} at step {after['step']} ({after['what']})")
     print(f"report  {root / 'report.html'}")
@@ -79,26 +79,30 @@ def probe(
     run: Run,
     cell: Name,
     renderers: Annotated[str, typer.Option("--renderers", help="Two or more, comma-separated; the first is the reference.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; by default below RUN/probes/, where reports look.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder to write; by default below RUN/probes/, where the report looks.")
+    ] = None,
     scenario: Where = None,
     as_json: Json = False,
     debug: Debug = False,
 ) -> None:
-    """Ask the policy at a logged rollout's own poses behind several renderers and measure how far its plans part."""
+    """Query the policy at a logged rollout's poses behind several renderers and measure the distance between its plans."""
     del debug
     names = tuple(name.strip() for name in renderers.split(",") if name.strip())
     _check_names(names, None)
     past = find_rollout(run, cell, scenario)
     folder = write_probe(probe_rollout(past, names), past, names, out)
-    told = read_json(folder / PROBE_JSON)
+    found = read_json(folder / PROBE_JSON)
     if as_json:
-        print(json.dumps({"out": str(folder), "probe": told}))
+        print(json.dumps({"out": str(folder), "probe": found}))
         return
-    for pair in told["pairs"]:
+    for pair in found["pairs"]:
         gaps = [f"{key[4:-2]} ahead median {gap['median']:.3f} m, 95 % {gap['p95']:.3f} m" for key in pair if (gap := _gap(pair, key))]
         first = pair["first_divergence"]
-        parted = f"parts by {first['gap_m']:.2f} m at {first['after_us'] * 1e-6:.1f} s" if first else "never parts by the threshold"
-        print(f"{pair['renderer']} against {pair['reference']}: {'; '.join(gaps)}; {parted} ({told['threshold_m']} m)")
+        divergence = (
+            f"diverges by {first['gap_m']:.2f} m at {first['after_us'] * 1e-6:.1f} s" if first else "never diverges by the threshold"
+        )
+        print(f"{pair['renderer']} compared with {pair['reference']}: {'; '.join(gaps)}; {divergence} ({found['threshold_m']} m)")
     print(f"probe  {folder}")
 
 

@@ -1,4 +1,4 @@
-"""``simrun gate``: hold a run against margins and limits; the exit code says what it came to."""
+"""``simrun gate``: test a run against margins and limits; the exit code is the verdict."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def gate(
 
 
 def print_verdict(verdict: GateVerdict) -> None:
-    """Print every check, what else led to the verdict, and last the verdict, once."""
+    """Print every check, other reasons, and the verdict."""
     for check in verdict.checks:
         note = "" if check.binding else " (not binding)"
         print(f"{check.cause:>10}  {check.policy}, {check.text}{note}")

@@ -1,4 +1,4 @@
-"""Spread independent work over processes; results do not depend on how many there are."""
+"""Run independent work in processes; results do not depend on their number."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ A = TypeVar("A")
 R = TypeVar("R")
 
 
-def spread(work: Callable[[A], R], items: Sequence[A], jobs: int) -> Iterator[tuple[A, R]]:
-    """Yield every item with what ``work`` returns for it, as they are done; in order for one job.
+def parallel_map(work: Callable[[A], R], items: Sequence[A], jobs: int) -> Iterator[tuple[A, R]]:
+    """Yield every item with its result, as they finish; in order for one job.
 
     Args:
-        work: A function of a module, so that other processes find it. One job runs it in this process.
-        items: What to work on; they travel to other processes.
+        work: A module-level function. One job runs it in this process.
+        items: Its arguments; pickled for other processes.
         jobs: Processes, one thread each.
 
     Raises:
-        Whatever ``work`` raises first; what is queued then is given up.
+        The first exception of ``work``; queued items are cancelled.
     """
     if jobs <= 1:
         for item in items:

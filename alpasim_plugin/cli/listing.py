@@ -1,4 +1,4 @@
-"""``simrun list``: what can be named on the command line."""
+"""``simrun list``: names for the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entry point of ``simrun``: verbs, the default verb ``run``, and one place that turns errors into exit codes."""
+"""Entry point of ``simrun``: verbs, the default verb ``run``, and the mapping of errors to exit codes."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "listing", "list_parts", "EPILOG",
         "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",
     ),
-    "doctor": ("doctor", "doctor", "EPILOG", "Try each part on a small case and say what works, what does not, and what to do about it."),
+    "doctor": ("doctor", "doctor", "EPILOG", "Test each part on a small case and report what works, what does not, and what to do."),
     "refine": ("refine", "refine", "EPILOG", "Refine a video with a fixer, block by block, at any length in constant memory."),
     "fork": ("fork", "fork", "FORK_EPILOG", "Continue a logged rollout from an instant on with another renderer, policy or seed."),
     "probe": (
         "fork", "probe", "PROBE_EPILOG",
-        "Ask the policy at a logged rollout's own poses behind several renderers and measure how far its plans part.",
+        "Query the policy at a logged rollout's poses behind several renderers and measure the distance between its plans.",
     ),
     "bench": ("bench", "app", "", "Measure speed and error of parts."),
     "train": ("train", "app", "", "Make training data and train networks."),
@@ -46,7 +46,7 @@ OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
 
 
 def with_verb(args: list[str]) -> list[str]:
-    """Insert the verb ``run`` where the first word is none.
+    """Insert the verb ``run`` if the first word is not a verb.
 
     Example:
         >>> with_verb(["--renderer", "clean", "smoke/straight"])
@@ -55,7 +55,7 @@ def with_verb(args: list[str]) -> list[str]:
         ['list', 'renderers']
 
     Raises:
-        InputError: A word that is no file and nearly a verb.
+        InputError: The first word is no file and resembles a verb.
     """
     if not args or args[0] in (*VERBS, *OWN_OPTIONS):
         return args
@@ -67,13 +67,13 @@ def with_verb(args: list[str]) -> list[str]:
 
 
 def make_app(verb: str | None) -> typer.Typer:
-    """Return the command line with one verb, or with all verbs as a listing of them shows them."""
+    """Return the command line with one verb, or with all verbs for the help page."""
     app = typer.Typer(
         no_args_is_help=True,
         rich_markup_mode="markdown",
         pretty_exceptions_enable=False,
         help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
-        "Without a verb `run` is meant: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
+        "The default verb is `run`: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
         "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, "
         "5 evaluator failure, 130 interrupted.",
     )

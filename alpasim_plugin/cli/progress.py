@@ -31,12 +31,12 @@ class Lines:
         self._done, self._total = 0, 0
 
     def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
-        """Print what is about to run."""
+        """Print the run's headline."""
         self._total = len(plan.cells)
         print(headline(plan, root, threads), file=sys.stderr, flush=True)
 
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
-        """Print one rollout's fate."""
+        """Print one rollout's result."""
         self._done += 1
         print(f"[{self._done}/{self._total}] {describe(manifest, reused)}", file=sys.stderr, flush=True)
 
@@ -63,7 +63,7 @@ class Bar:
         self._progress.start()
 
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
-        """Advance the bar; failures stay on the screen."""
+        """Advance the bar, and print failures above it."""
         if manifest["status"] != "ok":
             self._progress.console.print(describe(manifest, reused), highlight=False, markup=False)
         self._progress.update(self._task, advance=1, description=f"{manifest['renderer']} {manifest['scene']}")
@@ -79,7 +79,7 @@ def make_progress(quiet: bool) -> Silent | Lines | Bar:
 
 
 def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
-    """Say in one line what runs where."""
+    """Return one line with the size of the run, its workers and its folder, and one per fixer."""
     axes = (
         plural(len(plan.renderers), "renderer"),
         plural(len(plan.policies), "policy", "policies"),
@@ -92,13 +92,13 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
 
 
 def fixer_labels(plan: RunPlan) -> list[str]:
-    """Name the fixers of a run, whose weights they have, and how they keep time with the loop."""
+    """Return one line per fixer: label, with the origin of its weights, and mode."""
     named = [(spec.name, spec.fixer) for spec in plan.renderers if spec.fixer is not None]
     return [f"{name}: {fixer.label}, {getattr(fixer.settings, 'mode', '')}" for name, fixer in named]
 
 
 def describe(manifest: dict[str, Any], reused: bool) -> str:
-    """Say in one line how a rollout went."""
+    """Return one line with a rollout's result."""
     cell = f"{manifest['renderer']} {manifest['policy']} {manifest['scene']} seed {manifest['seed']}"
     if manifest["status"] != "ok":
         return f"{cell}: FAILED ({manifest['error']['failure_class']}) {manifest['error']['found']}"

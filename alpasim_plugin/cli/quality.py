@@ -17,8 +17,8 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.atomic import write_bytes, write_json
-from alpasim_plugin.bench.quality import RAW, Arm, QualityClip, measure, row_key, run_arm
-from alpasim_plugin.cli.jobs import spread
+from alpasim_plugin.bench.quality import RAW, QualityClip, Variant, measure, row_key, run_variant
+from alpasim_plugin.cli.jobs import parallel_map
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
@@ -49,10 +49,10 @@ Examples:
 
 @dataclass(frozen=True)
 class Work:
-    """One clip under one arm, as sent to a worker process."""
+    """One clip under one variant, as sent to a worker process."""
 
     folder: Path  # of the sequence
-    arm: Arm
+    variant: Variant
     frames: int
     seed: int
     device: str
@@ -65,11 +65,11 @@ class Work:
     @property
     def row_file(self) -> Path:
         """Where the row is kept."""
-        return self.out / "clips" / self.arm.label / f"{self.folder.name}.json"
+        return self.out / "clips" / self.variant.label / f"{self.folder.name}.json"
 
     def picture_file(self, at: int) -> Path:
         """Where a shown frame is kept."""
-        return self.out / "frames" / self.arm.label / f"{self.folder.name}_{at:04d}.png"
+        return self.out / "frames" / self.variant.label / f"{self.folder.name}_{at:04d}.png"
 
 
 def quality(
@@ -77,10 +77,10 @@ def quality(
     out: Annotated[Path, typer.Option("--out", help="Folder for results; the same command continues there.")],
     fixers: Annotated[str, typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE.")] = "3dgs",
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test",
-    baseline: Annotated[str, typer.Option("--baseline", help="Arm that the others are compared with.")] = RAW,
+    baseline: Annotated[str, typer.Option("--baseline", help="Variant that the others are compared with.")] = RAW,
     frames: Annotated[int, typer.Option("--frames", min=2, help="First frames of every clip; shorter clips are taken whole.")] = 198,
     clips: Annotated[int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="[LABEL:]fixer.key=value, of one arm or of all fixers.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="[LABEL:]fixer.key=value, of one variant or of all fixers.")] = None,
     weights: Annotated[Path | None, typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}.")] = None,
     pictures: Annotated[int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
@@ -95,38 +95,38 @@ def quality(
     Writes quality.json, quality.md, by-frame.png, speed.png and pictures side by side; rows of finished clips are kept.
     """
     del debug
-    arms = parse_arms(fixers, overrides or [])
-    if baseline not in {arm.label for arm in arms}:
-        raise InputError(DOING, f"--baseline {baseline}", f"arms {', '.join(a.label for a in arms)}", "name one of the arms")
+    variants = parse_variants(fixers, overrides or [])
+    if baseline not in {variant.label for variant in variants}:
+        raise InputError(DOING, f"--baseline {baseline}", f"variants {', '.join(a.label for a in variants)}", "name one of the variants")
     networks = tuple((name, identity(name, weights)) for name in available(weights))
     sequences = evenly(PairDataset(data, split).sequences, clips)
     shown = {s.name for s in evenly(sequences, pictures)} if pictures else set()
     used = threads if jobs == 1 else 1
     todo = [
-        Work(s.folder, arm, frames, seed, device, used, networks, weights, out, s.name in shown)
+        Work(s.folder, variant, frames, seed, device, used, networks, weights, out, s.name in shown)
         for s in sequences
-        for arm in (*arms, Arm(TRUTH))
+        for variant in (*variants, Variant(TRUTH))
     ]
     console = Console(stderr=True)
-    for i, (work, row) in enumerate(spread(finish, todo, jobs), start=1):
+    for i, (work, row) in enumerate(parallel_map(finish, todo, jobs), start=1):
         if not as_json:
             psnr = row["values"].get("psnr_db")
-            console.print(f"{i}/{len(todo)} {work.arm.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
+            console.print(f"{i}/{len(todo)} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
     summary = summarise([read_json(work.row_file)["row"] for work in todo], baseline)
     summary["run"] = {
         "data": str(data), "split": split, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
-        "fixers": {arm.label: arm.spec and arm.spec.as_dict() for arm in arms}, "networks": dict(networks),
+        "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in variants}, "networks": dict(networks),
         "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
     }  # fmt: skip
     write_results(summary, todo, out)
     print(json.dumps(summary) if as_json else markdown(summary) + f"\nwrote {out / 'quality.json'}")
 
 
-def parse_arms(text: str, overrides: Sequence[str]) -> tuple[Arm, ...]:
-    """Return the arms that ``--fixer`` and ``--set`` name.
+def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
+    """Return the variants that ``--fixer`` and ``--set`` name.
 
     Raises:
-        InputError: A label twice, a fixer or key that is not known, or a setting for an arm that is not there.
+        InputError: A label twice, a fixer or key that is not known, or a setting for a variant that is not there.
     """
     common: list[str] = []
     own: dict[str, list[str]] = {}
@@ -136,21 +136,23 @@ def parse_arms(text: str, overrides: Sequence[str]) -> tuple[Arm, ...]:
             own.setdefault(label, []).append(rest)
         else:
             common.append(given)
-    arms: dict[str, Arm] = {}
+    variants: dict[str, Variant] = {}
     for part in (p.strip() for p in text.split(",") if p.strip()):
         label, equals, named = part.partition("=")
         fixer = named if equals else label
-        if label in arms or label == TRUTH or "/" in label:
+        if label in variants or label == TRUTH or "/" in label:
             found = f"label {label!r} is taken, or no name of a folder"
             raise InputError(DOING, f"--fixer {text}", found, "write LABEL=NAME with labels of your own")
         if fixer == RAW:
-            arms[label] = Arm(label)
+            variants[label] = Variant(label)
             continue
         name, settings = bundle_fixer(fixer) if fixer.endswith(".safetensors") else (fixer, ())
-        arms[label] = Arm(label, resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
-    if own or not arms:
-        raise InputError(DOING, f"--set {next(iter(own), '')}", "no fixer of this label", f"the arms are {', '.join(arms) or 'none'}")
-    return tuple(arms.values())
+        variants[label] = Variant(label, resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))))
+    if own or not variants:
+        raise InputError(
+            DOING, f"--set {next(iter(own), '')}", "no fixer of this label", f"the variants are {', '.join(variants) or 'none'}"
+        )
+    return tuple(variants.values())
 
 
 def evenly(sequences: Sequence[PairSequence], count: int | None) -> list[PairSequence]:
@@ -169,10 +171,10 @@ def identity(name: str, folder: Path | None) -> str:
 
 
 def finish(work: Work) -> dict[str, Any]:
-    """Return the row of one clip under one arm, from disk if it is up to date."""
+    """Return the row of one clip under one variant, from disk if it is up to date."""
     sequence = PairSequence(work.folder)
     clip = quality_clip(sequence).first(work.frames)
-    key = row_key(clip, work.arm, work.seed, work.device, dict(work.networks))
+    key = row_key(clip, work.variant, work.seed, work.device, dict(work.networks))
     at = shown_frames(len(clip.t_us)) if work.pictured else ()
     if work.row_file.is_file() and all(work.picture_file(i).is_file() for i in at):
         stored = read_json(work.row_file)
@@ -180,15 +182,15 @@ def finish(work: Work) -> dict[str, Any]:
             return dict(stored["row"])
     torch.set_num_threads(work.threads)
     cv2.setNumThreads(work.threads)
-    spec = work.arm.spec
+    spec = work.variant.spec
     fixer = None
     if spec is not None:
         scene = str(sequence.info.get("scene_id", sequence.name))
         fixer = build(spec, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
-    result = run_arm(clip, work.arm, fixer)
+    result = run_variant(clip, work.variant, fixer)
     for i in at:
         _write_png(work.picture_file(i), result.video[i])
-    row = measure(clip, work.arm, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
+    row = measure(clip, work.variant, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
     write_json(work.row_file, {"key": key, "row": row})
     return row
 
@@ -217,7 +219,7 @@ def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> N
             shown.setdefault(work.folder, []).append(work)
     for folder, works in shown.items():
         at = shown_frames(int(read_json(works[0].row_file)["row"]["frames"]))
-        columns = {work.arm.label: [_picture(work.picture_file(i)) for i in at] for work in works}
+        columns = {work.variant.label: [_picture(work.picture_file(i)) for i in at] for work in works}
         _write_png(out / "sheets" / f"{folder.name}.png", sheet(columns, [f"frame {i}" for i in at]))
 
 
@@ -230,7 +232,7 @@ def _write_png(path: Path, rgb: U8) -> None:
 def _picture(path: Path) -> Any:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise InputError(DOING, str(path), "no picture", "remove the clip's row and start the command again")
+        raise InputError(DOING, str(path), "no readable image", "remove the clip's row and start the command again")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -1,4 +1,4 @@
-"""``simrun refine``: a fixer over any video."""
+"""``simrun refine``: apply a fixer to a video file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Examples:
 def refine(
     source: Annotated[Path, typer.Argument(metavar="IN.mp4", help="Any video: any size, frame rate and length.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4).")],
-    opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey video, white where the input is reliable; else all is.")] = None,
+    opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey video, white where the input is reliable.")] = None,
     sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Video of the semantic map (docs/semantic-map.md).")] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer-tiny",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
@@ -52,8 +52,8 @@ def refine(
 ) -> None:
     """Refine a video with a fixer, block by block, at any length in constant memory.
 
-    Frame times, size and colours are kept; sound is left out. The result appears once complete: an interrupted command leaves nothing
-    behind and is simply given again.
+    Frame times, size and colours are kept; sound is dropped. The result gets its name once complete: an interrupted command leaves
+    no file.
     """
     del debug
     settings = fixer_settings(fixer, fixer_overrides(overrides or ()))
@@ -81,7 +81,7 @@ def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
     """Return ``--set`` values without their prefix ``fixer.``.
 
     Raises:
-        InputError: A value for anything else.
+        InputError: A value without this prefix.
     """
     for text in texts:
         if not text.startswith(PREFIX):
@@ -91,7 +91,7 @@ def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
 
 def untrained_notice(label: str) -> str:
     """Return a warning that the weights are untrained."""
-    return f"UNTRAINED: {label}. The result shows the pipeline, not a repair."
+    return f"UNTRAINED: {label}. The result only shows that the pipeline runs."
 
 
 def describe(summary: RefineSummary, out: Path) -> str:
@@ -116,7 +116,7 @@ def frame_progress(silent: bool) -> Iterator[Callable[[int, int | None], None]]:
     """Show frames done on standard error: a bar on a terminal, a line every ten seconds on a pipe.
 
     Yields:
-        A function of the number of frames done and of the number that the file claims.
+        A function of the number of frames done and of the number that the file states.
     """
     begin = last = time.perf_counter()
     terminal = sys.stderr.isatty()

@@ -1,4 +1,4 @@
-"""``simrun [run]``: drive scenarios behind renderers and tabulate what happened."""
+"""``simrun [run]``: drive scenarios behind renderers and tabulate the results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from scenarios.suite import expand
 
 INTERRUPTED = 130
 FIXER_PREFIX = "fixer."
-MAX_SEED = 2**63 - 1  # what the tables' integers hold
+MAX_SEED = 2**63 - 1  # int64 in the tables
 
 EPILOG = """
 Examples:
@@ -58,13 +58,13 @@ def run(
         list[str] | None, typer.Option("--set", help="Override a scenario key, or with `fixer.` a fixer's: key=value. Repeatable.")
     ] = None,
     controller: Annotated[
-        str | None, typer.Option("--controller", help="What moves the ego along its plans; by default the policy's.")
+        str | None, typer.Option("--controller", help="Controller that tracks the plans; by default the policy's.")
     ] = None,
     evaluators: Annotated[
         list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
     ] = None,
-    source: Annotated[str | None, typer.Option("--source", help="Who reads the recorded log: a name, or package.module:Class.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue in a folder that another command began.")] = False,
+    source: Annotated[str | None, typer.Option("--source", help="Reader of the recorded log: a name, or package.module:Class.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue in a folder of another command.")] = False,
     baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
     certify: Annotated[Certify, typer.Option("--certify", help="Repeat one rollout and compare bit for bit.")] = "one",
@@ -79,7 +79,7 @@ def run(
     """
     del debug  # read from the command line by cli.main, before any option is parsed
     if executor != "local":
-        raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is built", "use --executor local")
+        raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is implemented", "use --executor local")
     names = [name.strip() for name in renderer.split(",") if name.strip()]
     drivers = [name.strip() for name in policy.split(",") if name.strip()]
     _check_preset(preset)
@@ -100,12 +100,12 @@ def run(
         raise typer.Exit(INTERRUPTED) from None
     _print_result(result, as_json)
     if plan.undigested and not as_json:
-        print(f"not reused by the next command: {', '.join(plan.undigested)} cannot be identified from here (--resume reuses it)")
+        print(f"not reused by the next command: {', '.join(plan.undigested)} has no digest (--resume reuses its rollouts)")
     raise typer.Exit(result.exit_code)
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Part the overrides of scenarios from those of fixers, which begin with ``fixer.``.
+    """Separate the overrides of scenarios from those of fixers, which start with ``fixer.``.
 
     Example:
         >>> split_overrides(["timing.warmup_us=400000", "fixer.mode=chunk"])
@@ -116,7 +116,7 @@ def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[st
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Return the seeds meant by ``--seeds``.
+    """Parse ``--seeds``.
 
     Example:
         >>> parse_seeds("3"), parse_seeds("4,7")

@@ -43,7 +43,7 @@ def score(
     evaluators: Annotated[
         list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after logs and preset.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named by logs and preset.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.jobs import spread
+from alpasim_plugin.cli.jobs import parallel_map
 from alpasim_plugin.cli.training_options import AsJson, Debug, scene_files
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.cache import cache_root
@@ -48,7 +48,7 @@ def reconstructions(
     del debug
     refs = [ref for item in scenarios for ref in expand(item, overrides or ())]
     console, rows = Console(stderr=True), []
-    for number, (ref, row) in enumerate(spread(_Fitted(again), refs, jobs), start=1):
+    for number, (ref, row) in enumerate(parallel_map(_Fitted(again), refs, jobs), start=1):
         rows.append({"path": ref.path, **row})
         console.print(f"[{number}/{len(refs)}] {row['scene_id']}: {row['what']}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
@@ -98,7 +98,7 @@ def pairs(
     console, began = Console(stderr=True), time.perf_counter()
     maker = _Maker(out, PairRecipe(source=source, degradation=degradation, max_offset_m=max_offset_m), seed)
     rows = []
-    for number, (scene, made) in enumerate(spread(maker, work, jobs), start=1):
+    for number, (scene, made) in enumerate(parallel_map(maker, work, jobs), start=1):
         rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})
         note = "" if made else " (exists)"
         line = f"[{number}/{len(work)}] {scene.split}/{scene.path.stem}{note}, {time.perf_counter() - began:.0f} s"

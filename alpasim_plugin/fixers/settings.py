@@ -143,7 +143,9 @@ class OneFixerSettings(FixerSettings):
     @classmethod
     def _counted(cls, value: Any) -> Any:
         """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
-        return schedule.names(value) if isinstance(value, int) and not isinstance(value, bool) else value
+        if isinstance(value, int) and not isinstance(value, bool):
+            return schedule.names(value)
+        return tuple(value) if isinstance(value, list) else value  # strict validation takes no list for a tuple after this step
 
     @model_validator(mode="after")
     def _consistent(self) -> OneFixerSettings:

@@ -1,1 +1,1 @@
-"""The only place where the stages meet: one rollout, and runs of many."""
+"""The closed loop: one rollout, and runs of many rollouts."""

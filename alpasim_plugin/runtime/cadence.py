@@ -1,4 +1,4 @@
-"""When the policy is queried, and with it which frames are wanted and when they are rendered."""
+"""When the policy is queried, and which frames are rendered when."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ DOING = "setting up a loop in whole blocks of frames"
 class Cadence:
     """The instants at which the policy is queried.
 
-    With ``whole_blocks`` all frames since the last query are wanted and are rendered together at the next one; otherwise a frame is
-    rendered at its own instant, and only if no newer one of that camera will exist when the policy looks.
+    With ``whole_blocks`` all frames since the last query are rendered together at the next query. Otherwise a frame is rendered at its own
+    instant, and only if it is the camera's newest at the next query.
     """
 
     query_times_us: I64  # (Q,) increasing
     whole_blocks: bool = False
 
     def queries_at(self, t_us: int) -> bool:
-        """Tell whether the policy is queried at ``t_us``."""
+        """Return whether the policy is queried at ``t_us``."""
         return self.next_query_us(t_us) == t_us
 
     def next_query_us(self, t_us: int) -> int | None:
@@ -34,8 +34,8 @@ class Cadence:
         i = int(np.searchsorted(self.query_times_us, t_us))
         return int(self.query_times_us[i]) if i < len(self.query_times_us) else None
 
-    def wants(self, t_us: int, period_us: int) -> bool:
-        """Tell whether the policy will take a frame of ``t_us`` from a camera of that period."""
+    def needs_frame(self, t_us: int, period_us: int) -> bool:
+        """Return whether a query uses the frame at ``t_us`` of a camera with that period."""
         query = self.next_query_us(t_us)
         return query is not None and (self.whole_blocks or query - t_us < period_us)
 
@@ -43,14 +43,14 @@ class Cadence:
 def make_cadence(clock: Clock, scenario: Scenario, sensors: Sequence[SensorSpec], block: BlockRule | None = None) -> Cadence:
     """Return the cadence of a rollout: the policy's own period, or with ``block`` one query at the end of each block of frames.
 
-    ``block`` is AlpaSim's rule for video models: the control step is the block, and a plan is committed for the whole next one. The
-    recorded drive has to be forced until the first block is complete, since there was no query before. A policy without cameras has no
-    blocks and keeps its own period. There is no query at the last instant: no drive follows it.
+    ``block`` is AlpaSim's rule for video models: the control step is one block, and a plan is committed for the whole next block. The
+    warm-up must cover the first block, since there is no query before its end. A policy without cameras has no blocks and keeps its own
+    period. There is no query at the last instant, because no control step follows it.
 
     Args:
         clock: Ticks of the rollout.
         scenario: Rates and warm-up.
-        sensors: Cameras the policy listens to.
+        sensors: Cameras of the policy.
         block: Frames of the first block and of each later one.
 
     Raises:

@@ -1,4 +1,4 @@
-"""From a tick to render requests: only frames that the policy will take are rendered."""
+"""From a tick to render requests: only frames that the policy uses are rendered."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from itertools import islice
 from alpasim_plugin.clock import Clock, Tick
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.cadence import Cadence, make_cadence
-from alpasim_plugin.runtime.forecast import Ahead, Forecaster, shutter_poses
+from alpasim_plugin.runtime.forecast import Forecaster, PredictedRequests, shutter_poses
 from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
 
 
 class CameraRig:
-    """The cameras one policy listens to.
+    """The cameras of one policy.
 
     Args:
         scenario: Has the cameras.
-        sensors: Which of them, at which period.
+        sensors: Which of them the policy uses, at which period.
         clock: Ticks of the rollout.
-        cadence: When the policy looks; by default at its own period.
-        forecaster: Source of the forecasts that requests carry, for `lookahead` frames.
+        cadence: When the policy is queried; by default at its own period.
+        forecaster: Predicts the next `lookahead` frames of a request.
         lookahead: How many of a camera's next frames a request predicts.
 
     Raises:
-        InputError: The policy asks for a camera the scenario lacks, or for a period that is no multiple of the control period.
+        InputError: The scenario lacks a camera of the policy, or a period is no multiple of the control period.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class CameraRig:
                 raise InputError(
                     "connecting a policy to its cameras",
                     f"scene {scenario.scene_id!r}",
-                    f"the policy wants camera {sensor.camera!r}; the scenario has {sorted(known)}",
+                    f"the policy needs camera {sensor.camera!r}; the scenario has {sorted(known)}",
                     "add that camera to the scenario or choose another policy",
                 )
             period = sensor.interval_us or scenario.rates.camera_us
@@ -66,14 +66,14 @@ class CameraRig:
         return {camera.name: camera for camera, _ in self._due}
 
     def requests(self, tick: Tick, history: Trajectory, actors: Mapping[str, F64]) -> list[RenderRequest]:
-        """Return what to render now. Shutter-start poses come from the motion so far, the shutter end is now.
+        """Return the requests to render now. Shutter-start poses come from the history, the shutter ends now.
 
-        In a cadence of whole blocks requests are held until the block's last frame is due and then handed over together.
+        In a cadence of whole blocks the requests of a block are returned together when its last frame is due.
         """
         forecast = self._forecaster.now() if self._forecaster and self._lookahead else None
         for camera, period in self._due:
             if self._is_due(tick.t_us, period):
-                ahead = Ahead(forecast, camera, self._next_us(tick.t_us, period)) if forecast else ()
+                ahead = PredictedRequests(forecast, camera, self._next_us(tick.t_us, period)) if forecast else ()
                 self._held.append(RenderRequest(tick.t_us, camera, shutter_poses(history, camera, tick.t_us), actors, ahead))
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
@@ -81,7 +81,7 @@ class CameraRig:
         return ready
 
     def _is_due(self, t_us: int, period: int) -> bool:
-        return (t_us - self._clock.start_us) % period == 0 and self._cadence.wants(t_us, period)
+        return (t_us - self._clock.start_us) % period == 0 and self._cadence.needs_frame(t_us, period)
 
     def _next_us(self, t_us: int, period: int) -> tuple[int, ...]:
         end_us = self._clock.start_us + self._clock.n_steps * self._clock.rates.control_us

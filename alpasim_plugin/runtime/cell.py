@@ -1,4 +1,4 @@
-"""One cell of a run, start to finish: build the parts, drive, score, write. Runs in a worker process."""
+"""One cell of a run: build its parts, drive, score, write. Runs in a worker process."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
-class Parts:
-    """What one rollout is made of.
+class RolloutParts:
+    """The parts of one rollout.
 
     Attributes:
-        session: Names the rollout in its log; equal rollouts have equal names.
-        names: What the log's header says of each service.
+        session: Identifies the rollout in its log; equal rollouts have equal ids.
+        names: Name of each service, for the log's header.
         controller: Moves the ego.
     """
 
@@ -46,13 +46,13 @@ class Parts:
     controller: Controller
 
 
-PartsOf = Callable[[Cell, RunOptions, Scenario, int], Parts]
+PartsBuilder = Callable[[Cell, RunOptions, Scenario, int], RolloutParts]
 
 
-def own_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
-    """Build the parts that a cell holds."""
+def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int) -> RolloutParts:
+    """Build the parts that a cell names."""
     name, fixer = cell.renderer.name, cell.renderer.fixer
-    return Parts(
+    return RolloutParts(
         make_renderer(cell.renderer, scenario, cell.seed, options.device, threads),
         build(cell.policy, scenario=scenario),
         cell.rollout_key,
@@ -61,14 +61,14 @@ def own_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: int)
     )
 
 
-def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of: PartsOf = own_parts) -> dict[str, Any]:
-    """Run and score one cell and return its manifest, which is written last: a folder without one is unfinished.
+def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder: PartsBuilder = build_parts) -> dict[str, Any]:
+    """Run and score one cell and return its manifest. The manifest is written last: a folder without one is unfinished.
 
-    A failure of any part is a result as well: its manifest has ``status: failed``, the four parts and the traceback.
+    A failure is a result too: the manifest then has ``status: failed``, the error and the traceback.
     """
     folder = root / cell.folder
     began = time.perf_counter()
-    cv2.setNumThreads(1)  # its pool is outside the thread budget, and frames are too small to gain from it
+    cv2.setNumThreads(1)  # OpenCV's pool is outside the thread budget, and frames are too small to gain from it
     manifest: dict[str, Any] = {
         **cell.names,
         "path": cell.folder.as_posix(),
@@ -80,7 +80,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).unlink(missing_ok=True)
         scenario = _scenario(cell.ref)
-        parts = parts_of(cell, options, scenario, threads)
+        parts = builder(cell, options, scenario, threads)
         with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
             run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
         manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
@@ -93,14 +93,14 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, parts_of
         failure = disk_error(folder, error)
         manifest |= {"status": "failed", "error": failure.as_dict(), "traceback": traceback.format_exc()}
     except Exception as error:
-        manifest |= {"status": "failed", "error": _unforeseen(error), "traceback": traceback.format_exc()}
+        manifest |= {"status": "failed", "error": _unexpected(error), "traceback": traceback.format_exc()}
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_json(folder / MANIFEST, manifest)
     return manifest
 
 
 def rescore_cell(cell: Cell, options: RunOptions, root: Path) -> dict[str, Any]:
-    """Score a finished rollout again, under another preset or by newer evaluators, from its log alone."""
+    """Score a finished rollout again from its log, with another preset or changed evaluators."""
     folder = root / cell.folder
     manifest: dict[str, Any] = read_json(folder / MANIFEST)
     manifest |= _score(folder, cell, options, _scenario(cell.ref))
@@ -109,12 +109,12 @@ def rescore_cell(cell: Cell, options: RunOptions, root: Path) -> dict[str, Any]:
     return manifest
 
 
-def finished(cell: Cell, root: Path, trusted: bool = False) -> dict[str, Any] | None:
-    """Return the manifest of a cell whose rollout is done and was shaped by the same content; else None.
+def finished(cell: Cell, root: Path, reuse_undigested: bool = False) -> dict[str, Any] | None:
+    """Return the manifest of a finished rollout with the same content key; None if there is none.
 
-    Failed rollouts are not finished: they run again. So do rollouts with a part whose content cannot be known, unless they are ``trusted``.
+    Failed rollouts are not finished: they run again. So do rollouts with a part that has no digest, unless ``reuse_undigested`` is set.
     """
-    if cell.undigested and not trusted:
+    if cell.undigested and not reuse_undigested:
         return None
     path = root / cell.folder / MANIFEST
     if not path.exists():
@@ -134,7 +134,7 @@ def _scenario(ref: ScenarioRef) -> Scenario:
     return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
 
 
-def _unforeseen(error: Exception) -> dict[str, str]:
+def _unexpected(error: Exception) -> dict[str, str]:
     return {
         "doing": "running a rollout",
         "with": "a part that raised something other than a SimrunError",

@@ -1,4 +1,4 @@
-"""The determinism certificate of a run: one rollout is made again and compared with the first, component by component, bit for bit."""
+"""The determinism certificate of a run: one rollout is repeated and compared with the first, component by component, bit for bit."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ Certify = Literal["none", "one"]
 
 
 def certify(
-    plan: RunPlan, root: Path, manifests: Sequence[dict[str, Any]], threads: int, wanted: Certify, before: Mapping[str, Any] | None = None
+    plan: RunPlan, root: Path, manifests: Sequence[dict[str, Any]], threads: int, mode: Certify, before: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Repeat one rollout of a finished run and return the certificate.
 
-    The rollout with the fewest control steps is taken, of several the one with the smallest content key: the choice depends on the plan
-    alone. It is repeated in this process, alone, whatever the run did.
+    The rollout with the fewest control steps is repeated, of several the one with the smallest content key: the choice depends on the plan
+    alone. The repeat runs in this process, whatever the number of workers of the run.
 
     Args:
         plan: The run.
         root: Its folder.
         manifests: One per cell, in the plan's order.
         threads: Threads of the repeat; results must not depend on them.
-        wanted: "none" makes no repeat.
-        before: The certificate that the folder held; it is kept where it is of the same rollout and the same log.
+        mode: "none" makes no repeat.
+        before: The folder's earlier certificate; it is kept if it certifies the same rollout and the same log.
 
     Returns:
         ``status`` (equal, different, skipped), ``reason`` where skipped, ``cell``, ``path``, ``rollout_key``, ``score_key``, ``steps``,
-        ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout), ``repeated`` (the same of the repeat),
+        ``log_sha256`` and ``digests`` (component -> SHA-256 of the first rollout), ``repeated`` (those of the repeat),
         ``first_difference`` (component, t_us, step, what) or None, and ``wall_s``.
     """
-    if wanted == "none":
+    if mode == "none":
         return {"status": "skipped", "reason": "switched off with --certify none"}
     done = [(cell, m) for cell, m in zip(plan.cells, manifests, strict=True) if m["status"] == "ok"]
     repeatable = [(cell, m) for cell, m in done if plan.scenarios[cell.scene].latency.kind != "measured"]
     if not repeatable:
-        why = "latency 'measured' depends on the machine: no rollout can be repeated" if done else "no rollout was run to its end"
+        why = "latency 'measured' depends on the machine: no rollout can be repeated" if done else "no rollout finished"
         return {"status": "skipped", "reason": why}
     cell, manifest = min(repeatable, key=lambda pair: (pair[1]["steps"], pair[0].rollout_key))
     log_sha256 = sha256((root / cell.folder / LOG_NAME).read_bytes())
@@ -65,11 +65,11 @@ def certify(
 
 
 def certificate_line(certificate: Mapping[str, Any]) -> str:
-    """Say in one line what a certificate says.
+    """Return a certificate as one line of text.
 
     Example:
-        >>> certificate_line({"status": "skipped", "reason": "no rollout was run to its end"})
-        'skipped: no rollout was run to its end'
+        >>> certificate_line({"status": "skipped", "reason": "no rollout finished"})
+        'skipped: no rollout finished'
     """
     if certificate["status"] == "skipped":
         return f"skipped: {certificate['reason']}"
@@ -108,6 +108,11 @@ def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], 
     }
 
 
+def log_trace(folder: Path) -> dict[str, dict[Key, str]]:
+    """Read the components of a finished rollout from its log and its per-frame facts."""
+    return trace_log(folder / LOG_NAME, read_facts(folder / FRAMES_NAME))
+
+
 def rollout_trace(folder: Path, manifest: Mapping[str, Any]) -> dict[str, dict[Key, str]]:
     """Read all components of a finished rollout, its scores included.
 
@@ -118,7 +123,7 @@ def rollout_trace(folder: Path, manifest: Mapping[str, Any]) -> dict[str, dict[K
     Raises:
         InputError: A file is missing or damaged.
     """
-    trace = trace_log(folder / LOG_NAME, read_facts(folder / FRAMES_NAME))
+    trace = log_trace(folder)
     table = pq.read_table(folder / "steps.parquet", columns=["t_us", "metric", "value", "valid", "reason"])
     values: dict[Key, list[str]] = defaultdict(list)
     columns: list[list[Any]] = [table[name].to_pylist() for name in table.column_names]

@@ -1,4 +1,4 @@
-"""Put a rollout's renderer together: the base renderer, and a fixer over it where one is named."""
+"""Build a rollout's renderer: the base renderer, with a fixer applied to its frames where one is named."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ def make_renderer(
     threads: int | None = None,
     overrides: Sequence[str] = (),
 ) -> Renderer:
-    """Make one rollout's renderer.
+    """Build one rollout's renderer.
 
     Args:
-        name: A renderer, or a fixer over one, as `alpasim_plugin.parts.resolve_renderer` takes it; or resolved already.
+        name: A renderer, or a fixer over one, as `alpasim_plugin.parts.resolve_renderer` takes it; or its resolved spec.
         scenario: What is rendered.
-        seed: The rollout's seed: what wanders from frame to frame depends on it, and a fixer's noise.
+        seed: The rollout's seed, for temporal noise and the fixer's noise.
         device: ``cpu`` or ``cuda``.
-        threads: Threads of the CPU rasteriser and of torch; None leaves their numbers.
-        overrides: ``KEY=VALUE`` of the fixer's settings, for a name that is not resolved yet.
+        threads: Threads of the CPU rasteriser and of torch; None keeps their settings.
+        overrides: ``KEY=VALUE`` of the fixer's settings, where ``name`` is a string.
 
     Raises:
         InputError: Unknown name, device or setting, or weights that are missing or wrong.

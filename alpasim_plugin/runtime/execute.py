@@ -1,7 +1,7 @@
 """Run the cells of a plan: in this process for one worker, in a pool of spawned processes for more.
 
 A cell's result does not depend on where or when it runs: every random stream is keyed by (scene, seed, component, step) and the
-rasteriser is bit-equal for any number of threads. So the pool may hand out cells in any order.
+rasteriser is bit-equal for any number of threads. The pool may therefore run cells in any order.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
 
 @dataclass(frozen=True)
 class Threads:
-    """One budget for everything: workers x threads per worker never exceeds the cores."""
+    """The thread budget: workers x threads per worker never exceeds the cores."""
 
     workers: int
     per_worker: int
 
 
 def thread_budget(workers: int | None, n_cells: int) -> Threads:
-    """Share the cores this process may use among the workers.
+    """Divide the cores that this process may use among the workers.
 
     Args:
-        workers: Wanted number of workers; None takes one per core, but no more than there are cells.
-        n_cells: How many cells there are to run.
+        workers: Number of workers; None is one per core. Never more than cells.
+        n_cells: Number of cells to run.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     chosen = max(1, min(workers or cores, max(n_cells, 1)))
     return Threads(chosen, max(1, cores // chosen))
 
 
-def execute(plan: RunPlan, root: Path, threads: Threads, on_done: OnDone, trusted: bool = False) -> list[dict[str, Any]]:
-    """Bring every cell to a manifest and return the manifests in the plan's order.
+def execute(plan: RunPlan, root: Path, threads: Threads, on_done: OnDone, reuse_undigested: bool = False) -> list[dict[str, Any]]:
+    """Run every unfinished cell and return all manifests in the plan's order.
 
-    Cells finished earlier are reused; those scored under another preset are scored again from their logs. KeyboardInterrupt passes
-    through after the workers have been stopped; what was finished stays on disk.
+    Finished rollouts are reused; those scored with another preset are scored again from their logs. KeyboardInterrupt is re-raised after
+    the workers are stopped; finished rollouts stay on disk.
 
     Args:
         plan: The run.
         root: Its folder.
         threads: Workers, and threads of each.
         on_done: Called with each manifest.
-        trusted: Reuse rollouts with parts that have no digest too.
+        reuse_undigested: Also reuse rollouts with parts that have no digest.
     """
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
     for cell in plan.cells:
-        manifest = finished(cell, root, trusted)
+        manifest = finished(cell, root, reuse_undigested)
         if manifest is None:
             todo.append(cell)
             continue
@@ -84,7 +84,7 @@ def _run_here(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Th
 
 
 def _run_pool(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Threads) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Run cells in pools; a worker that dies breaks its pool, so the cells then in flight are run again alone, at the end."""
+    """Run cells in pools. A worker that dies breaks its pool; the cells then in flight run again at the end, each in a pool of its own."""
     left = list(todo)
     suspects: list[Cell] = []
     while left:
@@ -97,7 +97,7 @@ def _run_pool(todo: Sequence[Cell], options: RunOptions, root: Path, threads: Th
             suspects += in_flight.values()
             left = [cell for cell in left if cell not in suspects]
     for cell in suspects:
-        manifest_now = finished(cell, root, trusted=True)  # written just before its worker died, perhaps
+        manifest_now = finished(cell, root, reuse_undigested=True)  # the worker may have died after writing it
         try:
             yield cell, manifest_now or next(_one_pool([cell], options, root, Threads(1, threads.per_worker), {}))[1]
         except BrokenProcessPool:
@@ -117,7 +117,7 @@ def _one_pool(
         waiting = iter(todo)
         try:
             while True:
-                # Only a few cells are queued ahead, so that an interrupted run stops soon and few cells are suspects.
+                # Few cells are queued, so that an interrupted run stops soon and few cells are suspects after a crash.
                 for cell in _take(waiting, 2 * threads.workers - len(in_flight)):
                     in_flight[pool.submit(run_cell, cell, options, root, threads.per_worker)] = cell
                 if not in_flight:
@@ -139,8 +139,7 @@ def _take(cells: Iterator[Cell], count: int) -> list[Cell]:
 
 
 def ignore_interrupts() -> None:
-    """Leave Ctrl-C to the parent of a worker process."""
-    # Ctrl-C reaches the whole process group; the parent alone decides what it means.
+    """Ignore SIGINT in a worker process: Ctrl-C reaches the whole process group, and the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -163,7 +162,7 @@ def _lost_worker(cell: Cell, root: Path) -> dict[str, Any]:
     error = InfrastructureError(
         "running a rollout in a worker process",
         cell.folder.as_posix(),
-        "the worker died without a word, twice",
+        "the worker process exited without an error message, twice",
         "look for the out-of-memory killer in the system log, or use --workers 1",
     )
     manifest = {

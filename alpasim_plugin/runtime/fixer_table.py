@@ -1,4 +1,4 @@
-"""What a summary says of fixers: what they are, and how their blocks came about."""
+"""The fixers of a summary: label, training, mode, and counts of blocks and predictions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
 
 
 def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return per renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts``, ``frames`` and ``blocks``.
+    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts``, ``frames`` and ``blocks``.
 
     In speculative mode also the counts of `alpasim_plugin.fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
     predicted frames within tolerance), and the largest ``forecast_error`` and ``shown_error``.
@@ -19,15 +19,15 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """
     out: dict[str, Any] = {}
     for name in dict.fromkeys(m["renderer"] for m in manifests):
-        told = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
-        if not told:
+        facts = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
+        if not facts:
             continue
-        entry = {key: told[0][key] for key in ("label", "trained", "mode")} | {"rollouts": len(told)}
-        entry |= {key: sum(one[key] for one in told) for key in ("frames", "blocks")}
+        entry = {key: facts[0][key] for key in ("label", "trained", "mode")} | {"rollouts": len(facts)}
+        entry |= {key: sum(one[key] for one in facts) for key in ("frames", "blocks")}
         if entry["mode"] == "speculative":
-            entry |= {key: sum(one[key] for one in told) for key in COUNTS}
+            entry |= {key: sum(one[key] for one in facts) for key in COUNTS}
             entry["hit_rate"] = round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None
-            entry |= {key: _largest(one[key] for one in told) for key in ("forecast_error", "shown_error")}
+            entry |= {key: _largest(one[key] for one in facts) for key in ("forecast_error", "shown_error")}
         out[name] = entry
     return out
 

@@ -1,6 +1,6 @@
-"""For every cell whose outcome changed: when the plans of the two rollouts first parted, and both camera frames of that moment.
+"""For every cell whose outcome flipped: when the plans of the two rollouts first diverged, and both camera frames at that instant.
 
-Written into the run folder as ``flips.json`` and ``flips/*.jpg``, since the report reads no logs.
+Written to the run folder as ``flips.json`` and ``flips/*.jpg``, since the report reads no logs.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ PICTURE_WIDTH = 560
 
 
 def write_flips(root: Path) -> Path:
-    """Look up the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
+    """Find the first plan divergence of every flipped cell of a run folder and write ``flips.json``.
 
-    Where a probe of the same cell and renderers exists its answer is taken: it has both renderers at identical poses. Otherwise the two
-    logs are compared; their poses are the same until the plans part.
+    A probe of the same cell and renderers is used where it exists: it renders both at identical poses. Otherwise the two logs are compared;
+    their poses are equal until the plans diverge.
 
     Raises:
         InputError: The run folder is not complete enough to be read.
@@ -58,16 +58,16 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
         return {"t_us": None, "reason": "a log without plans"}
     found = first_divergence(one.plans, other.plans)
     if found is None:
-        return {"t_us": None, "reason": f"the plans never part by more than {DIVERGED_M} m"}
-    answer: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
+        return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
+    divergence: dict[str, Any] = {"t_us": found.t_us, "after_us": found.t_us - one.render_start_us, "gap_m": round(found.gap_m, 4)}
     frames = {renderer: _picture(root, log, found.t_us, f"{name}-{i}.jpg") for i, (renderer, log) in enumerate(logs.items())}
     if None in frames.values():
-        answer["frames_reason"] = "a log without camera images (--images none, or a policy that sees nothing)"
-    return answer | {"source": "logs", "ahead_us": found.ahead_us, "frames": {r: path for r, path in frames.items() if path}}
+        divergence["frames_reason"] = "a log without camera images (--images none, or a policy without cameras)"
+    return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {r: path for r, path in frames.items() if path}}
 
 
 def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
-    """Save what the first camera showed at a question; None where the log has no such image."""
+    """Save the first camera's newest frame at a query and return its path; None where the log has none."""
     if not log.images:
         return None
     camera = log.images[0].camera

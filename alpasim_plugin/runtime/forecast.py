@@ -1,7 +1,7 @@
-"""Where cameras and road users will be, as far as one can tell at one instant: what `RenderRequest.ahead` holds.
+"""Predicted poses of cameras and road users, for `RenderRequest.ahead`.
 
-The ego follows the plan in force as the controller would, plans that are waiting for their latency included; while the log is forced it
-follows the log, exactly. Nobody is asked and nothing moves: the loop's own state stays as it is.
+The controller moves the predicted ego along the active plan and along plans that become active after their latency. During the warm-up
+the prediction is the log itself. A forecast queries no policy and leaves the state of the loop unchanged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from alpasim_plugin.control import Controller
 from alpasim_plugin.geometry import interpolate, quat_from_matrix
 from alpasim_plugin.runtime.latency import PlanQueue
-from alpasim_plugin.runtime.loop_state import LoopState, moved_ego
+from alpasim_plugin.runtime.loop_state import LoopState, advance_ego
 from alpasim_plugin.types import F64, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory
 from alpasim_plugin.world.actors import ActorForecast, Actors
 
@@ -27,30 +27,30 @@ def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
 
 
 class Forecaster:
-    """Takes forecasts of a running loop."""
+    """Makes forecasts of a running loop."""
 
     def __init__(self, scenario: Scenario, controller: Controller, plans: PlanQueue, actors: Actors, state: LoopState) -> None:
         self._parts = scenario, controller, plans, actors, state
 
     def now(self) -> Forecast:
-        """Return the forecast of the present instant; it costs next to nothing until it is read."""
+        """Return the forecast from the present instant. It is computed when read."""
         scenario, controller, plans, actors, state = self._parts
         return Forecast(scenario, controller, plans.copy(), actors.forecast(), state.history, state.ego)
 
 
 @dataclass
 class Forecast:
-    """A forecast from one instant, worked out as far as it is asked for."""
+    """A forecast from one instant, computed as far as it is read."""
 
     scenario: Scenario
     controller: Controller
     plans: PlanQueue
     actors: ActorForecast
-    history: Trajectory  # rig poses up to the instant; grows by predicted ones
+    history: Trajectory  # rig poses up to the instant, then predicted ones
     ego: EgoState  # at the end of the history
 
     def request(self, camera: CameraSpec, t_us: int) -> RenderRequest:
-        """Return what is expected to be rendered at a future control instant."""
+        """Return the predicted render request at a future control instant."""
         self._extend(t_us)
         upto = int(np.searchsorted(self.history.t_us, t_us, side="right"))
         past = Trajectory(self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto])
@@ -60,7 +60,7 @@ class Forecast:
         states = []
         while self.ego.t_us < to_us:
             next_us = self.ego.t_us + self.scenario.rates.control_us
-            self.ego, _ = moved_ego(self.scenario, self.controller, self.ego, self.plans.active(self.ego.t_us), next_us)
+            self.ego, _ = advance_ego(self.scenario, self.controller, self.ego, self.plans.active(self.ego.t_us), next_us)
             states.append(self.ego)
         if states:
             past, poses = self.history, np.stack([state.T_world_rig for state in states])
@@ -72,8 +72,8 @@ class Forecast:
 
 
 @dataclass
-class Ahead(Sequence[RenderRequest]):
-    """The forecast of one camera's next requests, worked out when read."""
+class PredictedRequests(Sequence[RenderRequest]):
+    """The predicted next requests of one camera, computed when read."""
 
     forecast: Forecast
     camera: CameraSpec

@@ -1,9 +1,8 @@
 """Continue a logged rollout from an instant on with another renderer, policy or seed.
 
-Up to that instant the rollout is made again by its own parts and compared with its log, component by component and to the bit; that is how
-the whole state is there: the ego's speed and steering, reactive actors, the policy's memory, the renderer's history. A log alone holds less
-(its poses are float32, it has no memory of a policy). Where the replay leaves the log, the component and the step are named and nothing is
-continued.
+Up to that instant the rollout is replayed with its own parts and compared with its log, component by component, bit for bit. The replay
+restores the whole state: the ego's speed and steering, reactive actors, the policy's memory, the renderer's history. A log alone does not
+hold it (its poses are float32, and it has no policy state). If the replay differs from the log, an error names the component and the step.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from typing import Any, Literal
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.log import read_facts
-from alpasim_plugin.log.trace import Difference, Trace, first_difference, trace_log
+from alpasim_plugin.log.trace import Difference, Trace, first_difference
 from alpasim_plugin.parts import digest, resolve, resolve_renderer
-from alpasim_plugin.runtime.cell import MANIFEST, Parts, own_parts, run_cell
+from alpasim_plugin.runtime.cell import MANIFEST, RolloutParts, build_parts, run_cell
+from alpasim_plugin.runtime.certificate import log_trace
 from alpasim_plugin.runtime.execute import thread_budget
-from alpasim_plugin.runtime.past import PastRollout
+from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, score_key
-from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.run import RunResult, write_run_info
 from alpasim_plugin.runtime.store import read_json
@@ -39,7 +38,7 @@ UNCHANGED = "replay"
 
 @dataclass(frozen=True)
 class Change:
-    """What is another from ``after_us`` after the first frame on; None: as it was."""
+    """Which parts are replaced ``after_us`` after the first frame; None keeps the logged one."""
 
     after_us: int
     renderer: str | None = None
@@ -52,24 +51,24 @@ class Change:
         parts = [self.renderer or "", self.policy or "", f"seed {self.seed}" if self.seed is not None else ""]
         return f"{', '.join(part for part in parts if part) or UNCHANGED} from {self.after_us * 1e-6:g} s"
 
-    def of(self, cell: Cell, fixer: Sequence[str]) -> Cell:
-        """Return the cell whose parts take over; ``fixer`` are the run's settings of fixers."""
+    def apply(self, cell: Cell, fixer: Sequence[str]) -> Cell:
+        """Return the cell with the replaced parts; ``fixer`` are the run's fixer settings."""
         renderer = cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
         policy = cell.policy if self.policy is None else resolve("policy", self.policy)
         controller = cell.controller if self.policy is None else resolve("controller", policy.controller)
         return replace(cell, renderer=renderer, policy=policy, controller=controller, seed=cell.seed if self.seed is None else self.seed)
 
 
-def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
+def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
     """Continue a rollout and write a run folder with the original and the continuation side by side.
 
-    The continuation stands in the tables as a renderer of its own (`Change.label`), paired with the original: same policy name, scene and
-    seed. ``run.json`` and the manifest say under ``fork`` what was changed when, that the replay was equal to the log, and, where nothing
-    was changed, whether the continuation was.
+    In the tables the continuation is a renderer of its own (`Change.label`), paired with the original: same policy name, scene and seed.
+    ``fork`` in ``run.json`` and in the manifest holds the change, the result of the replay and, for an empty change, whether the
+    continuation equals the log.
 
     Args:
         past: The logged rollout.
-        change: What is another from which instant on.
+        change: Which parts are replaced, and when.
         root: Run folder to write; must not hold a run.
         video: Whether to write the continuation's video.
         command: For ``run.json``.
@@ -81,7 +80,7 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     _check(past, change, root)
     began = time.perf_counter()
     options = replace(past.options, video=video, baseline=past.cell.renderer.name)
-    then = change.of(past.cell, options.fixer)
+    then = change.apply(past.cell, options.fixer)
     original = _copied(past, root)
     key = digest([past.cell.rollout_key, asdict(change), then.renderer.digest, then.policy.digest, then.controller.digest])
     label = replace(then.renderer, name=change.label)
@@ -90,7 +89,7 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     at_us = past.scenario.start_us + change.after_us
     manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change))
     if manifest["status"] == "ok":
-        manifest["fork"] = asdict(change) | {"of": past.name} | _compared(past, change, at_us, root / fork.folder)
+        manifest["fork"] = asdict(change) | {"of": past.name} | _compare_with_log(past, change, at_us, root / fork.folder)
         write_json(root / fork.folder / MANIFEST, manifest)
     cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
     plan = RunPlan(cells, {past.cell.scene: past.scenario}, renderers, (past.cell.policy,), (past.cell.seed,), options)
@@ -101,21 +100,19 @@ def fork_rollout(past: PastRollout, change: Change, root: Path, video: Literal["
     return RunResult(root, summary, 2, summary["failures"]["n_failed"])
 
 
-def _check(past: PastRollout, change: Change, root: Path) -> None:
+def _check(past: LoggedRollout, change: Change, root: Path) -> None:
     scenario = past.scenario
     length_us = scenario.end_us - scenario.start_us
     if not 0 <= change.after_us < length_us:
         found = f"the rollout lasts {length_us * 1e-6:g} s"
         raise InputError(DOING, f"--at {change.after_us * 1e-6:g}", found, "choose an instant within it, in seconds after the first frame")
-    if scenario.latency.kind == "measured":
-        found = "its latency is measured: when a plan took effect depended on the machine"
-        raise InputError(DOING, past.name, found, "run it with --set latency.kind=fixed")
+    past.check_repeatable(DOING)
     if (root / "run.json").exists():
         raise InputError(DOING, f"--out {root}", "it holds a run already", "choose another --out")
 
 
-def _copied(past: PastRollout, root: Path) -> dict[str, Any]:
-    """Copy the original's folder and return its manifest."""
+def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:
+    """Copy the original rollout's folder and return its manifest."""
     folder = root / past.cell.folder
     shutil.copytree(past.folder, folder, dirs_exist_ok=True)
     manifest = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
@@ -123,15 +120,15 @@ def _copied(past: PastRollout, root: Path) -> dict[str, Any]:
     return manifest
 
 
-def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> Parts:
-    """Make the original's parts and those that take over, joined at the instant; a part that stays the same is one object."""
+def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOptions, scenario: Scenario, threads: int) -> RolloutParts:
+    """Build the original's parts and those that replace them, switched at the instant; an unchanged part is one object."""
     at_us = scenario.start_us + change.after_us
-    before = own_parts(own, options, scenario, threads)
-    after = before if then == own else own_parts(then, options, scenario, threads)
+    before = build_parts(own, options, scenario, threads)
+    after = before if then == own else build_parts(then, options, scenario, threads)
     same_renderer = (then.renderer, then.seed) == (own.renderer, own.seed)
     same_policy = (then.policy, then.seed) == (own.policy, own.seed)
     next_policy = before.policy if same_policy else after.policy
-    return Parts(
+    return RolloutParts(
         SwitchedRenderer(before.renderer, before.renderer if same_renderer else after.renderer, at_us),
         SwitchedPolicy(before.policy, next_policy, at_us, then.seed, scenario.rates.camera_us),
         own.rollout_key if then == own else fork.rollout_key,
@@ -140,17 +137,17 @@ def _parts(own: Cell, then: Cell, change: Change, fork: Cell, options: RunOption
     )
 
 
-def _compared(past: PastRollout, change: Change, at_us: int, folder: Path) -> dict[str, Any]:
-    """Compare the replay with the log up to the instant, and beyond it where nothing was changed.
+def _compare_with_log(past: LoggedRollout, change: Change, at_us: int, folder: Path) -> dict[str, Any]:
+    """Compare the replay with the log up to the instant; for an empty change also the continuation.
 
     Raises:
         InfrastructureError: They differ before the instant.
     """
-    one, other = (trace_log(f / LOG_NAME, read_facts(f / FRAMES_NAME)) for f in (past.folder, folder))
-    # Another policy may take more cameras; what was not logged before says nothing about the replay.
+    one, other = log_trace(past.folder), log_trace(folder)
+    # Another policy may have more cameras; their frames before the instant have no logged counterpart.
     other["frames"] = {key: value for key, value in other["frames"].items() if key in one["frames"] or key[0] >= at_us}
     where = (past.scenario.start_us, past.scenario.rates.control_us)
-    # The pose at the instant itself follows from what was before it; its frames and its plan belong to the parts that take over.
+    # The pose at the instant follows from the original parts; its frames and its plan come from the new ones.
     until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
     difference = first_difference(one, other, *where, until)
     if difference is not None:
@@ -159,14 +156,14 @@ def _compared(past: PastRollout, change: Change, at_us: int, folder: Path) -> di
             DOING,
             past.name,
             f"its replay differs from the log before the change: {difference}",
-            "continue it on the machine and with the versions that run.json names, or run the rollout again",
+            "use the machine and the versions in run.json, or run the rollout again",
         )
     if change == Change(change.after_us):
-        return {"replay": "equal", "continuation": _word(one, other, past, folder, where)}
+        return {"replay": "equal", "continuation": _continuation(one, other, past, folder, where)}
     return {"replay": "equal"}
 
 
-def _word(one: Trace, other: Trace, past: PastRollout, folder: Path, where: tuple[int, int]) -> Mapping[str, Any] | str:
+def _continuation(one: Trace, other: Trace, past: LoggedRollout, folder: Path, where: tuple[int, int]) -> Mapping[str, Any] | str:
     difference = first_difference(one, other, *where)
     if difference is None and (past.folder / LOG_NAME).read_bytes() != (folder / LOG_NAME).read_bytes():
         difference = Difference("log", where[0], None, "an entry that belongs to no component")

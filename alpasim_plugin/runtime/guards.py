@@ -1,4 +1,4 @@
-"""What renderers and policies hand over is checked at the seam: a broken part is named, never passed on."""
+"""Checks of what renderers and policies return; an error names the part that broke its contract."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
     """Render and check the frames of one instant, or of one block; an all-black frame passes but carries the event ``black``.
 
     Raises:
-        RendererError: The renderer raised, or its frames have another number, size, type, time or camera than asked for.
+        RendererError: The renderer raised, or its frames do not match the requests in number, size, type, time or camera.
     """
     if not requests:
         return []
@@ -55,10 +55,10 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
 
 
 def checked_plan(policy: Policy, observation: Observation) -> Plan:
-    """Ask the policy and check its answer.
+    """Query the policy and check its plan.
 
     Raises:
-        PolicyError: The policy raised, or its plan is empty, not finite, not ordered in time or does not begin now.
+        PolicyError: The policy raised, or its plan is empty, not finite, not ordered in time or does not start now.
     """
     name = f"{type(policy).__name__} at {observation.t_us} us"
     try:
@@ -67,22 +67,22 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
         raise
     except Exception as error:
         raise PolicyError(
-            "asking the policy for a plan", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
+            "querying the policy", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
         ) from error
     found = _plan_problem(plan, observation.t_us)
     if found:
-        raise PolicyError("asking the policy for a plan", name, found, "run the policy through policies.conformance.check_policy")
+        raise PolicyError("querying the policy", name, found, "run the policy through policies.conformance.check_policy")
     return plan
 
 
 def _plan_problem(plan: Plan, now_us: int) -> str:
     n = len(plan.times_us)
     if n < 1 or plan.xy.shape != (n, 2) or plan.yaw.shape != (n,):
-        return f"shapes times_us {plan.times_us.shape}, xy {plan.xy.shape}, yaw {plan.yaw.shape} do not belong together"
+        return f"shapes times_us {plan.times_us.shape}, xy {plan.xy.shape}, yaw {plan.yaw.shape} do not match"
     if not (np.isfinite(plan.xy).all() and np.isfinite(plan.yaw).all()):
         return "xy or yaw is not finite"
     if int(plan.times_us[0]) != now_us or np.any(np.diff(plan.times_us) <= 0):
-        return f"times_us begins at {int(plan.times_us[0])} us or does not increase strictly"
+        return f"times_us starts at {int(plan.times_us[0])} us or does not increase strictly"
     if any(sample.shape != (n, 3) or not np.isfinite(sample).all() for sample in plan.samples):
-        return f"a sampled alternative is not finite or not of shape ({n}, 3)"
+        return f"a sample is not finite or not of shape ({n}, 3)"
     return ""

@@ -1,4 +1,4 @@
-"""Scenes by id, for logs that only name theirs."""
+"""Finds scenes by the ids that logs hold."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from scenarios.suite import load_suite
 from scenarios.usdz import read_usdz, usdz_scene_id
 
 DOING = "finding the scene of a log"
-_SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")  # another scene seed than the file's own adds this to the id
+_SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")  # a seed other than the file's is part of the id
 
 
 class KnownScenes:
-    """Finds and reads scenes among paths and folders; each is read once, when first asked for.
+    """Finds scenes in files and folders; each is read once, on first use.
 
     Args:
         places: Scenes (anything that ``simrun run`` drives), or folders of them.
-        rails: False drops the lanes' rails of AlpaSim scenes.
+        rails: Whether lanes of AlpaSim scenes keep their rails.
 
     Raises:
-        InputError: Nothing there, or two AlpaSim scenes with one id.
+        InputError: A place without scenes, or two AlpaSim scenes with one id.
     """
 
     def __init__(self, places: Sequence[str | Path], rails: bool = True) -> None:
@@ -62,7 +62,7 @@ class KnownScenes:
             known = sorted({*self._archives, *self._read})
             raise InputError(
                 DOING, f"scene {scene_id!r}", f"not among the {len(known)} scenes of {', '.join(self.places)}: {', '.join(known[:5])}",
-                "give --scene the scene that the log was driven in, or a folder that holds it",
+                "name the log's scene with --scene, or a folder that holds it",
             )  # fmt: skip
         return self._read[scene_id]
 
@@ -75,7 +75,7 @@ class KnownScenes:
 
 
 def _scene_files(place: str) -> list[str]:
-    """Return the scenes that a path, a folder or a shipped name stands for."""
+    """Return the scene files of a path, a folder or a shipped name."""
     path = Path(place)
     archives = sorted(path.rglob("*.usdz")) if path.is_dir() else []
     if archives:

@@ -1,4 +1,4 @@
-"""What one rollout carries from tick to tick."""
+"""The state of one rollout between ticks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from alpasim_plugin.world.route import route_in_rig
 class LoopState:
     """The ego's true state, its history, and the newest frame of each camera.
 
-    The history lives in arrays sized once for the whole rollout: an observation is a view of them, not a copy.
+    The history is stored in arrays allocated once for the whole rollout: an observation is a view of them, not a copy.
     """
 
     scenario: Scenario
@@ -44,7 +44,7 @@ class LoopState:
             np.concatenate([log.quat[:context], np.zeros((size - context, 4))]),
             context,
         )
-        state._remember()
+        state._append_pose()
         return state
 
     @property
@@ -54,14 +54,14 @@ class LoopState:
         return Trajectory(self._t_us[:n], self._xyz[:n], self._quat[:n])
 
     def observe(self, cameras: Mapping[str, CameraSpec]) -> Observation:
-        """Return what the policy may know now."""
+        """Return the policy's observation at the present instant."""
         route = route_in_rig(self.scenario.route, self.ego.T_world_rig)
         return Observation(self.ego.t_us, dict(self.frames), cameras, self.ego, self.history, route)
 
     def to_world(self, plan: Plan) -> list[Trajectory]:
-        """Map a plan and then its alternatives from the rig frame now to absolute poses.
+        """Map a plan and its samples from the present rig frame to world poses.
 
-        Plans are planar, so the rig's heading alone turns them.
+        Plans are planar, so only the rig's heading rotates them.
         """
         yaw0, origin = yaw_of(self.ego.T_world_rig), self.ego.T_world_rig[:3, 3]
         c, s = np.cos(yaw0), np.sin(yaw0)
@@ -74,16 +74,16 @@ class LoopState:
         return [place(plan.xy, plan.yaw), *(place(sample[:, :2], sample[:, 2]) for sample in plan.samples)]
 
     def advance(self, controller: Controller, plan: Trajectory | None, to_us: int) -> bool:
-        """Move the ego to ``to_us``: along the log while it is forced, otherwise by the vehicle model, then onto the ground.
+        """Move the ego to ``to_us``: along the log in the warm-up, then by the vehicle model, projected onto the ground.
 
         Returns:
             Whether the log was forced.
         """
-        self.ego, forced = moved_ego(self.scenario, controller, self.ego, plan, to_us)
-        self._remember()
+        self.ego, forced = advance_ego(self.scenario, controller, self.ego, plan, to_us)
+        self._append_pose()
         return forced
 
-    def _remember(self) -> None:
+    def _append_pose(self) -> None:
         n = self._filled
         self._t_us[n] = self.ego.t_us
         self._xyz[n] = self.ego.T_world_rig[:3, 3]
@@ -91,8 +91,8 @@ class LoopState:
         self._filled = n + 1
 
 
-def moved_ego(scenario: Scenario, controller: Controller, ego: EgoState, plan: Trajectory | None, to_us: int) -> tuple[EgoState, bool]:
-    """Return the ego at ``to_us`` and whether the log was forced: it is until the end of the warm-up."""
+def advance_ego(scenario: Scenario, controller: Controller, ego: EgoState, plan: Trajectory | None, to_us: int) -> tuple[EgoState, bool]:
+    """Return the ego at ``to_us`` and whether the log was forced, as it is until the end of the warm-up."""
     if to_us <= scenario.start_us + scenario.warmup_us:
         return ego_state_from_log(scenario.ego_log, to_us, scenario.vehicle), True
     moved = controller.advance(ego, plan, to_us)

@@ -1,4 +1,4 @@
-"""What a run consists of: the cells renderer x policy x scene x seed, each with its parts resolved and a key of their content."""
+"""The plan of a run: its cells, renderer x policy x scene x seed, with resolved parts and content keys."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SLUG_LENGTH = 80
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Everything but the cells that shapes a run's results."""
+    """Everything except the cells that determines a run's results."""
 
     preset: str = "paper"
     images: Literal["none", "jpeg", "png"] = "jpeg"  # camera frames in rollout.asl
@@ -30,13 +30,13 @@ class RunOptions:
     device: Literal["cpu", "cuda"] = "cpu"
     baseline: str | None = None
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
-    controller: str | None = None  # None: what each policy asks for
-    evaluators: tuple[str, ...] = ()  # package.module:Class of evaluators beside the registered ones
+    controller: str | None = None  # None: each policy's own
+    evaluators: tuple[str, ...] = ()  # package.module:Class of evaluators in addition to the registered ones
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One rollout to run: what its parts are, and what identifies it."""
+    """One rollout to run: its parts and its identity."""
 
     renderer: RendererSpec
     policy: PartSpec
@@ -45,9 +45,9 @@ class Cell:
     seed: int
     ref: ScenarioRef
     evaluators: tuple[PartSpec, ...]
-    rollout_key: str  # content of everything that shapes the log
-    score_key: str  # rollout_key plus what shapes the scores
-    undigested: tuple[str, ...] = ()  # parts whose behaviour is decided elsewhere: the rollout is never reused unasked
+    rollout_key: str  # digest of everything that determines the log
+    score_key: str  # digest of rollout_key and of everything that determines the scores
+    undigested: tuple[str, ...] = ()  # parts without a digest (remote services): the rollout is reused on request only
 
     @property
     def folder(self) -> Path:
@@ -56,7 +56,7 @@ class Cell:
 
     @property
     def names(self) -> dict[str, str | int]:
-        """Give the cell as tables name it."""
+        """Give the columns that identify the cell in tables."""
         return {"renderer": self.renderer.name, "policy": self.policy.name, "scene": self.scene, "seed": self.seed}
 
 
@@ -73,13 +73,13 @@ class RunPlan:
 
     @property
     def command_key(self) -> str:
-        """Give a short hash of what was asked for: the same command has the same one, whatever its parts contain by now."""
-        asked = [[*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides] for cell in self.cells]
-        return digest([asked, asdict(self.options)])[:12]
+        """Give a short digest of the command: names, paths and options, not the content of the parts."""
+        named = [[*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides] for cell in self.cells]
+        return digest([named, asdict(self.options)])[:12]
 
     @property
     def content(self) -> str:
-        """Give a short hash of what shapes the results: it changes with any part."""
+        """Give a short digest of everything that determines the results; it changes with any part."""
         return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
 
     @property
@@ -102,10 +102,10 @@ def make_plan(
     seeds: Sequence[int],
     options: RunOptions,
 ) -> RunPlan:
-    """Load every scenario, resolve every part, and lay out the cells, scene by scene so that workers reuse what they built.
+    """Load every scenario, resolve every part, and list the cells, scene by scene so that workers reuse a loaded scene.
 
     Raises:
-        InputError: A scenario or a part is bad, two scenarios share an id, or a name is given twice.
+        InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given twice.
     """
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
         twice = sorted({str(value) for value in values if list(values).count(value) > 1})
@@ -115,7 +115,7 @@ def make_plan(
     rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
     same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
-        raise InputError("planning a run", f"renderers {list(renderers)}", f"they stand for {same}", "name every renderer once")
+        raise InputError("planning a run", f"renderers {list(renderers)}", f"they resolve to {same}", "name every renderer once")
     if options.fixer and all(spec.fixer is None for spec in rendering):
         found = f"no fixer among the renderers {list(renderers)}"
         raise InputError("planning a run", f"--set fixer.{options.fixer[0]}", found, "leave it out, or name a fixer")
@@ -169,7 +169,7 @@ def _cell(
 
 
 def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:
-    """Return the content key of a rollout's scores: another preset, or other code of an evaluator or of the reduction, gives another."""
+    """Return the content key of a rollout's scores; it changes with the preset and the code of the evaluators and of the reduction."""
     own = own_code_digest("alpasim_plugin.runtime.scoring")
     return digest([rollout_key, preset(preset_name).as_dict(), own, [(spec.name, spec.digest) for spec in evaluators]])
 

@@ -1,7 +1,7 @@
-"""Ask one policy at the same poses behind several renderers: what a renderer alone changes in the plans, frame by frame.
+"""Query one policy at the same poses behind several renderers: the effect of the renderer alone on the plans.
 
-The logged rollout is made again by its own parts and compared with its log. At every camera frame each renderer under test renders the
-same request; at every query a policy of its own, with the history of its own frames, queries. Only the logged renderer's policy drives.
+The logged rollout is replayed with its own parts and compared with its log. Every renderer under test renders every request. Each has a
+policy instance of its own, which sees its frames and is queried at the same instants. Only the plans of the logged renderer's policy drive.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.log import read_facts
-from alpasim_plugin.log.trace import first_difference, trace_log
+from alpasim_plugin.log.trace import first_difference
 from alpasim_plugin.parts import resolve_renderer
-from alpasim_plugin.runtime.cell import own_parts
+from alpasim_plugin.runtime.cell import build_parts
+from alpasim_plugin.runtime.certificate import log_trace
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan
-from alpasim_plugin.runtime.past import PastRollout
-from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
+from alpasim_plugin.runtime.logged_rollout import LoggedRollout
+from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.types import F64, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US, plan_gap
@@ -34,7 +34,7 @@ DOING = "probing renderers along a logged rollout"
 
 @dataclass(frozen=True)
 class PolicyQuery:
-    """The plans of one query and the pictures they were made from, by renderer."""
+    """The plans of one query and the frames they were made from, by renderer."""
 
     t_us: int
     plans: Mapping[str, Plan]
@@ -43,12 +43,12 @@ class PolicyQuery:
 
 @dataclass(frozen=True)
 class Pair:
-    """A renderer against the reference over all queries ``(Q,)``.
+    """A renderer compared with the reference over all queries ``(Q,)``.
 
     Attributes:
         gap_m: Distance between the plans at `HORIZONS_S` ``(Q, 2)``; NaN where a plan ends earlier.
-        turn_rad: Heading of the renderer's plan less that of the reference's ``(Q, 2)``.
-        levels: Mean absolute difference of the two pictures, 8-bit levels ``(Q,)``.
+        turn_rad: Heading of the renderer's plan minus that of the reference's ``(Q, 2)``.
+        levels: Mean absolute difference of the two images, 8-bit levels ``(Q,)``.
         first: Row of the first divergence as in `evaluators.plan_gap`, or None.
         first_gap_m: The gap there, at the horizon or the end of the shorter plan.
     """
@@ -64,14 +64,14 @@ class Pair:
 
 @dataclass(frozen=True)
 class Probe:
-    """What a probe found."""
+    """Result of a probe."""
 
     queries: tuple[PolicyQuery, ...]
     pairs: tuple[Pair, ...]
 
 
-class _AllRenderers(Renderer):
-    """Renders every request with all renderers and gives the loop the driving one's frames."""
+class _MultiRenderer(Renderer):
+    """Renders every request with all renderers and returns the driving renderer's frames."""
 
     def __init__(self, renderers: Mapping[str, Renderer], driver: str) -> None:
         self.renderers, self.driver = renderers, driver
@@ -96,70 +96,65 @@ class _AllRenderers(Renderer):
 
 
 @dataclass
-class _PolicyPerRenderer(Policy):
-    """Asks one policy per renderer and gives the loop the driving one's plan."""
+class _MultiPolicy(Policy):
+    """Queries one policy per renderer, each with its renderer's frames, and returns the driving renderer's plan."""
 
     policies: Mapping[str, Policy]
-    renderers_together: _AllRenderers
+    renderer: _MultiRenderer
     queries: list[PolicyQuery] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.sensors: Sequence[SensorSpec] = self.policies[self.renderers_together.driver].sensors
+        self.sensors: Sequence[SensorSpec] = self.policies[self.renderer.driver].sensors
 
     def reset(self, seed: int, route: Route) -> None:
         for policy in self.policies.values():
             policy.reset(seed, route)
 
     def act(self, observation: Observation) -> Plan:
-        seen = {name: replace(observation, frames=dict(self.renderers_together.latest[name])) for name in self.policies}
-        plans = {name: checked_plan(policy, seen[name]) for name, policy in self.policies.items()}
-        camera = self.sensors[0].camera
-        self.queries.append(
-            PolicyQuery(observation.t_us, plans, {name: self.renderers_together.latest[name][camera] for name in self.policies})
-        )
-        return plans[self.renderers_together.driver]
+        latest, camera = self.renderer.latest, self.sensors[0].camera
+        plans = {name: checked_plan(policy, replace(observation, frames=dict(latest[name]))) for name, policy in self.policies.items()}
+        self.queries.append(PolicyQuery(observation.t_us, plans, {name: latest[name][camera] for name in self.policies}))
+        return plans[self.renderer.driver]
 
 
-def probe_rollout(past: PastRollout, renderers: Sequence[str]) -> Probe:
-    """Ask the policy of a logged rollout at its own poses behind each of some renderers.
+def probe_rollout(past: LoggedRollout, renderers: Sequence[str]) -> Probe:
+    """Query the policy of a logged rollout at its logged poses behind several renderers.
 
     Args:
-        past: The logged rollout, which is driven again as it was.
+        past: The logged rollout, which is replayed.
         renderers: Which to compare; the first is the reference. The logged renderer need not be among them.
 
     Raises:
-        InputError: Fewer than two renderers, a policy without cameras, measured latency, or renderers of different blocks.
+        InputError: Fewer than two renderers, a policy without cameras, measured latency, or renderers with different blocks.
         InfrastructureError: The replay is not equal to the log.
         RendererError: A renderer failed.
-        PolicyError: The policy failed behind one of them.
+        PolicyError: The policy failed with one of them.
     """
     if len(set(renderers)) < 2 or len(set(renderers)) < len(renderers):
         raise InputError(DOING, f"--renderers {','.join(renderers)}", "fewer than two, or one of them twice", "name two renderers")
-    if past.scenario.latency.kind == "measured":
-        found = "its latency is measured: when a plan took effect depended on the machine"
-        raise InputError(DOING, past.name, found, "run it with --set latency.kind=fixed")
+    past.check_repeatable(DOING)
     own, threads = past.cell, thread_budget(1, 1).per_worker
     specs = {own.renderer.name: own.renderer} | {
         name: resolve_renderer(name, past.options.fixer) for name in renderers if name != own.renderer.name
     }
-    parts = {name: own_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
-    renderers_together = _AllRenderers({name: p.renderer for name, p in parts.items()}, own.renderer.name)
-    policies_together = _PolicyPerRenderer({name: p.policy for name, p in parts.items()}, renderers_together)
-    if not policies_together.sensors:
-        raise InputError(DOING, past.name, f"the policy {own.policy.name!r} takes no camera", "probe a rollout of a policy that sees")
+    parts = {name: build_parts(replace(own, renderer=spec), past.options, past.scenario, threads) for name, spec in specs.items()}
+    renderer = _MultiRenderer({name: p.renderer for name, p in parts.items()}, own.renderer.name)
+    policy = _MultiPolicy({name: p.policy for name, p in parts.items()}, renderer)
+    if not policy.sensors:
+        raise InputError(DOING, past.name, f"the policy {own.policy.name!r} has no camera", "probe a rollout of a policy with cameras")
     with tempfile.TemporaryDirectory(prefix="simrun-probe-") as folder:
         with Recorder(past.scenario, own.seed, Path(folder), own.rollout_key, past.options.images) as recorder:
-            run_rollout(past.scenario, renderers_together, policies_together, own.seed, recorder, parts[own.renderer.name].controller)
-        one, other = (trace_log(f / LOG_NAME, read_facts(f / FRAMES_NAME)) for f in (past.folder, Path(folder)))
+            run_rollout(past.scenario, renderer, policy, own.seed, recorder, parts[own.renderer.name].controller)
+        one, other = log_trace(past.folder), log_trace(Path(folder))
     difference = first_difference(one, other, past.scenario.start_us, past.scenario.rates.control_us)
     if difference is not None:
         raise InfrastructureError(
             DOING,
             past.name,
             f"its replay differs from the log: {difference}",
-            "probe it on the machine and with the versions that run.json names, or run the rollout again",
+            "use the machine and the versions in run.json, or run the rollout again",
         )
-    queries = tuple(policies_together.queries)
+    queries = tuple(policy.queries)
     return Probe(queries, tuple(_pair(queries, renderers[0], name) for name in renderers[1:]))
 
 
@@ -173,8 +168,8 @@ def _pair(queries: Sequence[PolicyQuery], reference: str, renderer: str) -> Pair
         gap[row], turn[row] = distances[:-1], turns[:-1]
         if first is None and distances[-1] > DIVERGED_M:
             first, first_gap = row, float(distances[-1])
-        pictures = (query.frames[name].rgb.astype(np.int16) for name in (reference, renderer))
-        levels[row] = float(np.mean(np.abs(np.subtract(*pictures))))
+        images = (query.frames[name].rgb.astype(np.int16) for name in (reference, renderer))
+        levels[row] = float(np.mean(np.abs(np.subtract(*images))))
     return Pair(reference, renderer, gap, turn, levels, first, first_gap)
 
 
@@ -184,7 +179,7 @@ def _trajectory(plan: Plan) -> Trajectory:
 
 
 def summarise(pair: Pair, queries: Sequence[PolicyQuery], start_us: int) -> dict[str, Any]:
-    """Return the numbers of a pair for JSON, without the pictures."""
+    """Return the numbers of a pair for JSON, without the frames."""
     out: dict[str, Any] = {"reference": pair.reference, "renderer": pair.renderer, "queries": len(queries)}
     for j, horizon in enumerate(HORIZONS_S):
         known = pair.gap_m[np.isfinite(pair.gap_m[:, j]), j]

@@ -1,4 +1,4 @@
-"""Where probes lie in a run folder, and how their answers are found."""
+"""Paths of probes in a run folder, and the search for a stored probe."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PROBES = "probes"
 PROBE_JSON, PROBE_TABLE, PROBE_PLOT = "probe.json", "probe.parquet", "probe.png"
 
 
-def probe_folder(renderer: str, policy: str, scene: str, seed: int, asked: tuple[str, ...]) -> Path:
-    """Return the folder of a probe below the run folder: along which rollout, and which renderers were asked."""
-    return Path(PROBES, slug(renderer), slug(policy), slug(scene), str(seed), slug("--".join(asked)))
+def probe_folder(renderer: str, policy: str, scene: str, seed: int, renderers: tuple[str, ...]) -> Path:
+    """Return the folder of a probe of ``renderers`` along a rollout, relative to the run folder."""
+    return Path(PROBES, slug(renderer), slug(policy), slug(scene), str(seed), slug("--".join(renderers)))
 
 
 def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:
-    """Return what a probe along a rollout found between its own renderer and another one; None where there is no such probe."""
+    """Return the first divergence that a probe along a rollout found between its renderer and another; None without such a probe."""
     folder = root / PROBES / slug(driven.renderer) / slug(driven.policy) / slug(driven.scene) / str(driven.seed)
     for path in sorted(folder.glob(f"*/{PROBE_JSON}")):
         for pair in read_json(path)["pairs"]:

@@ -1,4 +1,4 @@
-"""Write what a probe found: a table, a summary and a plot."""
+"""Write a probe: a table, a summary and a plot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from alpasim_plugin.atomic import write_bytes, write_json
 from alpasim_plugin.log import encode_image
-from alpasim_plugin.runtime.past import PastRollout
+from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.probe import HORIZONS_S, Probe, summarise
 from alpasim_plugin.runtime.probe_files import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
 from alpasim_plugin.runtime.store import write_table
@@ -24,14 +24,14 @@ SCHEMA = pa.schema(
 )
 
 
-def write_probe(probe: Probe, past: PastRollout, renderers: tuple[str, ...], out: Path | None = None) -> Path:
+def write_probe(probe: Probe, past: LoggedRollout, renderers: tuple[str, ...], out: Path | None = None) -> Path:
     """Write ``probe.parquet``, ``probe.json``, ``probe.png`` and the frames of each first divergence; return the folder.
 
     Args:
-        probe: What was found.
-        past: Along which rollout.
-        renderers: Which were asked.
-        out: Folder; by default one below ``probes/`` in the rollout's run folder, where the report finds it.
+        probe: The probe.
+        past: The rollout it went along.
+        renderers: The renderers compared.
+        out: Folder; by default one below ``probes/`` in the rollout's run folder, where the report looks.
     """
     cell = past.cell
     folder = out or past.root / probe_folder(cell.renderer.name, cell.policy.name, cell.scene, cell.seed, renderers)
@@ -63,7 +63,7 @@ def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _plot(path: Path, probe: Probe, past: PastRollout) -> None:
+def _plot(path: Path, probe: Probe, past: LoggedRollout) -> None:
     start_us, warmup_s = past.scenario.start_us, past.scenario.warmup_us * 1e-6
     seconds = np.array([query.t_us - start_us for query in probe.queries]) * 1e-6
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
@@ -78,10 +78,10 @@ def _plot(path: Path, probe: Probe, past: PastRollout) -> None:
         if pair.first is not None:
             above.axvline(seconds[pair.first], color=f"C{k}", linewidth=0.8, alpha=0.6)
     above.axhline(DIVERGED_M, color="0.5", linestyle=":", linewidth=1.0, label=f"diverged: {DIVERGED_M} m")
-    above.set_ylabel("between the plans, m")
-    middle.set_ylabel("turn, degrees")
-    below.set_ylabel("pictures, levels of 255")
-    below.set_xlabel("s since the first frame")
+    above.set_ylabel("distance of plans, m")
+    middle.set_ylabel("heading difference, degrees")
+    below.set_ylabel("image difference, 8-bit levels")
+    below.set_xlabel("time since the first frame, s")
     above.set_ylim(bottom=0.0)
     below.set_ylim(bottom=0.0)
     for axes in (above, middle, below):
@@ -91,6 +91,6 @@ def _plot(path: Path, probe: Probe, past: PastRollout) -> None:
     above.legend(fontsize=8, loc="upper left")
     reference = probe.pairs[0].reference
     above.set_title(
-        f"{past.cell.policy.name} along {past.cell.scene}, seed {past.cell.seed}: against {reference} (grey: warm-up)", fontsize=10
+        f"{past.cell.policy.name} along {past.cell.scene}, seed {past.cell.seed}: compared with {reference} (grey: warm-up)", fontsize=10
     )
     figure.savefig(path, dpi=110)

@@ -1,4 +1,4 @@
-"""What a run was made with: software, machine, and what its scenes left out."""
+"""Provenance of a run: software versions and hardware."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PACKAGES = ("numpy", "scipy", "numba", "torch", "shapely", "opencv-contrib-pytho
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and the libraries that shape results; a missing one says so."""
+    """Return the versions of Python and of the libraries that affect results, or "not installed"."""
     found = {"alpasim-onefixer": __version__, "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -26,7 +26,7 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> dict[str, Any]:
-    """Return processor, cores this process may use, memory and operating system."""
+    """Return the processor, the cores that this process may use, memory and operating system."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
     return {

@@ -1,4 +1,4 @@
-"""What one rollout leaves behind: the log, per-frame facts, stage times and pictures."""
+"""Writes the files of one rollout: the log, per-frame facts and images; collects stage times."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 
 class Recorder:
-    """Receives everything a rollout does, in the loop's order, and writes it down.
+    """Records a rollout in the loop's order.
 
     Args:
         scenario: What is driven.
         seed: Rollout seed, for the log's header.
-        folder: Where to write; by default a temporary folder that lives as long as the recorder.
-        session: Names the rollout in the log; equal rollouts have equal names.
-        images: How camera frames enter the log.
-        keep_frames: Keep every frame for a video, or only those of the strip.
-        versions: What to put into the log's header by service, such as ``{"sensorsim": "3dgs", "egodriver": "lane-camera"}``.
+        folder: Folder to write; by default a temporary one that is deleted with the recorder.
+        session: Identifies the rollout in the log; equal rollouts have equal ids.
+        images: Encoding of camera frames in the log.
+        keep_frames: Keep every frame for a video, not only those of the strip.
+        versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs", "egodriver": "lane-camera"}``.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Recorder:
         return self._times.measure(name)
 
     def rendering(self, renderer: Renderer, frames: int) -> AbstractContextManager[None]:
-        """Time the rendering of so many frames; what the renderer reports as stages of their own is filed under their names."""
+        """Time the rendering of ``frames`` frames; stages that the renderer reports are timed under their own names."""
         self._first_call = self._first_call or frames
         return self._times.measure("render", frames, lambda: renderer.stage_ms)
 
@@ -86,7 +86,7 @@ class Recorder:
         self._writer.begin(list(cameras.values()))
 
     def poses(self, ego: EgoState, actors: Mapping[str, F64]) -> None:
-        """Log where everybody truly is."""
+        """Log the true poses of the ego and the actors."""
         with self.stage("log"):
             self._log.actor_poses(ego.t_us, ego.T_world_rig, actors)
 
@@ -110,7 +110,7 @@ class Recorder:
                 self._pictures.add(frame)
 
     def policy_query(self, observation: Observation, clock: Clock) -> None:
-        """Log a query of the policy: the ego motion and the route that it gets."""
+        """Log a policy query: ego motion and route."""
         with self.stage("log"):
             log, history = self._scenario.ego_log, observation.history.t_us
             unlogged = history[(history > self._last_query_us) & (history < clock.start_us)]
@@ -121,12 +121,12 @@ class Recorder:
             self._log.driver_request(observation.t_us, observation.t_us + clock.rates.control_us)
 
     def policy_plan(self, plan: Trajectory, samples: Sequence[Trajectory]) -> None:
-        """Log the policy's plan and its alternatives, in the world."""
+        """Log the policy's plan and its samples, in world coordinates."""
         with self.stage("log"):
             self._log.driver_return(plan, samples)
 
-    def moved(self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool) -> None:
-        """Log one step of the vehicle."""
+    def control_step(self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool) -> None:
+        """Log one control step."""
         with self.stage("log"):
             self._log.controller_request(before, plan if plan is not None else NO_PLAN, after.t_us, forced)
             self._log.controller_return(after)
@@ -138,10 +138,10 @@ class Recorder:
             self._log.finish()
             write_facts(self.folder / FRAMES_NAME, self._frames)
 
-    # --- afterwards -------------------------------------------------------------------------------------------------
+    # --- after the rollout ------------------------------------------------------------------------------------------
 
     def log(self, images: bool = True) -> RolloutLog:
-        """Read the finished log back, exactly as any scorer would."""
+        """Read the finished log back."""
         return read_asl(self.folder / LOG_NAME, images=images)
 
     def facts(self) -> dict[str, Any]:
@@ -161,7 +161,7 @@ class Recorder:
         }
 
     def save_pictures(self, video: bool) -> None:
-        """Write the strip of frames, and the video if asked for."""
+        """Write the strip of frames, and the video if requested."""
         if self._pictures is not None:
             self._pictures.save(self.folder, video)
 

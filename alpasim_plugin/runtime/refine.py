@@ -1,6 +1,6 @@
-"""Refine a video file: read, fix block by block, write; optionally with opacity and map videos beside it.
+"""Refine a video file: read, fix block by block, write; optionally with videos of opacity and semantic map.
 
-Nothing is held but the block in progress. The result appears under its name only once complete.
+Only the current block is held in memory. The result is renamed to its final name when it is complete.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from alpasim_plugin.types import F32, U8, Fixer, Frame
 DOING = "refining a video"
 CAMERA = "video"
 SAME_RATE = 5e-4  # relative; 29.97 and 30 differ by twice that
-GREY_LEVELS = 40  # an opacity video's channels may differ by this much, for compression's sake
+GREY_LEVELS = 40  # channels of an opacity video may differ by this much, because of compression
 
 
 @dataclass(frozen=True)
 class RefineFiles:
-    """What is read and written.
+    """The files of a refinement.
 
     Attributes:
         source: The video.
         out: The refined video (MP4).
-        opacity: Grey video, white where the source is reliable; None counts all of it as opaque.
-        sdmap: Video of the semantic map; None gives the fixer none.
+        opacity: Grey video, white where the source is reliable; None is opaque everywhere.
+        sdmap: Video of the semantic map; None is no map.
         compare: Also write source and result side by side here.
         overwrite: Whether existing results may be replaced.
     """
@@ -49,32 +49,32 @@ class RefineFiles:
 
     @property
     def inputs(self) -> dict[str, Path]:
-        """What is read, by role."""
+        """Give the files to read, by role."""
         named = {"input": self.source, "opacity": self.opacity, "sdmap": self.sdmap}
         return {role: path for role, path in named.items() if path is not None}
 
     @property
     def results(self) -> dict[str, Path]:
-        """What is written, by role."""
+        """Give the files to write, by role."""
         named = {"output": self.out, "compare": self.compare}
         return {role: path for role, path in named.items() if path is not None}
 
 
 @dataclass(frozen=True)
 class RefineSummary:
-    """How a video was refined.
+    """Statistics of a refined video.
 
     Attributes:
-        fixer: What the fixer is.
+        fixer: The fixer's label.
         trained: Whether its weights were learned.
         frames, width, height: Of the video; odd sizes are padded by one row or column in the file.
         fps: Average frame rate, None where the source states none.
-        ms_per_frame_p50, ms_per_frame_p95: Fixer only, over blocks; the first block apart where there are more.
+        ms_per_frame_p50, ms_per_frame_p95: Fixer only, over blocks; without the first block where there are more.
         ms_per_frame_first: Of the first block.
-        wall_s: Everything, files included.
+        wall_s: Total time, files included.
         psnr_db: Result against source, None where they are equal; before the file's compression.
         mean_levels, max_levels: Their absolute difference in grey levels.
-        events: How many frames a guard passed on unrefined, by event.
+        events: Number of frames that a guard replaced by the unrefined ones, by event.
         audio_left_out: Whether the source has sound; the result has none.
     """
 
@@ -101,17 +101,17 @@ def refine_video(
     """Refine a video file.
 
     Args:
-        files: What is read and written.
-        make_fixer: Makes the session; called once the files are found good.
-        on_frames: Told the number of frames done and the number that the container claims, after every block.
+        files: The files to read and write.
+        make_fixer: Creates the fixer's session; called after the files are checked.
+        on_frames: Called after every block with the frames done and the number that the container states.
 
     Raises:
-        InputError: Files that cannot be read, do not belong together, or stand in the way of the results.
-        InfrastructureError: The disk or the encoder refuses.
+        InputError: Files that cannot be read or do not match, or results that exist already.
+        InfrastructureError: The disk or the encoder fails.
     """
     check_names(files)
     begin = time.perf_counter()
-    tally = StreamStats()
+    stats = StreamStats()
     with ExitStack() as stack:
         readers = {role: stack.enter_context(VideoReader(path, DOING)) for role, path in files.inputs.items()}
         check_formats(readers)
@@ -122,39 +122,39 @@ def refine_video(
             role: stack.enter_context(VideoWriter(path, source.time_base, rate, source.colour, source.pixel_aspect))
             for role, path in files.results.items()
         }
-        timing: list[TimedFrame] = []  # of the block in progress
+        timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer):
             for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
                 writers["output"].write(fixed.rgb, timed.time, timed.duration)
                 if "compare" in writers:
                     writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
             timing.clear()
-            tally.add(block)
+            stats.add(block)
             if on_frames is not None:
-                on_frames(tally.frames, source.frames)
-    later = tally.ms_per_frame[1:] or tally.ms_per_frame
-    difference = tally.difference
+                on_frames(stats.frames, source.frames)
+    later = stats.ms_per_frame[1:] or stats.ms_per_frame
+    difference = stats.difference
     return RefineSummary(
         fixer=fixer.label,
         trained=fixer.trained,
-        frames=tally.frames,
+        frames=stats.frames,
         width=source.width,
         height=source.height,
         fps=None if source.rate is None else float(source.rate),
         ms_per_frame_p50=float(np.median(later)),
         ms_per_frame_p95=float(np.percentile(later, 95)),
-        ms_per_frame_first=tally.ms_per_frame[0],
+        ms_per_frame_first=stats.ms_per_frame[0],
         wall_s=time.perf_counter() - begin,
         psnr_db=difference.psnr_db if difference.squared else None,
         mean_levels=difference.mean_levels,
         max_levels=difference.max_levels,
-        events=dict(tally.events),
+        events=dict(stats.events),
         audio_left_out=source.audio,
     )
 
 
 def check_names(files: RefineFiles) -> None:
-    """Refuse results that exist, that are inputs, or that are one file; and a missing folder.
+    """Refuse results that exist, that are inputs or that share one path, and missing folders.
 
     Raises:
         InputError: Naming the option.
@@ -176,7 +176,7 @@ def check_names(files: RefineFiles) -> None:
 
 
 def check_formats(readers: Mapping[str, VideoReader]) -> None:
-    """Refuse side videos whose size, frame rate or claimed number of frames is not the source's.
+    """Refuse opacity and map videos whose size, frame rate or stated number of frames is not the source's.
 
     Raises:
         InputError: With both values.
@@ -189,14 +189,14 @@ def check_formats(readers: Mapping[str, VideoReader]) -> None:
             raise InputError(DOING, str(reader.path), found, "give both at one size")
         if mine.frames and source.frames and mine.frames != source.frames:
             raise _lengths_differ(role, reader.path, f"{mine.frames} frames, the input {source.frames}")
-        several = (source.frames or 2) > 1  # the rate of a single frame means nothing
+        several = (source.frames or 2) > 1  # a single frame has no rate
         if several and mine.rate and source.rate and abs(mine.rate / source.rate - 1) > SAME_RATE:
             found = f"the {role} has {float(mine.rate):.3f} frames per second, the input {float(source.rate):.3f}"
             raise InputError(DOING, str(reader.path), found, "give both at one frame rate")
 
 
 def _joined(readers: Mapping[str, VideoReader], timing: list[TimedFrame]) -> Iterator[tuple[Frame, U8 | None]]:
-    """Yield the source's frames with opacity and map; their times are appended to ``timing``."""
+    """Yield the source's frames with opacity and map, and append their times to ``timing``."""
     roles = list(readers)
     starts: list[Fraction] = []
     for index, row in enumerate(zip_longest(*readers.values())):

@@ -10,7 +10,7 @@ def write_reports(root: Path, flips: bool = True) -> Path:
 
     Args:
         root: A run folder whose tables are written.
-        flips: Look for scene-seed cells with another outcome than their baseline's first; logs of others have none.
+        flips: Find cells whose outcome differs from their baseline's first; not for scored logs of others.
     """
     # Plotting libraries take a second to load, and a run needs them only now.
     from evaluators.report import write_junit, write_report, write_summary_md

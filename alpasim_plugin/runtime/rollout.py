@@ -26,21 +26,21 @@ def run_rollout(
     recorder: Recorder | None = None,
     controller: Controller | None = None,
 ) -> Recorder:
-    """Drive one scenario once and return what was recorded.
+    """Drive one scenario once and return its recorder.
 
-    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy already run; then the loop is closed.
+    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then the loop is closed.
 
     Args:
-        scenario: What is driven.
-        renderer: A session of this rollout's own; see `make_renderer`.
-        policy: Reads the frames and plans; see `make_policy`.
+        scenario: The scenario.
+        renderer: A session for this rollout alone; see `make_renderer`.
+        policy: Plans from the frames; see `make_policy`.
         seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.seeding`.
-        recorder: Receives everything; by default one that keeps it in memory.
-        controller: Vehicle model; by default what the policy asks for, else the bicycle with a tracker.
+        recorder: Records the rollout; by default into a temporary folder.
+        controller: Vehicle model; by default the policy's, else the bicycle with a tracker.
 
     Raises:
         PolicyError: The policy raised or broke its contract.
-        RendererError: The renderer raised or gave a frame of the wrong form.
+        RendererError: The renderer raised, or a frame does not match its request.
     """
     clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     recorder = recorder or Recorder(scenario, seed)
@@ -73,12 +73,12 @@ def run_rollout(
             began = time.perf_counter()
             with recorder.stage("policy"):
                 plan = checked_plan(policy, observation)
-            plan_world, *alternatives = state.to_world(plan)
+            plan_world, *samples = state.to_world(plan)
             plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
-            recorder.policy_plan(plan_world, alternatives)
-        before, in_force = state.ego, plans.active(tick.t_us)
+            recorder.policy_plan(plan_world, samples)
+        before, active = state.ego, plans.active(tick.t_us)
         with recorder.stage("control"):
-            forced = state.advance(controller, in_force, tick.t_us + clock.rates.control_us)
-        recorder.moved(before, in_force, state.ego, forced)
+            forced = state.advance(controller, active, tick.t_us + clock.rates.control_us)
+        recorder.control_step(before, active, state.ego, forced)
     recorder.finish()
     return recorder

@@ -1,4 +1,4 @@
-"""A whole run: plan, execute, tabulate, report; the same command continues where an interrupted one stopped."""
+"""A whole run: execute, tabulate, report. The same command continues an interrupted run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Progress(Protocol):
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to."""
+    """Result of a run."""
 
     root: Path
     summary: dict[str, Any]
@@ -49,7 +49,7 @@ class RunResult:
 
     @property
     def outcome(self) -> Outcome:
-        """Say what the run came to: rollouts that could not be run or scored; gates add criteria to this."""
+        """Give the outcome: failures of rollouts and of their scoring. Gates add criteria to it."""
         return outcome_of_failures(self.summary["failures"])
 
     @property
@@ -59,7 +59,7 @@ class RunResult:
 
 
 def default_folder(plan: RunPlan) -> Path:
-    """Return the folder a command writes to when none is named: the same command, the same folder."""
+    """Return the default run folder; it depends on the command alone."""
     first = next(iter(plan.scenarios))
     more = f"-and-{len(plan.scenarios) - 1}-more" if len(plan.scenarios) > 1 else ""
     return Path("runs", f"{slug(first)}{more}-{plan.command_key}")
@@ -103,7 +103,7 @@ def execute_run(
 
 
 def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, resume: bool) -> None:
-    """Write run.json, or check that the run in the folder is this one; parts that have changed since are written down anew."""
+    """Write run.json, or check that the folder holds this run; changed parts are written again."""
     path = root / "run.json"
     if path.exists():
         held = read_json(path)
@@ -120,7 +120,7 @@ def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, 
 
 
 def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads) -> None:
-    """Write ``run.json`` and what a report draws of the scenes."""
+    """Write ``run.json`` and the scene files of the report."""
     for scene_id, scenario in plan.scenarios.items():
         write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scenario))
     refs = {cell.scene: cell.ref for cell in plan.cells}

@@ -13,7 +13,7 @@ from alpasim_plugin.types import F64, Actor, LaneMap, Scenario, Scene, Trajector
 
 @dataclass(frozen=True)
 class LoggedScene:
-    """A scene that logs are scored against: what evaluators see, and what a report says of it."""
+    """A scene that logs are scored against, with the facts that a report shows."""
 
     scene: Scene
     source: str

@@ -16,7 +16,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.plan import slug
-from alpasim_plugin.runtime.scoring import contacts_of, tabulated
+from alpasim_plugin.runtime.scoring import contacts_of, tabulate
 from alpasim_plugin.runtime.store import steps_schema, write_table
 from alpasim_plugin.types import RolloutLog
 from evaluators import reduce_rollout, score
@@ -30,14 +30,14 @@ SKIPPED = "<skip>"
 
 @dataclass(frozen=True)
 class LogScore:
-    """What became of one log."""
+    """Result of one log."""
 
     manifest: dict[str, Any]
-    scored: ScoredRollout | None  # None where the log could not be scored
+    scored: ScoredRollout | None  # None if the log could not be scored
 
 
 def find_logs(items: Sequence[str]) -> list[Path]:
-    """Return the logs meant by files, folders (searched to any depth for ``*.asl``) and glob patterns, each once, sorted per item.
+    """Return the logs of files, folders (searched to any depth for ``*.asl``) and glob patterns, each once, sorted per item.
 
     Raises:
         InputError: An item names no log.
@@ -67,7 +67,7 @@ def score_logs(
 ) -> list[LogScore]:
     """Score every log against its scene and write its steps and manifest.
 
-    A log that cannot be read, ended before its time, or could not be scored becomes a failed row; the others are scored all the same.
+    A log that cannot be read, is incomplete or cannot be scored becomes a failed row; the others are still scored.
 
     Raises:
         InputError: A log of a scene that is not among the given ones, or a scene that cannot be read.
@@ -88,7 +88,7 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
     name = log.resolve().parent.name
     manifest: dict[str, Any] = {
         "renderer": UNKNOWN, "policy": UNKNOWN, "scene": UNKNOWN, "seed": 0, "rollout": name, "log": str(log), "preset": preset.name,
-        "reused": True,  # nothing was rendered: no frame of this table belongs to the speed of anything
+        "reused": True,  # nothing was rendered, so these rows have no speed
     }  # fmt: skip
     try:
         rollout = read_asl(log)
@@ -105,11 +105,11 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
         "steps": _steps(rollout),
         "warnings": list(rollout.warnings),
     }
-    known = scenes.of(rollout.scene_id)  # a wrong --scene is the command's fault, not the log's
+    known = scenes.of(rollout.scene_id)  # a wrong --scene is an error of the command, not of the log
     try:
-        check_whole(log, rollout)
+        check_complete(log, rollout)
         series = tuple(score(rollout, known.scene, preset, evaluators))
-        one = tabulated(rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset))
+        one = tabulate(rollout, series, reduce_rollout(series, preset), contacts=contacts_of(rollout, preset))
     except SimrunError as error:
         return _failed(manifest, error, root, taken)
     manifest |= {"status": "ok", "metrics": one.metrics, "events": one.events, "censored": one.censored}
@@ -120,11 +120,11 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
     return LogScore(manifest, ScoredRollout(rollout.scene_id, name, series, run_uuid, run_name))
 
 
-def check_whole(log: Path, rollout: RolloutLog) -> None:
-    """Refuse the log of a rollout that did not come to its end.
+def check_complete(log: Path, rollout: RolloutLog) -> None:
+    """Refuse the log of a rollout that did not finish.
 
-    The end is the announced number of control steps after the first policy time, or as far as the recording goes. A rollout that the
-    driver ended itself is whole.
+    A finished rollout has the number of control steps in its header after the first policy time, or covers the recording. A rollout that
+    the driver terminated is finished.
 
     Raises:
         InfrastructureError: The log ends earlier.
@@ -138,7 +138,7 @@ def check_whole(log: Path, rollout: RolloutLog) -> None:
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
         raise InfrastructureError(
             "scoring a log", str(log), f"the rollout ended after {done} of {steps} control steps{cut}",
-            "run this rollout again: what it would have done after that is unknown",
+            "run this rollout again",
         )  # fmt: skip
 
 
@@ -153,7 +153,7 @@ def run_names(log: Path) -> tuple[str | None, str | None]:
     """Return uuid and name of the run that a log belongs to, of the ``run_metadata.yaml`` in the nearest folder above it.
 
     Raises:
-        InputError: The file is there, but broken.
+        InputError: The file is invalid.
     """
     for folder in list(log.resolve().parents)[:5]:
         path = folder / "run_metadata.yaml"

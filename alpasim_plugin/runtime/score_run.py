@@ -10,10 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
-from alpasim_plugin.atomic import write_bytes, write_json
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.parts import PartSpec, digest
 from alpasim_plugin.runtime.execute import Threads
@@ -24,7 +21,7 @@ from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.run import SCHEMA_VERSION
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
-from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.runtime.store import read_json, write_parquet
 from alpasim_plugin.runtime.tables import write_tables
 from evaluators.aggregate.reduce import RolloutValue
 from evaluators.alpasim import (
@@ -45,7 +42,7 @@ AGGREGATE = "aggregate"
 
 @dataclass(frozen=True)
 class ScoreResult:
-    """What scoring came to; the process exit code and what is printed come from here."""
+    """Result of scoring: the run folder, its summary and the process exit code."""
 
     root: Path
     summary: dict[str, Any]
@@ -66,9 +63,9 @@ def execute_score(
 
     Args:
         logs: The logs.
-        scenes: Where their scenes are.
-        preset: How to score.
-        settings: AlpaSim's settings; None where the preset is not AlpaSim's.
+        scenes: Their scenes.
+        preset: Evaluator preset.
+        settings: AlpaSim's settings; None for other presets.
         evaluators: From `evaluators.resolve_evaluators`.
         root: Run folder; None makes one below ``runs/`` named after content and preset.
         command: The command line, for run.json.
@@ -126,8 +123,8 @@ def _aggregate(
         if reduced and not skipped:
             own = [one.of for one in reduced]
             sweeps = over_sweeps(reduced)
-            _write_parquet(root / AGGREGATE / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
-            _write_parquet(root / AGGREGATE / "metrics_results.parquet", metrics_results_table(sweeps, own))
+            write_parquet(root / AGGREGATE / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
+            write_parquet(root / AGGREGATE / "metrics_results.parquet", metrics_results_table(sweeps, own))
             written += ["metrics_unprocessed.parquet", "metrics_results.parquet"]
             if error is None:
                 rows = [_failure(m, own[0].run_name) for m in failed]
@@ -193,9 +190,3 @@ def _hash(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise InputError("scoring logs", str(path), f"cannot open: {error.strerror}", "check the path") from error
-
-
-def _write_parquet(path: Path, table: pa.Table) -> None:
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
-    write_bytes(path, sink.getvalue().to_pybytes())

@@ -1,4 +1,4 @@
-"""Score one rollout from its log file and flatten the result for the tables."""
+"""Score one rollout from its log and flatten the result for the tables."""
 
 from __future__ import annotations
 
@@ -16,58 +16,58 @@ from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
 
-# Of a fixer that predicts: the camera's distance between the frame handed out and the truth, and between forecast and truth.
+# Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
 FIXER_FACTS = ("pose_error_m", "forecast_error_m")
 
 
 @dataclass(frozen=True)
-class Scored:
-    """What a log came to."""
+class TabulatedScores:
+    """Scores of one rollout, as rows and JSON."""
 
-    steps: list[dict[str, Any]]  # rows of steps.parquet less the rollout's key
+    steps: list[dict[str, Any]]  # rows of steps.parquet without the rollout's key
     metrics: dict[str, dict[str, Any]]  # metric -> value, valid, reason, unit, direction
     events: list[dict[str, Any]]  # first scored collision and off-road: metric, t_us, x_m, y_m
-    censored: dict[str, Any]  # how many steps which rule removed
-    contacts: list[dict[str, Any]]  # where contact is searched between steps, each beginning: actor_id, t_s, side, x_m, y_m (rig frame)
+    censored: dict[str, Any]  # number of steps that each rule removed
+    contacts: list[dict[str, Any]]  # contact onsets, if contact is searched between steps: actor_id, t_s, side, x_m, y_m (rig frame)
 
 
-def score_log(log: Path, frames: Path, scenario: Scenario, preset: str, evaluators: Sequence[PartSpec] | None = None) -> Scored:
-    """Read a log back and score it, so that what is tabulated is what any reader of the log would find.
+def score_log(log: Path, frames: Path, scenario: Scenario, preset: str, evaluators: Sequence[PartSpec] | None = None) -> TabulatedScores:
+    """Read a log and score it; the scores depend on the written log alone.
 
     Raises:
-        EvaluatorError: An evaluator could not give a value where one is due.
+        EvaluatorError: An evaluator could not compute a required value.
     """
     rollout = read_asl(log)
     series = score(rollout, scenario.scene, preset, evaluators)
-    return tabulated(rollout, series, reduce_rollout(series, preset), read_facts(frames), contacts_of(rollout, preset))
+    return tabulate(rollout, series, reduce_rollout(series, preset), read_facts(frames), contacts_of(rollout, preset))
 
 
-def tabulated(
+def tabulate(
     rollout: RolloutLog,
     series: Sequence[MetricSeries],
     reduction: Reduction,
     frames: Sequence[Mapping[str, Any]] = (),
     contacts: Sequence[ContactEvent] = (),
-) -> Scored:
+) -> TabulatedScores:
     """Flatten a scored rollout for the tables.
 
     Args:
         rollout: The log.
-        series: What `evaluators.score` gave.
-        reduction: What it was reduced to.
-        frames: Facts per camera frame, where the renderer's are known.
-        contacts: What `contacts_of` gave.
+        series: Result of `evaluators.score`.
+        reduction: Their reduction.
+        frames: Facts per camera frame, if known.
+        contacts: Result of `contacts_of`.
     """
     rows = [row for one in series for row in _rows(one)]
     rows += _state_rows(rollout)
     rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in frames]
     rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in frames if name in f]
     begun = [one.as_dict() for one in contacts]
-    return Scored(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict(), begun)
+    return TabulatedScores(rows, reduction.as_dict(), _placed(rollout, reduction), reduction.ledger.as_dict(), begun)
 
 
 def contacts_of(rollout: RolloutLog, preset: str | Preset) -> tuple[ContactEvent, ...]:
-    """Return who touched the ego when and where, if the preset searches contact between steps; else nothing."""
+    """Return the contact onsets of the ego if the preset searches contact between steps; else none."""
     chosen = find_preset(preset)
     return contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
 
@@ -85,7 +85,7 @@ def _row(t_us: int, metric: str, value: Any, why_missing: str = "") -> dict[str,
 
 
 def _state_rows(rollout: RolloutLog) -> list[dict[str, Any]]:
-    """Return where the ego was: not metrics, but what plots and stratified results need."""
+    """Return rows of the ego's state, for plots and stratified results."""
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
     state: Mapping[str, F64] = {
         "ego_x_m": rig.xyz[:, 0],
@@ -104,7 +104,7 @@ def _offset(path: F64, at: F64) -> float | None:
     """Return the signed distance from the logged path, left positive; None before its start and past its end."""
     moved = np.flatnonzero(np.linalg.norm(path[:, :2] - path[0, :2], axis=1) > 0.5)
     if not moved.size:
-        return None  # the recorded car stood still: there is no path to be beside of
+        return None  # the recorded car stands still: there is no path
     first = path[moved[0], :2] - path[0, :2]
     back = np.flatnonzero(np.linalg.norm(path[:, :2] - path[-1, :2], axis=1) > 0.5)[-1]
     last = path[-1, :2] - path[back, :2]
@@ -124,7 +124,7 @@ def _speeds(t_us: I64, xyz: F64) -> F64:
 
 
 def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
-    """Return the events with the place of the ego's box centre when they happened."""
+    """Return the events with the position of the ego's box centre."""
     placed = []
     for event in reduction.events:
         at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]

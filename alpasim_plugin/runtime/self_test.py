@@ -1,4 +1,4 @@
-"""The gate's self-test: drive deliberately broken renderers in closed loop, and see whether the gate catches each."""
+"""The gate's self-test: drive deliberately broken renderers in closed loop and check that the gate catches each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from evaluators.report.run_folder import read_run
 from scenarios.suite import load_suite
 
 SUITE = "suites/gate_self_test"
-POLICY = "lane-camera"  # the only shipped policy that drives by what it sees
+POLICY = "lane-camera"  # the shipped policy that drives from camera frames
 REFERENCE = "clean"
 CONTROL = "clean, other noise"
 SEED, OTHER_SEED = 0, 1
@@ -25,7 +25,7 @@ SEED, OTHER_SEED = 0, 1
 
 @dataclass(frozen=True)
 class Trial:
-    """What the gate said about one renderer, and what it should have said."""
+    """The gate's verdict on one renderer, and whether it is right."""
 
     renderer: str
     is_broken: bool
@@ -33,7 +33,7 @@ class Trial:
 
     @property
     def is_right(self) -> bool:
-        """Tell whether a broken renderer is caught, or the healthy control is not called worse."""
+        """Return whether a broken renderer is caught, or the control is not called worse."""
         return (self.verdict.outcome.cause == "regression") == self.is_broken
 
     @property
@@ -49,7 +49,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """All trials and the outcome that follows."""
+    """All trials and their outcome."""
 
     trials: tuple[Trial, ...]
     outcome: Outcome
@@ -64,15 +64,15 @@ def broken_renderers() -> list[str]:
 def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequence[str], progress: Callable[[], Progress]) -> SelfTest:
     """Drive the suite behind the reference and every broken renderer and judge each pair by the gate.
 
-    The gate's rules are taken as they are, except what ties it to one run: the reference is `REFERENCE`, and no more scenes are asked for
-    than the suite has. As a control the reference meets itself under another seed: a gate that fails everything fails its test.
+    The gate's rules apply unchanged, except that the reference is `REFERENCE` and that ``min_scenes`` is at most the suite's size. As a
+    control the reference is compared with itself under another seed: a gate that fails everything fails its test.
 
     Args:
         spec: The gate under test.
         root: Run folder; finished rollouts in it are reused.
         workers: As for a run.
         command: Written to run.json.
-        progress: Makes what shows the drives, once for each of the two runs.
+        progress: Creates a progress display, once for each of the two runs.
     """
     broken = broken_renderers()
     options = RunOptions(preset=spec.preset or "paper", baseline=REFERENCE)
@@ -81,7 +81,7 @@ def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequ
     runs = [(plan, root), (control, root / "control")]
     results = [execute_run(one, folder, workers, command, progress(), certificate="none") for one, folder in runs]
     rows = rows_of_run(read_run(root))
-    # The other seed's rollouts take the first one's place, so that they are paired with it.
+    # The rollouts of the other seed get the first seed, so that they are paired with its rollouts.
     again = [{**row, "renderer": CONTROL, "seed": SEED} for row in rows_of_run(read_run(root / "control"))]
     trials = [Trial(name, True, _judge(spec, rows, name, len(plan.scenarios))) for name in broken]
     trials.append(Trial(CONTROL, False, _judge(spec, [*rows, *again], CONTROL, len(plan.scenarios))))
@@ -89,7 +89,7 @@ def run_self_test(spec: GateSpec, root: Path, workers: int | None, command: Sequ
     if failed.cause != "pass":
         return SelfTest(tuple(trials), failed, root)
     wrong = [trial for trial in trials if not trial.is_right]
-    reasons = tuple(f"{t.renderer} is {'not caught' if t.is_broken else 'called worse, and it is not'}" for t in wrong)
+    reasons = tuple(f"{t.renderer} is {'not caught' if t.is_broken else 'wrongly called worse'}" for t in wrong)
     return SelfTest(tuple(trials), Outcome("regression" if wrong else "pass", reasons), root)
 
 

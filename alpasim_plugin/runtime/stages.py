@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 
 class StageTimes:
-    """Collects durations by stage name; the first call of each stage is kept apart because it may compile or load."""
+    """Collects durations by stage name."""
 
     def __init__(self) -> None:
         self.durations_s: dict[str, list[float]] = defaultdict(list)
@@ -20,8 +20,8 @@ class StageTimes:
 
         Args:
             stage: Its name.
-            shares: The pass counts as so many equal ones (frames of a block); 0 counts nothing.
-            within: Tells afterwards what parts of the pass, in milliseconds, belong to stages of their own.
+            shares: Number of equal passes it counts as (frames of a block); 0 records nothing.
+            within: Called after the pass; returns the parts of it, in milliseconds, that belong to other stages.
         """
         began = time.perf_counter()
         try:

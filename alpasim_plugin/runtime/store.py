@@ -31,8 +31,13 @@ def read_json(path: Path) -> Any:
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
     """Write rows as parquet atomically, in the order given."""
     columns = {field.name: pa.array([row.get(field.name) for row in rows], type=field.type) for field in schema}
+    write_parquet(path, pa.table(columns, schema=schema))
+
+
+def write_parquet(path: Path, table: pa.Table) -> None:
+    """Write a table as parquet atomically, compressed with zstd."""
     sink = pa.BufferOutputStream()
-    pq.write_table(pa.table(columns, schema=schema), sink, compression="zstd")
+    pq.write_table(table, sink, compression="zstd")
     write_bytes(path, sink.getvalue().to_pybytes())
 
 

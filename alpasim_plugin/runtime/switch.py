@@ -1,7 +1,7 @@
-"""Parts that change over at an instant: until then the first of two is in force while the second one looks on, from then on the second.
+"""Parts that switch at an instant: the first is active before it, the second from it on.
 
-The second part sees everything that the first one saw, so that it has a history when its turn comes: a renderer has rendered every
-request, a policy has answered every question. What it answered before its turn is not used.
+Before the instant the second part runs with the same inputs, so that it has the same history: its renderer renders every request, its
+policy gets every query. Its outputs before the instant are discarded.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class SwitchedRenderer(Renderer):
     """Render with ``first`` before ``at_us`` and with ``then`` from it on.
 
     Raises:
-        InputError: One of them renders in blocks of frames and the other does not, or in other blocks.
+        InputError: Their block rules differ.
     """
 
     def __init__(self, first: Renderer, then: Renderer, at_us: int) -> None:
@@ -37,9 +37,9 @@ class SwitchedRenderer(Renderer):
         self.block = first.block
         if first.block != then.block:
             raise InputError(
-                "changing over to another renderer",
+                "switching to another renderer",
                 f"{first.block or 'frames one by one'} and {then.block or 'frames one by one'}",
-                "the policy is asked at other times under each of them",
+                "the two have different query times of the policy",
                 "choose the mode 'speculative' for both",
             )
         self.lookahead = max(first.lookahead, then.lookahead)
@@ -49,7 +49,7 @@ class SwitchedRenderer(Renderer):
         return self.render_batch([request])[0]
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> Sequence[Frame]:
-        """Render the frames of an instant or of a block; a block belongs to the part in whose time it ends."""
+        """Render the frames of an instant or of a block; the end of a block decides which part renders it."""
         early = max(request.t_us for request in requests) < self.at_us
         used = self.first if early else self.then
         frames = used.render_batch(requests)
@@ -59,33 +59,33 @@ class SwitchedRenderer(Renderer):
         return frames
 
     def facts(self) -> dict[str, Any]:
-        """Return what the fixer of the part that took over, or else of the first, has to say."""
+        """Return the fixer facts of the second part, or of the first if the second has none."""
         return dict(self.then.facts() or self.first.facts())
 
 
 class SwitchedPolicy(Policy):
-    """Answer with ``first`` before ``at_us`` and with ``then`` from it on.
+    """Plan with ``first`` before ``at_us`` and with ``then`` from it on.
 
     Args:
         first: Reset with the rollout's seed.
         then: Reset with ``then_seed``.
-        at_us: When to change over.
+        at_us: When to switch.
         then_seed: Seed of the second policy.
         camera_us: The scenario's camera period.
     """
 
     def __init__(self, first: Policy, then: Policy, at_us: int, then_seed: int, camera_us: int) -> None:
         self.first, self.then, self.at_us, self.then_seed = first, then, at_us, then_seed
-        self.sensors: Sequence[SensorSpec] = joined_sensors(first.sensors, then.sensors, camera_us)
+        self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, camera_us)
 
     def reset(self, seed: int, route: Route) -> None:
-        """Start both."""
+        """Reset both."""
         self.first.reset(seed, route)
         if self.then is not self.first:
             self.then.reset(self.then_seed, route)
 
     def act(self, observation: Observation) -> Plan:
-        """Return the plan of the policy in force."""
+        """Return the plan of the active policy."""
         early = observation.t_us < self.at_us
         plan = (self.first if early else self.then).act(observation)
         if early and self.then is not self.first:
@@ -94,7 +94,7 @@ class SwitchedPolicy(Policy):
 
 
 class SwitchedController(Controller):
-    """Drive with ``first`` before ``at_us`` and with ``then`` from it on. Controllers are pure: there is no history to keep."""
+    """Drive with ``first`` before ``at_us`` and with ``then`` from it on. Controllers have no state."""
 
     def __init__(self, first: Controller, then: Controller, at_us: int) -> None:
         self.first, self.then, self.at_us = first, then, at_us
@@ -104,13 +104,13 @@ class SwitchedController(Controller):
         return (self.first if state.t_us < self.at_us else self.then).advance(state, plan, to_us)
 
 
-def joined_sensors(first: Sequence[SensorSpec], then: Sequence[SensorSpec], camera_us: int) -> tuple[SensorSpec, ...]:
-    """Return the cameras of two policies; one that both take comes at the shorter of its periods.
+def merge_sensors(first: Sequence[SensorSpec], then: Sequence[SensorSpec], camera_us: int) -> tuple[SensorSpec, ...]:
+    """Return the cameras of two policies; a camera of both has the shorter of its periods.
 
     Args:
         first: Cameras of one.
         then: Cameras of the other.
-        camera_us: The scenario's period, for which a sensor's 0 stands.
+        camera_us: The scenario's camera period, meant by a sensor's interval of 0.
     """
     joined = {sensor.camera: sensor for sensor in first}
     for sensor in then:

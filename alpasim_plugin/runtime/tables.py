@@ -10,16 +10,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.atomic import write_bytes, write_json
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
-from alpasim_plugin.runtime.store import read_json, rollouts_schema, steps_schema, write_table
+from alpasim_plugin.runtime.store import read_json, rollouts_schema, steps_schema, write_parquet, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 
 
 def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one flat row per rollout: its key, its fate, and every metric with its validity."""
+    """Return one flat row per rollout: its key, its status, and every metric with its validity."""
     rows = []
     for manifest in manifests:
         error = manifest.get("error") or {}
@@ -47,9 +47,7 @@ def write_tables(
     of_logs = any("rollout" in row for row in rows)
     write_table(root / "rollouts.parquet", rows, rollouts_schema(metrics, of_logs))
     parts = [pq.read_table(root / m["path"] / "steps.parquet") for m in manifests if m["status"] == "ok"]
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.concat_tables(parts) if parts else steps_schema(of_logs).empty_table(), sink, compression="zstd")
-    write_bytes(root / "steps.parquet", sink.getvalue().to_pybytes())
+    write_parquet(root / "steps.parquet", pa.concat_tables(parts) if parts else steps_schema(of_logs).empty_table())
     summary = {
         "preset": preset,
         "metrics": _by_policy(rows, aggregate),
@@ -89,8 +87,8 @@ def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
 
-    A frame's time is the sum of all stages of the loop between two frames; frames made together share their time evenly. The first
-    frames of each rollout (all that its first call made) are kept apart: that call may compile or fill caches.
+    A frame's time is the sum of all stages of the loop between two frames; the time of a block is divided evenly among its frames.
+    The frames of each rollout's first call are kept apart: that call may compile or fill caches.
     """
     stages: dict[str, list[float]] = {}
     first, per_frame = [], []
@@ -98,7 +96,7 @@ def speed(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
         frames, opening = max(int(manifest["frames"]), 1), max(int(manifest.get("first_call_frames", 1)), 1)
         total = np.zeros(frames)
         for stage, durations in manifest["stage_ms"].items():
-            total += spread(durations, frames)
+            total += resample_durations(durations, frames)
             stages.setdefault(stage, []).extend(durations[opening if len(durations) == frames else 1 :])
         first.append(float(total[:opening].sum()))
         per_frame.extend(total[opening:].tolist())
@@ -127,11 +125,11 @@ def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, 
     }
 
 
-def spread(durations: Sequence[float], frames: int) -> F64:
-    """Share out the durations of a stage that runs more or less often than frames come, evenly and in order.
+def resample_durations(durations: Sequence[float], frames: int) -> F64:
+    """Distribute the durations of a stage over frames, evenly and in order; the sum is kept.
 
     Example:
-        >>> spread([2.0, 4.0], 4), spread([1.0, 1.0, 3.0, 3.0], 2)
+        >>> resample_durations([2.0, 4.0], 4), resample_durations([1.0, 1.0, 3.0, 3.0], 2)
         (array([1., 1., 2., 2.]), array([2., 6.]))
     """
     done = np.concatenate([[0.0], np.cumsum(durations)])
@@ -139,7 +137,7 @@ def spread(durations: Sequence[float], frames: int) -> F64:
 
 
 def _pool(root: Path, manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float) -> dict[str, Any]:
-    """Return the throughput of all workers together, start-up included; a run that only reused rollouts keeps the figures it had."""
+    """Return the throughput of all workers together, start-up included; a run that only reused rollouts keeps its earlier figures."""
     fresh = [m for m in manifests if not m.get("reused")]
     before = root / "summary.json"
     if not fresh and before.exists():

@@ -56,7 +56,7 @@ def _entry(side: RendererRows, metric: str) -> dict[str, Any]:
         "direction": facts.direction,
     }
     if n == 0:
-        return entry | {"reason": "no rollout was run to its end" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
+        return entry | {"reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
     entry["mean"] = float(np.mean(values))
     entry["ci95"], why = normal_half_width(values)
     if why:

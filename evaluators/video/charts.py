@@ -27,13 +27,13 @@ def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
     metrics = [m for m in FACTS if any(m in windows for windows in by_frame.values())]
     figure, panels = _panels(len(metrics))
     for ax, metric in zip(panels, metrics, strict=True):
-        for arm, colour, dash in _styles(summary):
-            windows = by_frame[arm].get(metric)
+        for variant, colour, dash in _styles(summary):
+            windows = by_frame[variant].get(metric)
             if windows is None:
                 continue
             x = [(a + b) / 2 for a, b in zip(windows["first"], windows["last"], strict=True)]
-            ax.plot(x, windows["mean"], color=colour, linestyle=dash, label=arm, linewidth=1.6)
-            if summary["clips"][arm] >= LEAST_BANDED:
+            ax.plot(x, windows["mean"], color=colour, linestyle=dash, label=variant, linewidth=1.6)
+            if summary["clips"][variant] >= LEAST_BANDED:
                 ax.fill_between(x, windows["low"], windows["high"], color=colour, alpha=0.13, linewidth=0)
         ax.set_xlabel("frame")
         _finish(ax, metric)
@@ -42,28 +42,28 @@ def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
 
 
 def plot_speed(summary: Mapping[str, Any], path: str | Path) -> None:
-    """Draw every metric's mean against the fixer's time per frame and write a PNG; arms without a fixer are lines.
+    """Draw every metric's mean against the fixer's time per frame and write a PNG; variants without a fixer are lines.
 
-    Bars are 95 % intervals: of the time, and of the difference from the baseline, clip by clip, which is what arms are compared by.
+    Bars are 95 % intervals: of the time, and of the difference from the baseline, clip by clip, which is what variants are compared by.
     """
-    arms, paired, baseline = summary["arms"], summary["paired"], summary["baseline"]
-    metrics = [m for m in (PSNR, SSIM, "perceptual-syn", "lpips_alex", WARP) if any(m in values for values in arms.values())]
+    variants, paired, baseline = summary["arms"], summary["paired"], summary["baseline"]
+    metrics = [m for m in (PSNR, SSIM, "perceptual-syn", "lpips_alex", WARP) if any(m in values for values in variants.values())]
     figure, panels = _panels(len(metrics))
-    timed = [values[MS]["mean"] for values in arms.values() if MS in values]
+    timed = [values[MS]["mean"] for values in variants.values() if MS in values]
     for ax, metric in zip(panels, metrics, strict=True):
-        for i, (arm, colour, dash) in enumerate(_styles(summary)):
-            entry = arms[arm].get(metric)
+        for i, (variant, colour, dash) in enumerate(_styles(summary)):
+            entry = variants[variant].get(metric)
             if entry is None:
                 continue
-            if MS not in arms[arm]:
-                ax.axhline(entry["mean"], color=colour, linestyle=dash, label=f"{arm} (no fixer)", linewidth=1.4)
+            if MS not in variants[variant]:
+                ax.axhline(entry["mean"], color=colour, linestyle=dash, label=f"{variant} (no fixer)", linewidth=1.4)
                 continue
-            x, y = arms[arm][MS], entry
+            x, y = variants[variant][MS], entry
             marker = MARKERS[i % len(MARKERS)]
-            pair = paired.get(arm, {}).get(metric)
+            pair = paired.get(variant, {}).get(metric)
             reach = None if pair is None else _reach(pair["diff"], pair["ci95"])
             times = _reach(x["mean"], x["ci95"])
-            ax.errorbar(x["mean"], y["mean"], xerr=times, yerr=reach, fmt=marker, color=colour, label=arm, capsize=2)
+            ax.errorbar(x["mean"], y["mean"], xerr=times, yerr=reach, fmt=marker, color=colour, label=variant, capsize=2)
         ax.set_xlabel(f"fixer, ms per frame (bars: 95 % of the difference from {baseline})", fontsize=9)
         if timed and max(timed) > 4 * max(min(timed), 1e-3):
             ax.set_xscale("log")
@@ -82,14 +82,14 @@ def _reach(centre: float, bounds: list[float] | None) -> list[list[float]] | Non
 
 
 def _styles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Return arm, colour and dashes: grey for what no fixer made."""
+    """Return variant, colour and dashes: grey for what no fixer made."""
     out, used = [], 0
-    for arm, values in summary["arms"].items():
+    for variant, values in summary["arms"].items():
         if MS in values:
-            out.append((arm, f"C{used % 10}", "-"))
+            out.append((variant, f"C{used % 10}", "-"))
             used += 1
         else:
-            out.append((arm, "0.65" if arm == TRUTH else "0.25", ":" if arm == TRUTH else "--"))
+            out.append((variant, "0.65" if variant == TRUTH else "0.25", ":" if variant == TRUTH else "--"))
     return out
 
 

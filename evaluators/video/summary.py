@@ -1,6 +1,6 @@
 """From clips to a table: means with t intervals over clips, paired differences, quality by frame index, speed.
 
-A row is one clip under one arm: ``arm``, ``clip``, ``seed``, ``values`` (metric -> number), ``series`` (metric -> per frame),
+A row is one clip under one variant: ``arm``, ``clip``, ``seed``, ``values`` (metric -> number), ``series`` (metric -> per frame),
 ``ms_per_frame`` (of later blocks; absent where no fixer ran), ``identical``, ``events``.
 """
 
@@ -19,7 +19,7 @@ from evaluators.aggregate.rows import by_renderer
 from evaluators.video.facts import FACTS, MS, WARP
 
 Row = Mapping[str, Any]
-TRUTH = "truth"  # the arm of the ground-truth frames: only metrics without a reference are measured on it
+TRUTH = "truth"  # the variant of the ground-truth frames: only metrics without a reference are measured on it
 BINS = 20  # windows of frames
 LEAST_BIN = 5  # frames
 
@@ -28,32 +28,33 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
     """Summarise clips.
 
     Args:
-        rows: As above; every arm should have every clip.
-        baseline: Arm that the others are compared with, clip by clip.
+        rows: As above; every variant should have every clip.
+        baseline: Variant that the others are compared with, clip by clip.
 
     Returns:
-        ``arms``: ARM -> METRIC -> ``mean``, ``ci95`` ([low, high], t over clips, or None with ``reason``), ``n``, ``unit``, ``direction``;
-        ``paired``: ARM -> METRIC -> what `evaluators.aggregate.paired.compare` gives;
-        ``by_frame``: ARM -> METRIC -> ``first`` and ``last`` frame of each window, ``mean``, ``low``, ``high`` over clips;
-        ``identical``, ``events``, ``frames``, ``clips``: by arm.
+        ``arms``: VARIANT -> METRIC -> ``mean``, ``ci95`` ([low, high], t over clips, or None with ``reason``), ``n``, ``unit`` and
+        ``direction``;
+        ``paired``: VARIANT -> METRIC -> what `evaluators.aggregate.paired.compare` gives;
+        ``by_frame``: VARIANT -> METRIC -> ``first`` and ``last`` frame of each window, ``mean``, ``low``, ``high`` over clips;
+        ``identical``, ``events``, ``frames``, ``clips``: by variant.
 
     Raises:
         EvaluatorError: No row, or none of the baseline.
     """
     names = list(dict.fromkeys(str(row["arm"]) for row in rows))
     if baseline not in names:
-        found = f"arms {', '.join(names) or 'none'}"
-        raise EvaluatorError("summarising clips", f"baseline {baseline!r}", found, "name one of the arms as the baseline")
-    by_arm = {name: [row for row in rows if row["arm"] == name] for name in names}
+        found = f"variants {', '.join(names) or 'none'}"
+        raise EvaluatorError("summarising clips", f"baseline {baseline!r}", found, "name one of the variants as the baseline")
+    by_variant = {name: [row for row in rows if row["arm"] == name] for name in names}
     return {
         "baseline": baseline,
-        "arms": {name: {m: _mean(mine, m) for m in metrics_of(mine)} for name, mine in by_arm.items()},
+        "arms": {name: {m: _mean(mine, m) for m in metrics_of(mine)} for name, mine in by_variant.items()},
         "paired": _paired(rows, baseline),
-        "by_frame": {name: {m: _windows(mine, m) for m in mine[0]["series"]} for name, mine in by_arm.items()},
-        "clips": {name: len(mine) for name, mine in by_arm.items()},
-        "frames": {name: sorted({int(row["frames"]) for row in mine}) for name, mine in by_arm.items()},
-        "identical": {name: sum(int(row["identical"]) for row in mine) for name, mine in by_arm.items()},
-        "events": {name: _events(mine) for name, mine in by_arm.items()},
+        "by_frame": {name: {m: _windows(mine, m) for m in mine[0]["series"]} for name, mine in by_variant.items()},
+        "clips": {name: len(mine) for name, mine in by_variant.items()},
+        "frames": {name: sorted({int(row["frames"]) for row in mine}) for name, mine in by_variant.items()},
+        "identical": {name: sum(int(row["identical"]) for row in mine) for name, mine in by_variant.items()},
+        "events": {name: _events(mine) for name, mine in by_variant.items()},
     }
 
 

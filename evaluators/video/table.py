@@ -20,11 +20,11 @@ def markdown(summary: Mapping[str, Any]) -> str:
 
     Cells are mean and half-width of the 95 % t interval over clips. A difference in bold is one that the paired test shows.
     """
-    arms, paired = summary["arms"], summary["paired"]
-    shown = [m for m in FACTS if any(m in values for values in arms.values())]
-    head = ["arm", *(f"{TITLES.get(m, m)} {ARROWS[FACTS[m].direction]}" for m in shown), "clips x frames"]
+    variants, paired = summary["arms"], summary["paired"]
+    shown = [m for m in FACTS if any(m in values for values in variants.values())]
+    head = ["variant", *(f"{TITLES.get(m, m)} {ARROWS[FACTS[m].direction]}" for m in shown), "clips x frames"]
     rows = []
-    for name, values in arms.items():
+    for name, values in variants.items():
         lengths = summary["frames"][name]
         frames = str(lengths[0]) if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]}"
         rows.append([name, *(_mean(m, values.get(m)) for m in shown), f"{summary['clips'][name]} x {frames}"])

@@ -20,7 +20,7 @@ def test_the_verbs_report_what_they_did(tmp_path: Path, capsys: pytest.CaptureFi
     plan = make_plan(expand("smoke/lead_car", SHORT), ("clean",), ("lane-camera",), (0,), RunOptions())
     execute_run(plan, root, 1, ["simrun"], Heard(), certificate="none")
     assert run_command(["fork", str(root), "--cell", CELL, "--at", "0.6", "--out", str(tmp_path / "fork")]) == 0
-    assert "continuation      equal to the log, to the bit" in capsys.readouterr().out
+    assert "continuation      equal to the log, bit for bit" in capsys.readouterr().out
     asked = ["--renderers", "clean,broken-frozen", "--out", str(tmp_path / "p"), "--json"]
     assert run_command(["probe", str(root), "--cell", CELL, *asked]) == 0
     assert json.loads(capsys.readouterr().out)["probe"]["along"] == CELL

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.cli.quality import Work, finish, identity, parse_arms, shown_frames
+from alpasim_plugin.cli.quality import Work, finish, identity, parse_variants, shown_frames
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -50,15 +50,16 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
     command = ["bench", "quality", str(data), "--fixer", f"3dgs,identity,small={bundle}", "--pictures", "1", "--out", str(out)]
     assert run_command([*command, "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    arms = summary["arms"]
-    assert list(arms) == ["3dgs", "identity", "small", "truth"]
-    assert list(arms["truth"]) == ["warp_l1", "warp_l1_late"]
+    variants = summary["arms"]
+    assert list(variants) == ["3dgs", "identity", "small", "truth"]
+    assert list(variants["truth"]) == ["warp_l1", "warp_l1_late"]
     for metric in ("psnr_db", "ssim", "perceptual-syn", "warp_l1"):
-        assert arms["identity"][metric] == arms["3dgs"][metric]
+        assert variants["identity"][metric] == variants["3dgs"][metric]
         assert summary["paired"]["identity"][metric]["diff"] == 0.0
-        assert summary["paired"]["small"][metric]["diff"] == pytest.approx(arms["small"][metric]["mean"] - arms["3dgs"][metric]["mean"])
-    assert "ms_per_frame" in arms["small"]
-    assert "ms_per_frame" not in arms["3dgs"]
+        difference = variants["small"][metric]["mean"] - variants["3dgs"][metric]["mean"]
+        assert summary["paired"]["small"][metric]["diff"] == pytest.approx(difference)
+    assert "ms_per_frame" in variants["small"]
+    assert "ms_per_frame" not in variants["3dgs"]
     assert summary["run"]["fixers"]["small"]["settings"]["window"] == 3
     assert summary["run"]["fixers"]["small"]["trained"] is True
     for name in ("quality.json", "quality.md", "by-frame.png", "speed.png", "sheets/a.png"):
@@ -75,8 +76,8 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
 
 def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: Path) -> None:
     networks = (("perceptual-syn", identity("perceptual-syn", None)),)
-    arm = parse_arms("identity", [])[0]
-    work = Work(data / "test" / "b", arm, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
+    variant = parse_variants("identity", [])[0]
+    work = Work(data / "test" / "b", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
     row = finish(work)
     stamp = work.row_file.stat().st_mtime_ns
     assert finish(work) == row
@@ -86,17 +87,17 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
     finish(work)
     assert picture.is_file()
     key = json.loads(work.row_file.read_text())["key"]
-    other = parse_arms("identity", ["fixer.block_latents=3"])[0]
-    for changed in (replace(work, seed=1), replace(work, frames=9), replace(work, arm=other)):
+    other = parse_variants("identity", ["fixer.block_latents=3"])[0]
+    for changed in (replace(work, seed=1), replace(work, frames=9), replace(work, variant=other)):
         assert finish(changed)["frames"] == changed.frames
         assert json.loads(work.row_file.read_text())["key"] != key
 
 
 def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
-    arms = parse_arms(f"3dgs,two=onefixer@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"])
-    assert [arm.label for arm in arms] == ["3dgs", "two", "small"]
-    assert arms[0].card is None
-    two, small = (arm.card.settings for arm in arms[1:] if arm.card)
+    variants = parse_variants(f"3dgs,two=onefixer@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"])
+    assert [variant.label for variant in variants] == ["3dgs", "two", "small"]
+    assert variants[0].spec is None
+    two, small = (variant.spec.settings for variant in variants[1:] if variant.spec)
     assert isinstance(two, OneFixerSettings)
     assert isinstance(small, OneFixerSettings)
     assert (two.mode, small.mode) == ("chunk", "chunk")
@@ -113,9 +114,9 @@ def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
         ("identity", ["other:fixer.mode=chunk"], "no fixer of this label"), ("identity", ["window=3"], "not a key of the fixer"),
     ],
 )  # fmt: skip
-def test_arms_that_cannot_be_are_refused(text: str, overrides: list[str], words: str) -> None:
+def test_variants_that_cannot_be_are_refused(text: str, overrides: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        parse_arms(text, overrides)
+        parse_variants(text, overrides)
 
 
 def test_unknown_baseline_is_refused(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -123,9 +124,9 @@ def test_unknown_baseline_is_refused(data: Path, tmp_path: Path, capsys: pytest.
     assert "--baseline 3dgs" in capsys.readouterr().err
 
 
-def row(arm: str, clip: str, psnr: float, frames: int = 200) -> dict[str, object]:
+def row(variant: str, clip: str, psnr: float, frames: int = 200) -> dict[str, object]:
     values, series = {"psnr_db": psnr}, {"psnr_db": [psnr] * frames}
-    return {"arm": arm, "clip": clip, "seed": 0, "frames": frames, "values": values, "series": series, "identical": 0, "events": {}}
+    return {"arm": variant, "clip": clip, "seed": 0, "frames": frames, "values": values, "series": series, "identical": 0, "events": {}}
 
 
 def test_intervals_are_over_clips_and_pairs_are_sharper() -> None:

@@ -35,7 +35,7 @@ def test_every_verb_takes_json_and_debug_and_shows_an_example(path: tuple[str, .
     command = ALL[path]
     options = {name for parameter in command.params for name in parameter.opts}
     assert {"--json", "--debug"} <= options
-    assert f"simrun {' '.join(path)}" in (command.epilog or "") or path == ("run",)
+    assert f"simrun {' '.join(path)}" in (command.epilog or "") or command.hidden or path == ("run",)
 
 
 def test_the_listing_shows_each_verb_with_the_first_line_of_its_own_help() -> None:

@@ -103,7 +103,7 @@ def test_a_metric_that_is_valid_nowhere_is_null_with_a_reason_and_not_zero():
     assert (found["mean"], found["ci95"], found["ci95_clustered"]) == (None, None, None)
     assert found["reason"] == "valid in none of 4 rollouts"
     failed = aggregate(rows_of([[1.0]], status="failed"))["3dgs"]["route_distance_m"]
-    assert failed["reason"] == "no rollout was run to its end"
+    assert failed["reason"] == "no rollout finished"
 
 
 def test_infinite_values_do_not_reach_a_mean():

@@ -93,7 +93,7 @@ def _write_flips(folder: Path, plan: Plan) -> None:
     for number, flip in enumerate(flips):
         key = dict(zip(("renderer", "policy", "scene", "seed"), flip.key, strict=True)) | {"baseline": flip.base.renderer}
         if number == 1:
-            cells.append(key | {"t_us": None, "reason": "the plans never part by more than 0.5 m"})
+            cells.append(key | {"t_us": None, "reason": "the plans never diverge by more than 0.5 m"})
             continue
         frames = {}
         for side, rollout in enumerate((flip.base, flip.other)):
@@ -336,7 +336,7 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
 
 def _certificate(plan: Plan) -> dict[str, Any]:
     if plan.certificate == "skipped":
-        return {"status": "skipped", "reason": "no rollout was run to its end"}
+        return {"status": "skipped", "reason": "no rollout finished"}
     digests = {name: f"{k}a" * 32 for k, name in enumerate(("ego", "actors", "frames", "plans", "scores"))}
     cell = {"renderer": "clean", "policy": "lane-camera", "scene": "smoke/straight", "seed": 0}
     entry = {"status": plan.certificate, "cell": cell, "path": "rollouts/x", "steps": 120, "digests": digests, "wall_s": 3.2}

@@ -57,7 +57,7 @@ def test_rows_show_both_frames_the_time_and_both_clips(usual_run: Path) -> None:
     assert rows[0].time.text == "1.0\u00a0s"
     assert rows[0].gap.text == "0.500\u00a0m"
     assert rows[1].time.missing
-    assert rows[1].why_not == "the plans never part by more than 0.5 m"
+    assert rows[1].why_not == "the plans never diverge by more than 0.5 m"
     assert [tone for tone in ("worse", "mixed", "better") if any(r.flip.tone == tone for r in rows)] == list(
         dict.fromkeys(row.flip.tone for row in rows)
     )

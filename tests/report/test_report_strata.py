@@ -134,7 +134,7 @@ def test_chart_labels_keep_their_digits(usual_run: Path) -> None:
     [
         ("equal", "equal", "is the same to the bit"),
         ("different", "different", "differs first in frames at step 4 (camera &lt;b&gt;front&lt;/b&gt;)"),
-        ("skipped", "not made", "No rollout was repeated: no rollout was run to its end."),
+        ("skipped", "not made", "No rollout was repeated: no rollout finished."),
     ],
 )
 def test_the_certificate_is_shown_and_a_difference_stands_at_the_head(tmp_path: Path, status: str, word: str, said: str) -> None:

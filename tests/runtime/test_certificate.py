@@ -107,8 +107,8 @@ def test_what_cannot_be_repeated_is_said(tmp_path: Path) -> None:
     measured = certificate(plan_of(policy="pure-pursuit", overrides=("latency.kind=measured",)), tmp_path / "measured")
     assert measured == {"status": "skipped", "reason": "latency 'measured' depends on the machine: no rollout can be repeated"}
     failed = certificate(plan_of(policy="tests.runtime.broken_policies:Raises"), tmp_path / "failed")
-    assert failed == {"status": "skipped", "reason": "no rollout was run to its end"}
-    assert certificate_line(failed) == "skipped: no rollout was run to its end"
+    assert failed == {"status": "skipped", "reason": "no rollout finished"}
+    assert certificate_line(failed) == "skipped: no rollout finished"
 
 
 class Blind(ConstantVelocity):

@@ -112,7 +112,7 @@ def test_weights_enter_the_key_by_their_content_and_not_by_their_time(tmp_path: 
 
 
 def test_one_renderer_under_two_names_is_refused() -> None:
-    with pytest.raises(InputError, match=r"they stand for \['onefixer\+3dgs', 'onefixer\+3dgs'\]"):
+    with pytest.raises(InputError, match=r"they resolve to \['onefixer\+3dgs', 'onefixer\+3dgs'\]"):
         plan(("onefixer", "onefixer+3dgs"))
 
 

@@ -16,13 +16,13 @@ from alpasim_plugin.parts import resolve
 from alpasim_plugin.runtime.certificate import rollout_trace
 from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.fork import Change, fork_rollout
-from alpasim_plugin.runtime.past import PastRollout, find_rollout
+from alpasim_plugin.runtime.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.probe import probe_rollout
 from alpasim_plugin.runtime.probe_write import write_probe
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from alpasim_plugin.runtime.store import read_json
-from alpasim_plugin.runtime.switch import joined_sensors
+from alpasim_plugin.runtime.switch import merge_sensors
 from alpasim_plugin.types import SensorSpec
 from scenarios.suite import expand
 from tests.runtime.test_certificate import BARE
@@ -43,19 +43,19 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def past(root: Path) -> PastRollout:
+def past(root: Path) -> LoggedRollout:
     return find_rollout(root, CELL)
 
 
 @pytest.fixture(scope="module")
-def changed(past: PastRollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def changed(past: LoggedRollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Continue behind the frozen renderer."""
     folder = tmp_path_factory.mktemp("changed")
     go(past, folder, renderer="broken-frozen")
     return folder
 
 
-def go(past: PastRollout, root: Path, **change: object) -> RunResult:
+def go(past: LoggedRollout, root: Path, **change: object) -> RunResult:
     return fork_rollout(past, Change(AT_US, **change), root, "none", ["simrun", "fork"])  # type: ignore[arg-type]
 
 
@@ -63,7 +63,7 @@ def forked(root: Path) -> Path:
     return next(path.parent for path in root.rglob("manifest.json") if "fork" in read_json(path))
 
 
-def test_an_untouched_continuation_is_the_log_to_the_byte(past: PastRollout, tmp_path: Path) -> None:
+def test_an_untouched_continuation_is_the_log_to_the_byte(past: LoggedRollout, tmp_path: Path) -> None:
     go(past, tmp_path)
     told = read_json(tmp_path / "run.json")["fork"]
     assert (told["of"], told["replay"], told["continuation"]) == (CELL, "equal", "equal")
@@ -80,7 +80,7 @@ def test_a_stateful_renderer_continues_with_its_history(root: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("change", [{}, {"policy": "pure-pursuit", "seed": 5}])
 def test_a_change_takes_effect_at_its_instant_and_not_before(
-    past: PastRollout, changed: Path, tmp_path: Path, change: dict[str, object]
+    past: LoggedRollout, changed: Path, tmp_path: Path, change: dict[str, object]
 ) -> None:
     if change:
         go(past, tmp_path, **change)
@@ -95,7 +95,7 @@ def test_a_change_takes_effect_at_its_instant_and_not_before(
     assert not np.array_equal(one.ego.xyz[~before], other.ego.xyz[~before])
 
 
-def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame(past: PastRollout, changed: Path) -> None:
+def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame(past: LoggedRollout, changed: Path) -> None:
     pixels = {fact["t_us"]: fact["rgb_sha256"] for fact in read_facts(forked(changed) / "frames.jsonl")}
     first = pixels[past.scenario.start_us]
     assert [t_us for t_us, digest in pixels.items() if digest == first and t_us > past.scenario.start_us] == [
@@ -103,7 +103,7 @@ def test_a_frozen_renderer_that_takes_over_has_been_frozen_since_the_first_frame
     ]
 
 
-def test_the_run_folder_pairs_the_continuation_with_the_original(past: PastRollout, changed: Path) -> None:
+def test_the_run_folder_pairs_the_continuation_with_the_original(past: LoggedRollout, changed: Path) -> None:
     rows = pq.read_table(changed / "rollouts.parquet").to_pylist()
     assert [row["renderer"] for row in rows] == ["clean", "broken-frozen from 0.6 s"]
     here, there = (read_json(folder / "summary.json") for folder in (changed, past.root))
@@ -113,7 +113,7 @@ def test_the_run_folder_pairs_the_continuation_with_the_original(past: PastRollo
     assert "broken-frozen from 0.6 s" in (changed / "report.html").read_text()
 
 
-def test_a_replay_that_leaves_the_log_names_component_and_step(past: PastRollout, tmp_path: Path) -> None:
+def test_a_replay_that_leaves_the_log_names_component_and_step(past: LoggedRollout, tmp_path: Path) -> None:
     copy = tmp_path / "copy" / str(past.manifest["path"])
     copy.mkdir(parents=True)
     for file in past.folder.iterdir():
@@ -129,7 +129,7 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(past: PastRollout
         probe_rollout(moved, ["clean", "3dgs"])
 
 
-def test_instants_outside_and_folders_in_use_are_refused(past: PastRollout, root: Path, tmp_path: Path) -> None:
+def test_instants_outside_and_folders_in_use_are_refused(past: LoggedRollout, root: Path, tmp_path: Path) -> None:
     for after_us in (-1, 1_200_000, 10**12):
         with pytest.raises(InputError, match=r"the rollout lasts 1\.2 s"):
             fork_rollout(past, Change(after_us), tmp_path, "none", [])
@@ -137,25 +137,25 @@ def test_instants_outside_and_folders_in_use_are_refused(past: PastRollout, root
         fork_rollout(past, Change(AT_US), root, "none", [])
 
 
-def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root: Path, past: PastRollout) -> None:
+def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root: Path, past: LoggedRollout) -> None:
     assert find_rollout(root, str(past.manifest["path"])).cell == past.cell
     with pytest.raises(InputError, match="no such rollout among its 2") as caught:
         find_rollout(root, "claen/lane-camera/smoke-lead_car/0")
     assert CELL in caught.value.do_this
 
 
-def test_a_scenario_that_has_changed_is_refused(root: Path, past: PastRollout, tmp_path: Path) -> None:
+def test_a_scenario_that_has_changed_is_refused(root: Path, past: LoggedRollout, tmp_path: Path) -> None:
     info = read_json(root / "run.json")
     info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
     for name in ("rollouts.parquet", str(past.manifest["path"]) + "/manifest.json"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((root / name).read_bytes())
     (tmp_path / "run.json").write_text(json.dumps(info))
-    with pytest.raises(InputError, match="is not what it was when the log was made"):
+    with pytest.raises(InputError, match="has changed since the log was written"):
         find_rollout(tmp_path, CELL)
 
 
-def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(past: PastRollout, root: Path) -> None:
+def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(past: LoggedRollout, root: Path) -> None:
     probe = probe_rollout(past, ["clean", "broken-frozen", "3dgs"])
     frozen, surrogate = probe.pairs
     assert len(probe.queries) == 12
@@ -175,17 +175,17 @@ def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_anothe
     np.testing.assert_allclose(backwards.turn_rad, -frozen.turn_rad, atol=1e-12)
 
 
-def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: PastRollout) -> None:
+def test_a_probe_needs_a_policy_that_sees_and_two_renderers(past: LoggedRollout) -> None:
     with pytest.raises(InputError, match="fewer than two"):
         probe_rollout(past, ["clean"])
     blind = replace(past, cell=replace(past.cell, policy=resolve("policy", "pure-pursuit")))
-    with pytest.raises(InputError, match="takes no camera"):
+    with pytest.raises(InputError, match="has no camera"):
         probe_rollout(blind, ["clean", "3dgs"])
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period() -> None:
     first, then = (SensorSpec("front"), SensorSpec("left", 200_000)), (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
-    assert joined_sensors(first, then, 100_000) == (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
+    assert merge_sensors(first, then, 100_000) == (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
 
 
 def test_flips_are_written_for_a_run_without_any(root: Path) -> None:

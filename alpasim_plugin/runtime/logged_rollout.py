@@ -1,4 +1,4 @@
-"""Find a rollout of an earlier run by name, with everything that is needed to make it again."""
+"""Find a finished rollout of an earlier run by name, with everything needed to replay it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DOING = "finding a logged rollout"
 
 
 @dataclass(frozen=True)
-class PastRollout:
+class LoggedRollout:
     """A finished rollout of an earlier run."""
 
     root: Path  # of the run
@@ -40,35 +40,48 @@ class PastRollout:
         """Give the name by which `find_rollout` finds it."""
         return rollout_name(self.cell.renderer.name, self.cell.policy.name, self.cell.scene, self.cell.seed)
 
+    def check_repeatable(self, doing: str) -> None:
+        """Refuse a rollout that cannot be replayed.
+
+        Args:
+            doing: The attempted action, for the error.
+
+        Raises:
+            InputError: Its latency is measured.
+        """
+        if self.scenario.latency.kind == "measured":
+            found = "its latency is measured: the delay of its plans depended on the machine"
+            raise InputError(doing, self.name, found, "run it with --set latency.kind=fixed")
+
 
 def rollout_name(renderer: str, policy: str, scene: str, seed: int) -> str:
     """Return ``RENDERER/POLICY/SCENE/SEED``."""
     return f"{renderer}/{policy}/{scene}/{seed}"
 
 
-def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRollout:
-    """Find a finished rollout in a run folder and load what it was made of.
+def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRollout:
+    """Find a finished rollout in a run folder and load its scenario and parts.
 
     Args:
         root: Run folder.
         name: ``RENDERER/POLICY/SCENE/SEED`` as in the tables, or the rollout's folder below the run folder.
-        scenario: Where its scenario lies now; by default where ``run.json`` says that it lay.
+        scenario: Path of its scenario; by default the path in ``run.json``.
 
     Raises:
-        InputError: No such rollout, it did not finish, or its scenario or the parts that shape it are not what they were.
+        InputError: No such rollout, it did not finish, or its scenario or its parts have changed.
     """
     row = _row(root, name)
     info = read_json(root / "run.json")
     manifest = read_json(root / row["path"] / "manifest.json")
     if manifest.get("fork"):
-        raise InputError(DOING, name, "it is itself the continuation of another rollout", f"name that one: {manifest['fork']['of']}")
+        raise InputError(DOING, name, "it is the continuation of another rollout", f"name that rollout: {manifest['fork']['of']}")
     stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
     where = scenario or stated.get("path")
     if where is None:
-        raise InputError(DOING, f"{root / 'run.json'}", "it does not say where the scenario lies", "name it with --scenario PATH")
+        raise InputError(DOING, f"{root / 'run.json'}", "it has no path of the scenario", "name it with --scenario PATH")
     ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())), stated.get("source"))
     options = _options(info)
-    # Settings of fixers may belong to another renderer of the run; a plan refuses settings that no renderer takes.
+    # Fixer settings may belong to another renderer of the run; a plan refuses settings without a fixer.
     own = options if resolve_renderer(row["renderer"], options.fixer).fixer is not None else replace(options, fixer=())
     plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)
     (cell,) = plan.cells
@@ -78,10 +91,10 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> PastRoll
         raise InputError(
             DOING,
             name,
-            f"{what}: the scenario, a part or the version is not what it was when the log was made",
+            f"{what}: the scenario, a part or the version has changed since the log was written",
             "run the rollout again, or name its scenario with --scenario PATH",
         )
-    return PastRollout(root, cell, options, loaded, manifest)
+    return LoggedRollout(root, cell, options, loaded, manifest)
 
 
 def _options(info: Mapping[str, Any]) -> RunOptions:
@@ -101,8 +114,8 @@ def _row(root: Path, name: str) -> dict[str, Any]:
     row = by_name.get(wanted) or next((r for r in rows if wanted in (r["path"], r["path"].removeprefix("rollouts/"))), None)
     if row is None:
         near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
-        do_this = f"did you mean {' or '.join(near)}?" if near else "give a run that holds rollouts"
+        do_this = f"did you mean {' or '.join(near)}?" if near else "name a run that has rollouts"
         raise InputError(DOING, f"--cell {name}", f"the run has no such rollout among its {len(rows)}", do_this)
     if row["status"] != "ok":
-        raise InputError(DOING, f"--cell {name}", f"it did not finish: {row['failure']}", "name a rollout that ran to its end")
+        raise InputError(DOING, f"--cell {name}", f"it did not finish: {row['failure']}", "name a finished rollout")
     return dict(row)
