@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from alpasim_plugin.types import (
@@ -91,6 +91,7 @@ class Declaration:
     is_remote: bool = False
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """One rollout's renderer session."""
 
@@ -111,6 +112,7 @@ class Renderer(Protocol):
         return {}
 
 
+@runtime_checkable
 class Fixer(Protocol):
     """One rollout's fixer session: repairs frames causally, from the past and the current block only.
 
@@ -141,6 +143,7 @@ class Fixer(Protocol):
         return copy.deepcopy(self).step(block, maps)
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Plans from observations."""
 
@@ -156,6 +159,7 @@ class Policy(Protocol):
         """Return the plan in the rig frame of the observation."""
 
 
+@runtime_checkable
 class Controller(Protocol):
     """Moves the ego along a plan. Pure: the result depends on the arguments only."""
 
@@ -174,6 +178,7 @@ class Controller(Protocol):
         """
 
 
+@runtime_checkable
 class Evaluator(Protocol):
     """Pure: a log in, series out; never a renderer, a policy or a GPU."""
 
@@ -184,6 +189,7 @@ class Evaluator(Protocol):
         """Score one rollout."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """Reads one format of recorded drives."""
 

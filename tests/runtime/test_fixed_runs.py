@@ -65,7 +65,7 @@ def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp
 def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path) -> None:
     plan = plan_of()
     before = comparable(finished)
-    fixed = next(cell for cell in plan.cells if cell.renderer == "onefixer+clean")
+    fixed = next(cell for cell in plan.cells if cell.renderer.name == "onefixer+clean")
     (finished / fixed.folder / MANIFEST).unlink()
     assert sorted(run(plan, finished)) == [("ok", False), ("ok", True)]
     assert comparable(finished) == before

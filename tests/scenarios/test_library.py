@@ -14,9 +14,9 @@ from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
 from alpasim_plugin.types import F64, Box, Scenario
 from alpasim_plugin.world.actors import make_actors
 from alpasim_plugin.world.ego import ego_state_from_log
-from scenarios.library import LIBRARY, shipped_names
+from scenarios.library import LIBRARY, shipped, shipped_names, suites
 from scenarios.load import load_scenario
-from scenarios.suite import load_suite, shipped, suites
+from scenarios.suite import load_suite
 
 BUILT = [name for name in shipped_names() if not name.startswith("real/")]
 CAR = Box(4.855, 1.88, 1.6)
