@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-import scipy
+from scipy import special  # the functions behind scipy.stats, which takes a second to import
 
 from evaluators.aggregate.intervals import TAIL
 
@@ -80,5 +80,5 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_fla
 
 
 def _decides(n: int, distance: float, spread: float, power: float) -> bool:
-    quantiles = float(scipy.stats.t.ppf(1 - TAIL, n - 1) + scipy.stats.t.ppf(power, n - 1))
+    quantiles = float(special.stdtrit(n - 1, 1 - TAIL) + special.stdtrit(n - 1, power))
     return math.sqrt(n) * abs(distance) >= quantiles * spread

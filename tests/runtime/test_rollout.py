@@ -125,7 +125,7 @@ class Stale(StandStill):
 
 
 @pytest.mark.parametrize(
-    ("policy", "found"), [(Raises, "ValueError: the weights are gone"), (NotFinite, "not finite"), (Stale, "times_us begins at -1 us")]
+    ("policy", "found"), [(Raises, "ValueError: the weights are gone"), (NotFinite, "not finite"), (Stale, "times_us starts at -1 us")]
 )
 def test_a_broken_policy_is_named_and_not_driven(straight_road: Scenario, policy: type[StandStill], found: str) -> None:
     with pytest.raises(PolicyError, match=found):
