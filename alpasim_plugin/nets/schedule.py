@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numpy as np
-
 from alpasim_plugin.errors import InputError
 
 SHIFT = 5.0
@@ -59,9 +57,8 @@ def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
         >>> round(context_level().sigma, 5)
         0.12993
     """
-    u = 1 - np.arange(TABLE) / TABLE
-    table = SHIFT * u / (1 + (SHIFT - 1) * u)
-    return NoiseLevel(t, float(table[np.abs(TABLE * table - t).argmin()]))
+    table = (shifted(1 - i / TABLE) for i in range(TABLE))
+    return NoiseLevel(t, min(table, key=lambda sigma: abs(TABLE * sigma - t)))
 
 
 def names(count: int) -> tuple[float, ...]:

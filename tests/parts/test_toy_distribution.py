@@ -151,13 +151,6 @@ def test_an_edited_policy_file_is_driven_again(installed: Installed, name: str) 
     assert all(installed.drive(out, *parts).values()), "the policy imports a file that was edited"
 
 
-def test_a_remote_part_is_never_reused_unasked(installed: Installed) -> None:
-    parts = ("--renderer", "toy://host:1", "--policy", "toy-straight")
-    assert all(installed.drive("remote", *parts).values())
-    assert all(installed.drive("remote", *parts).values())
-    assert not any(installed.drive("remote", *parts, "--resume").values())
-
-
 def test_folders_named_like_ours_do_not_shadow_them(installed: Installed) -> None:
     for name in ("policies", "evaluators", "scenarios", "configs"):
         (installed.work / name).mkdir(exist_ok=True)
@@ -168,10 +161,3 @@ def test_folders_named_like_ours_do_not_shadow_them(installed: Installed) -> Non
     finally:
         for name in ("policies", "evaluators", "scenarios", "configs"):
             (installed.work / name / "__init__.py").unlink()
-
-
-def test_a_factory_that_asks_for_something_else_is_told_what_there_is(installed: Installed) -> None:
-    (installed.work / "odd.py").write_text("class Odd:\n    def __init__(self, gain):\n        pass\n")
-    error = installed.simrun("--renderer", "toy-grey", "--policy", "odd.py:Odd", "--seeds", "1", "--out", "odd", "drive.toycsv", code=4)
-    failed = error["summary"]["failures"]["cells"][0]["error"]
-    assert (failed["found"], failed["failure_class"]) == ("its factory asks for gain", "input")
