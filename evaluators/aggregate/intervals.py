@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special  # the functions behind scipy.stats, which takes a second to import
+import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.types import F64, I64
@@ -75,7 +75,7 @@ def t_bounds(means: F64) -> tuple[F64, F64]:
     """Return the t bounds ``(...,)`` of the mean over the last axis of ``(..., G)`` independent values."""
     n = means.shape[-1]
     centre = means.mean(axis=-1)
-    half = float(special.stdtrit(n - 1, 1 - TAIL)) * means.std(axis=-1, ddof=1) / np.sqrt(n)
+    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * means.std(axis=-1, ddof=1) / np.sqrt(n)
     return np.asarray(centre - half), np.asarray(centre + half)
 
 
@@ -92,7 +92,7 @@ def logit_t_bounds(means: F64) -> tuple[F64, F64]:
     flat = np.ptp(means, axis=-1) == 0.0
     inside = np.where(flat | (p <= 0.0) | (p >= 1.0), 0.5, p)
     logit = np.log(inside / (1 - inside))
-    half = float(special.stdtrit(n - 1, 1 - TAIL)) * error / (inside * (1 - inside))
+    half = float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * error / (inside * (1 - inside))
     low, high = _expit(logit - half), _expit(logit + half)
     if np.any(flat):
         exact_low, exact_high = _clopper_pearson(p * n, n)
@@ -180,8 +180,8 @@ def design_effect(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> float
 
 
 def _clopper_pearson(k: F64, n: int) -> tuple[F64, F64]:
-    low = np.where(k <= 0, 0.0, special.betaincinv(np.where(k > 0, k, 1.0), n - k + 1, TAIL))  # quantiles of beta distributions
-    high = np.where(k >= n, 1.0, special.betaincinv(k + 1, np.where(k < n, n - k, 1.0), 1 - TAIL))
+    low = np.where(k <= 0, 0.0, scipy.special.betaincinv(np.where(k > 0, k, 1.0), n - k + 1, TAIL))  # quantiles of beta distributions
+    high = np.where(k >= n, 1.0, scipy.special.betaincinv(k + 1, np.where(k < n, n - k, 1.0), 1 - TAIL))
     return np.asarray(low), np.asarray(high)
 
 

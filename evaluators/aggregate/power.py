@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from scipy import special  # the functions behind scipy.stats, which takes a second to import
+import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from evaluators.aggregate.intervals import TAIL
 
@@ -80,5 +80,5 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_fla
 
 
 def _decides(n: int, distance: float, spread: float, power: float) -> bool:
-    quantiles = float(special.stdtrit(n - 1, 1 - TAIL) + special.stdtrit(n - 1, power))
+    quantiles = float(scipy.special.stdtrit(n - 1, 1 - TAIL) + scipy.special.stdtrit(n - 1, power))
     return math.sqrt(n) * abs(distance) >= quantiles * spread

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from scipy import special  # the functions behind scipy.stats, which takes a second to import
+import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from alpasim_plugin.types import F64, Direction
 from evaluators.metrics import info
@@ -84,7 +84,7 @@ def sign_test(up: int, down: int) -> float:
         >>> round(sign_test(6, 0), 5)
         0.03125
     """
-    return min(1.0, 2.0 * float(special.bdtr(min(up, down), up + down, 0.5)))
+    return min(1.0, 2.0 * float(scipy.special.bdtr(min(up, down), up + down, 0.5)))
 
 
 def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
@@ -97,4 +97,4 @@ def p_value(means: F64, is_flag: bool) -> tuple[float, str]:
     if is_flag or alike:
         return sign_test(int(np.sum(means > 0)), int(np.sum(means < 0))), "exact sign test on scenes"
     t = float(np.mean(means) / (np.std(means, ddof=1) / np.sqrt(len(means))))
-    return 2.0 * float(special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
+    return 2.0 * float(scipy.special.stdtr(len(means) - 1, -abs(t))), "paired t test on scene means"
