@@ -14,6 +14,8 @@ from typing import Any
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.errors import InputError
 
+_imported_code: dict[Path, str] = {}  # file of a module -> its code digest when a part of it was first resolved
+
 
 def is_target(name: str) -> bool:
     """Tell whether a name is a target and not a registered name or an address (``scheme://``)."""
@@ -62,6 +64,21 @@ def file_of(target: str) -> Path | None:
         return Path(name)
     spec = importlib.util.find_spec(name)
     return Path(spec.origin) if spec is not None and spec.has_location and spec.origin is not None else None
+
+
+def require_unedited(file: Path, digest: str) -> None:
+    """Refuse a module whose code on disk is no longer the code that this process has imported.
+
+    Args:
+        file: The module's source file; it has been imported.
+        digest: Its `alpasim_plugin.parts.source.code_digest` now.
+
+    Raises:
+        InputError: The digest is another than when the part was first resolved in this process.
+    """
+    if _imported_code.setdefault(file, digest) != digest:
+        found = "it, or a module that it imports, was edited after this process had imported it"
+        raise InputError("resolving a part", str(file), found, "start a new process (in a notebook: restart the kernel)")
 
 
 def _from_file(file: Path) -> ModuleType:

@@ -16,8 +16,9 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.interfaces import Declaration
 from alpasim_plugin.parts.builtin import BUILTIN
 from alpasim_plugin.parts.kinds import KindName
-from alpasim_plugin.parts.loading import absolute_target, file_of, is_target, load
+from alpasim_plugin.parts.loading import absolute_target, file_of, is_target, load, require_unedited
 from alpasim_plugin.parts.registry import entries, find, names
+from alpasim_plugin.parts.source import code_digest
 from alpasim_plugin.parts.spec import PartSpec, digest, file_digest, part_digest
 from alpasim_plugin.yaml_marks import Document
 
@@ -148,6 +149,8 @@ def note_of(spec: PartSpec, declared: Declaration) -> str:
 
 def _described(spec: PartSpec, factory: Any) -> PartSpec:
     module = file_of(spec.target)
+    if factory is not None and module is not None:
+        require_unedited(module, code_digest(module))
     declared = declaration_of(factory, spec.settings, module.parent if module else Path())
     shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}") for key, path in declared.files.items()}
     attribute = spec.target.rpartition(":")[2]

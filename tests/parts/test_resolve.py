@@ -116,3 +116,13 @@ def test_a_fixer_without_preview_previews_on_a_copy_of_itself() -> None:
     assert fixer.preview([1], []) == [1]  # type: ignore[attr-defined]
     assert fixer.seen == 0
     assert fixer.step([1, 2], []) == [2, 2]
+
+
+def test_a_module_edited_after_its_import_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "edited.py"
+    file.write_text("class Mine:\n    controller = 'perfect'\n")
+    assert resolve("policy", f"{file}:Mine").controller == "perfect"
+    assert resolve("policy", f"{file}:Mine").controller == "perfect"
+    file.write_text("class Mine:\n    controller = 'bicycle'\n")
+    with pytest.raises(InputError, match="was edited after this process had imported it"):
+        resolve("policy", f"{file}:Mine")
