@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,8 +151,12 @@ def note_of(spec: PartSpec, declared: Declaration) -> str:
 
 def _described(spec: PartSpec, factory: Any) -> PartSpec:
     module = file_of(spec.target)
-    if factory is not None and module is not None:
-        require_unedited(module, code_digest(module))
+    modules = [] if module is None else [module]
+    if inspect.isclass(factory) or inspect.isfunction(factory):  # a package may only pass on what another module defines
+        home = getattr(sys.modules.get(factory.__module__), "__file__", None)
+        modules += [Path(home)] if home is not None and Path(home) not in modules else []
+    for file in modules if factory is not None else ():
+        require_unedited(file, code_digest(file))
     declared = declaration_of(factory, spec.settings, module.parent if module else Path())
     shas = {key: file_digest(path, f"{spec.kind} {spec.name!r}, {key}") for key, path in declared.files.items()}
     attribute = spec.target.rpartition(":")[2]
@@ -159,7 +165,7 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
         spec.name,
         spec.target,
         spec.settings,
-        None if declared.is_remote else part_digest(module, attribute, spec.settings, shas),
+        None if declared.is_remote else part_digest(modules, attribute, spec.settings, shas),
         note_of(spec, declared),
         declared.trained,
         {str(declared.files[key]): sha for key, sha in shas.items()},

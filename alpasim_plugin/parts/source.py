@@ -8,10 +8,12 @@ import re
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from alpasim_plugin import OWN_PACKAGES
 
 OWN_ROOT = str(Path(__file__).resolve().parents[2])
+PARTS = os.path.join(OWN_ROOT, "alpasim_plugin", "parts") + os.sep
 INSTALLED = {"site-packages", "dist-packages"}  # folders that hold packages of many distributions
 
 # Import statements wherever they stand: at the top, inside functions, under conditions. A line of a docstring that looks like one only
@@ -31,7 +33,7 @@ def code_digest(file: str | Path) -> str:
     Args:
         file: Source file of the part's module.
     """
-    digests = sorted(_read(path)[0] for path in reached(file))
+    digests = sorted(_read(path).digest for path in code_files(file))
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
@@ -42,8 +44,25 @@ def own_code_digest(module: str) -> str:
     return code_digest(file)
 
 
+def code_files(file: str | Path) -> set[str]:
+    """Return the paths of the files that `code_digest` covers.
+
+    Code of other people that reaches `alpasim_plugin.parts` may name any of our parts by a string, so all of ours counts for it.
+    """
+    found = reached(file)
+    is_ours = os.path.realpath(file) in _own_sources()
+    may_name_parts = any(path.startswith(PARTS) for path in found)
+    return found | _own_sources() if may_name_parts and not is_ours else found
+
+
+@lru_cache(maxsize=1)
+def _own_sources() -> frozenset[str]:
+    packages = (Path(OWN_ROOT, package) for package in OWN_PACKAGES)
+    return frozenset(str(path) for package in packages for path in package.rglob("*.py"))
+
+
 def reached(file: str | Path) -> set[str]:
-    """Return the paths of a module and of all that `code_digest` follows from it."""
+    """Return the paths of a module and of all that it reaches by imports."""
     start = os.path.realpath(file)
     root = top_folder(start)
     seen: set[str] = set()
@@ -64,17 +83,25 @@ def top_folder(file: str) -> str:
     return folder
 
 
-def _read(path: str) -> tuple[str, tuple[str, ...]]:
-    """Return a file's SHA-256 and the dotted names that it imports."""
+class _Source(NamedTuple):
+    digest: str  # SHA-256 of the text
+    imports: tuple[str, ...]  # dotted names
+    lazy: dict[str, str]  # public name -> module, of a package that imports its names on first use (`alpasim_plugin.lazy`)
+
+
+def _read(path: str) -> _Source:
     stat = os.stat(path)
     return _parsed(path, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache(maxsize=4096)
-def _parsed(path: str, mtime_ns: int, size: int) -> tuple[str, tuple[str, ...]]:
+def _parsed(path: str, mtime_ns: int, size: int) -> _Source:
     with open(path, "rb") as file:
         text = file.read()
-    return hashlib.sha256(text).hexdigest(), tuple(dict.fromkeys(_names(_TYPES_ONLY.sub(b"", text))))
+    lazy: dict[str, str] = {}
+    for match in _FROM.finditer(b"".join(_TYPES_ONLY.findall(text)) if b"lazy_names(" in text else b""):
+        lazy |= {item.split(" as ")[0].strip(): match[1].decode() for item in match[2].decode().strip("()").split(",")}
+    return _Source(hashlib.sha256(text).hexdigest(), tuple(dict.fromkeys(_names(_TYPES_ONLY.sub(b"", text)))), lazy)
 
 
 def _names(text: bytes) -> Iterator[str]:
@@ -96,7 +123,7 @@ def _imported(path: str, root: str) -> Iterator[str]:
     here = os.path.relpath(os.path.dirname(path), base).split(os.sep)
     top = here[0] if here != ["."] else os.path.basename(path).removesuffix(".py")
     is_shared = not INSTALLED.isdisjoint(root.split(os.sep))
-    for dotted in _read(path)[1]:
+    for dotted in _read(path).imports:
         dots = len(dotted) - len(dotted.lstrip("."))
         rest = [part for part in dotted[dots:].split(".") if part]
         parts = [*(part for part in here[: len(here) - dots + 1] if part != "."), *rest] if dots else rest
@@ -107,6 +134,11 @@ def _imported(path: str, root: str) -> Iterator[str]:
             found = _own_file(tuple(parts[:depth])) if own else _module_file(root, parts[:depth])
             if found is not None:
                 yield found
+        face = _own_file(tuple(parts[:-1])) if own and len(parts) > 1 else None
+        home = None if face is None else _read(face).lazy.get(parts[-1])
+        found = None if home is None else _own_file(tuple(home.split(".")))
+        if found is not None:
+            yield found
 
 
 @lru_cache(maxsize=8192)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -85,11 +85,11 @@ def file_digest(path: Path, what: str) -> str:
         raise InputError("reading a file that a part declares", f"{what}: {path}", error.strerror or str(error), do) from error
 
 
-def part_digest(module: Path | None, attribute: str, settings: BaseModel | None, files: Mapping[str, str]) -> str:
+def part_digest(modules: Sequence[Path], attribute: str, settings: BaseModel | None, files: Mapping[str, str]) -> str:
     """Return the digest of a part.
 
     Args:
-        module: Source file of the part's module; None where it has none (an extension module counts as its settings alone).
+        modules: Source files of the module that was named and of the one that defines the factory; none for an extension module.
         attribute: The factory in the module.
         settings: Its settings.
         files: SHA-256 by name; a name that is a dotted key of the settings takes the place of the path that stands there.
@@ -97,7 +97,7 @@ def part_digest(module: Path | None, attribute: str, settings: BaseModel | None,
     content = None if settings is None else settings.model_dump(mode="json")
     for name in files:
         _blank(content, name.split("."))
-    return digest([None if module is None else code_digest(module), attribute, content, dict(files)])
+    return digest([[code_digest(module) for module in modules], attribute, content, dict(files)])
 
 
 def _blank(content: Any, keys: list[str]) -> None:

@@ -8,12 +8,12 @@ import pytest
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.interfaces import BlockRule, Fixer, Renderer
-from alpasim_plugin.parts import complete, names, resolve, resolve_renderer
+from alpasim_plugin.parts import complete, names, resolve, resolve_renderer, spec
 from alpasim_plugin.parts.builtin import BUILTIN
 from alpasim_plugin.parts.kinds import KINDS
 from alpasim_plugin.parts.loading import load
 from alpasim_plugin.parts.resolve import PLAIN_KINDS
-from alpasim_plugin.parts.source import code_digest, reached
+from alpasim_plugin.parts.source import OWN_ROOT, code_digest, code_files, reached
 
 DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "metrics", "controller")
 
@@ -126,3 +126,28 @@ def test_a_module_edited_after_its_import_is_refused(tmp_path: Path) -> None:
     file.write_text("class Mine:\n    controller = 'bicycle'\n")
     with pytest.raises(InputError, match="was edited after this process had imported it"):
         resolve("policy", f"{file}:Mine")
+
+
+def own_files(path: Path) -> set[str]:
+    return {name.removeprefix(f"{OWN_ROOT}/") for name in code_files(path)}
+
+
+def test_the_digest_follows_names_that_our_packages_import_lazily(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from evaluators import PRESETS\nfrom alpasim_plugin.gaussians import (\n    GaussianCloud,\n)\n")
+    assert {"evaluators/presets.py", "alpasim_plugin/gaussians/cloud.py"} <= own_files(file)
+    assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" not in own_files(file)
+
+
+def test_a_part_that_may_name_others_depends_on_all_of_ours(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("from alpasim_plugin import make_renderer\n")
+    assert "alpasim_plugin/gaussians/raster/rasterize_cpu.py" in own_files(file)
+
+
+def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    home = "policies/constant_velocity.py"
+    digest = resolve("policy", "policies:ConstantVelocity").digest
+    whole = spec.code_digest
+    monkeypatch.setattr(spec, "code_digest", lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""))
+    assert resolve("policy", "policies:ConstantVelocity").digest != digest
