@@ -1,14 +1,30 @@
-"""How many examples a property is tried with: few in every run, all of them with ``SIMRUN_HYPOTHESIS=nightly``."""
+"""How much of a property is tried in every run, and how much in the nightly one.
+
+Hypothesis draws few examples by default and all of them with ``SIMRUN_HYPOTHESIS=nightly``; further cases of one rule are marked ``slow``.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
 
 PROFILE = os.environ.get("SIMRUN_HYPOTHESIS", "quick")
-SHARE = {"quick": 0.2, "nightly": 1.0}[PROFILE]
-FEWEST = 5
+SHARE = {"quick": 0.1, "nightly": 1.0}[PROFILE]
+FEWEST = 4
 
 
 def examples(full: int) -> int:
     """Return the number of examples to draw of a property that deserves ``full``."""
     return max(min(full, FEWEST), round(SHARE * full))
+
+
+def first_of(cases: Sequence[Any], count: int = 1) -> list[Any]:
+    """Return the cases of a parametrised test, all but the first ``count`` of them marked ``slow``."""
+    return [case if k < count else pytest.param(*_values(case), marks=pytest.mark.slow) for k, case in enumerate(cases)]
+
+
+def _values(case: Any) -> tuple[Any, ...]:
+    return case if isinstance(case, tuple) else (case,)

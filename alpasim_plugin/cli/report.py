@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,12 @@ from alpasim_plugin.runtime.store import read_json
 from evaluators.report import render_table
 
 EPILOG = "Example: `simrun report runs/us101`"
+
+
+def report_line(root: Path) -> str:
+    """Return the line that says where a run's report is, or how to get it."""
+    page = root / "report.html"
+    return f"report  {shlex.quote(str(page))}" if page.exists() else f"report  not written; simrun report {shlex.quote(str(root))}"
 
 
 def report(

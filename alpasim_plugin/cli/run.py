@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli.progress import fixer_labels, make_progress
+from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
 from alpasim_plugin.runtime.execute import thread_budget
@@ -68,6 +68,9 @@ def run(
     baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
     certify: Annotated[Certify, typer.Option("--certify", help="Repeat one rollout and compare bit for bit.")] = "one",
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write report.html now; `simrun report RUN` writes it later.")
+    ] = True,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Resolve and print the plan, run nothing.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
@@ -94,7 +97,7 @@ def run(
         _print_plan(plan, root, workers, as_json)
         return
     try:
-        result = execute_run(plan, root, workers, ["simrun", *sys.argv[1:]], make_progress(quiet or as_json), resume, certify)
+        result = execute_run(plan, root, workers, ["simrun", *sys.argv[1:]], make_progress(quiet or as_json), resume, certify, report)
     except KeyboardInterrupt:
         print(f"interrupted; finished rollouts are in {root}; the same command continues", file=sys.stderr)
         raise typer.Exit(INTERRUPTED) from None
@@ -179,4 +182,4 @@ def _print_result(result: RunResult, as_json: bool) -> None:
     if result.n_failed:
         print(f"{result.n_failed} of {result.n_rollouts} rollouts failed; the same command runs them again", file=sys.stderr)
     print(f"repeat  {certificate_line(result.summary['determinism'])}")
-    print(f"report  {shlex.quote(str(result.root / 'report.html'))}")
+    print(report_line(result.root))

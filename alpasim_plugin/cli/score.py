@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +11,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli.progress import describe
+from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
@@ -44,6 +44,9 @@ def score(
         list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named by logs and preset.")] = None,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write report.html now; `simrun report RUN` writes it later.")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
@@ -68,7 +71,7 @@ def score(
             print(f"[{done}/{len(found)}] {manifest['rollout']}: {describe(manifest, reused=False)}", file=sys.stderr, flush=True)
 
     result = execute_score(
-        found, KnownScenes(scene, rails), chosen, own, resolve_evaluators(evaluators or ()), out, ["simrun", *sys.argv[1:]], on_done
+        found, KnownScenes(scene, rails), chosen, own, resolve_evaluators(evaluators or ()), out, ["simrun", *sys.argv[1:]], on_done, report
     )
     _print(result, as_json)
     raise typer.Exit(result.exit_code)
@@ -98,4 +101,4 @@ def _print(result: ScoreResult, as_json: bool) -> None:
     if aggregation.get("error"):
         error = aggregation["error"]
         print(f"error: {error['doing']}\n   with: {error['with']}\n  found: {error['found']}\n     do: {error['do']}", file=sys.stderr)
-    print(f"report  {shlex.quote(str(result.root / 'report.html'))}")
+    print(report_line(result.root))

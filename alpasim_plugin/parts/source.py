@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -118,7 +118,20 @@ def _names(text: bytes) -> Iterator[str]:
             yield item.split(" as ")[0].strip()
 
 
-def _imported(path: str, root: str) -> Iterator[str]:
+def _imported(path: str, root: str) -> Iterable[str]:
+    """Return the files that a module imports. Those of our own modules are found once: our files do not come and go while a process runs."""
+    if root != OWN_ROOT:
+        return _find_imported(path, root)
+    stat = os.stat(path)
+    return _own_imported(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _own_imported(path: str, mtime_ns: int, size: int) -> tuple[str, ...]:
+    return tuple(_find_imported(path, OWN_ROOT))
+
+
+def _find_imported(path: str, root: str) -> Iterator[str]:
     base = next((base for base in (root, OWN_ROOT) if path.startswith(base + os.sep)), root)
     here = os.path.relpath(os.path.dirname(path), base).split(os.sep)
     top = here[0] if here != ["."] else os.path.basename(path).removesuffix(".py")
@@ -143,7 +156,7 @@ def _imported(path: str, root: str) -> Iterator[str]:
 
 @lru_cache(maxsize=8192)
 def _own_file(parts: tuple[str, ...]) -> str | None:
-    return _module_file(OWN_ROOT, parts)  # our own files do not come and go while a process runs
+    return _module_file(OWN_ROOT, parts)
 
 
 def _module_file(root: str, parts: Sequence[str]) -> str | None:

@@ -73,8 +73,11 @@ def execute_run(
     progress: Progress,
     resume: bool = False,
     certificate: Certify = "one",
+    report: bool = True,
 ) -> RunResult:
     """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
+
+    Without ``report`` there is no ``report.html``; `write_reports` makes it later.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
@@ -98,7 +101,7 @@ def execute_run(
     summary["determinism"] = determinism
     write_json(tables, summary)
     write_json(root / "run.json", read_json(root / "run.json") | {"determinism": determinism})
-    write_reports(root)
+    write_reports(root, page=report)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 

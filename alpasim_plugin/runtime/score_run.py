@@ -58,6 +58,7 @@ def execute_score(
     root: Path | None,
     command: Sequence[str],
     on_done: Callable[[dict[str, Any]], None],
+    report: bool = True,
 ) -> ScoreResult:
     """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its aggregation.
 
@@ -70,6 +71,7 @@ def execute_score(
         root: Run folder; None makes one below ``runs/`` named after content and preset.
         command: The command line, for run.json.
         on_done: Called with each log's manifest.
+        report: Write ``report.html``.
 
     Raises:
         InputError: The folder holds other results, or a log's scene is not among ``scenes``.
@@ -91,7 +93,7 @@ def execute_score(
     code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
     summary |= {"exit_code": code} | ({} if aggregation is None else {"alpasim": aggregation})
     write_json(root / "summary.json", summary)
-    write_reports(root, flips=False)
+    write_reports(root, flips=False, page=report)
     return ScoreResult(root, summary, code)
 
 

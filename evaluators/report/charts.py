@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
@@ -23,7 +24,7 @@ from evaluators.report.run_folder import Rollout, Series
 
 N_COLOURS = 8
 SIZE_IN = (4.6, 2.7)  # about 440 x 260 CSS pixels: legible at its own size on a phone
-DASHES: tuple[tuple[int, tuple[float, ...]], ...] = ((0, ()), (0, (5.0, 2.0)), (0, (1.5, 1.5)), (0, (6.0, 2.0, 1.5, 2.0)))
+DASHES: tuple[str | tuple[int, tuple[float, ...]], ...] = ("solid", (0, (5.0, 2.0)), (0, (1.5, 1.5)), (0, (6.0, 2.0, 1.5, 2.0)))
 VARIANT = [f"#01{i:02x}a1" for i in range(N_COLOURS)]  # stand-ins, found again in the SVG
 INK, MUTED, GRID = "#0201a1", "#0202a1", "#0203a1"
 VARIABLES = {colour: f"var(--variant-{i})" for i, colour in enumerate(VARIANT)}
@@ -73,11 +74,26 @@ class Curve:
     high: npt.NDArray[np.float64] | None = None
 
 
+def new_axes(height_in: float = SIZE_IN[1], left_in: float = 0.78, bottom_in: float = 0.5) -> tuple[Figure, Axes]:
+    """Return a figure with one set of axes and fixed margins.
+
+    Margins are given, not measured: measuring text takes two thirds of the time of a chart, and the page has a font of its own.
+
+    Args:
+        height_in: Height of the figure, inches.
+        left_in: Room for the tick labels and the label of the y axis, inches.
+        bottom_in: Room for those of the x axis, inches.
+    """
+    width_in = SIZE_IN[0]
+    figure = Figure(figsize=(width_in, height_in))
+    box = (left_in / width_in, bottom_in / height_in, 1.0 - (left_in + 0.08) / width_in, 1.0 - (bottom_in + 0.1) / height_in)
+    return figure, figure.add_axes(box)
+
+
 def line_chart(curves: Sequence[Curve], x_label: str, y_label: str, y_top: float | None = None) -> str:
     """Draw curves with bands and return themed SVG."""
     with mpl.rc_context(RC):
-        figure = Figure(figsize=SIZE_IN, layout="constrained")
-        axes = figure.add_subplot()
+        figure, axes = new_axes()
         for curve in curves:
             colour = VARIANT[curve.colour % N_COLOURS]
             if curve.low is not None and curve.high is not None:

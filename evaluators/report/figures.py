@@ -8,17 +8,16 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from evaluators.report.charts import GRID, INK, MUTED, N_COLOURS, RC, VARIANT, Chart, themed_svg
+from evaluators.report.charts import GRID, INK, MUTED, N_COLOURS, RC, SIZE_IN, VARIANT, Chart, new_axes, themed_svg
 from evaluators.report.headline import WORDS
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
 from evaluators.report.numbers import finite, interval
 from evaluators.report.run_folder import Run
 from evaluators.report.strata import NOT_BESIDE, VALUES, Strata
 
-WIDTH_IN = 4.6
+CHARACTER_IN = 0.075  # width of a tick label's character, inches: the page's font at 10 points
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
 ERRORS = ("collision_at_fault", "offroad", "route_distance_m")
 
@@ -68,8 +67,9 @@ def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
     variants = sorted({line.variant for line in lines})
     gap = 1.0 / (len(variants) + 1)
     with mpl.rc_context(RC | {"axes.grid.axis": "x"}):
-        figure = Figure(figsize=(WIDTH_IN, 0.75 + 0.42 * len(metrics) * max(1.0, 0.6 * len(variants))), layout="constrained")
-        axes = figure.add_subplot()
+        names = [WORDS.get(metric, metric) for metric in metrics]
+        left_in = 0.15 + CHARACTER_IN * max(len(name) for name in names)
+        figure, axes = new_axes(0.75 + 0.42 * len(metrics) * max(1.0, 0.6 * len(variants)), min(left_in, 0.55 * SIZE_IN[0]))
         axes.axvline(0.0, color=INK, linewidth=1.0)
         for line in lines:
             y = metrics.index(line.metric) + (variants.index(line.variant) + 1) * gap - 0.5
@@ -80,11 +80,12 @@ def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
             margin = max(line.margin for line in lines if line.metric == metric)
             if margin > 0.0:
                 axes.plot([margin, margin], [row - 0.42, row + 0.42], color=MUTED, linewidth=1.0, linestyle=(0, (2.0, 2.0)))
-        axes.set_yticks(range(len(metrics)), [WORDS.get(metric, metric) for metric in metrics])
+        axes.set_yticks(range(len(metrics)), names)
         axes.set_ylim(len(metrics) - 0.5, -0.5)
         axes.tick_params(length=0)
         axes.spines["left"].set_visible(False)
-        axes.set_xlabel(f"{'percentage points' if unit == 'points' else unit or 'no unit'} worse than the baseline \u2192")
+        worse_in = "percentage points" if unit == "points" else unit or "no unit"
+        axes.set_xlabel(f"{worse_in} worse than the baseline \u2192", x=1.0, ha="right")
         svg = themed_svg(figure)
     title = "Rates and shares" if unit == "points" else "Distances" if unit == "m" else f"In {unit or 'numbers without unit'}"
     return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
@@ -112,8 +113,7 @@ def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
 
 def _speed_chart(metric: str, unit: str, points: Sequence[tuple[str, float, _Line]]) -> Chart:
     with mpl.rc_context(RC):
-        figure = Figure(figsize=(WIDTH_IN, 2.7), layout="constrained")
-        axes = figure.add_subplot()
+        figure, axes = new_axes()
         axes.axhline(0.0, color=INK, linewidth=0.9, alpha=0.7)
         for variant, ms, line in points:
             colour = VARIANT[line.variant % N_COLOURS]
@@ -153,8 +153,7 @@ def strata_chart(one: Strata) -> Chart | None:
         return None
     variants = sorted({b.variant for s in known for b in s.bins})
     with mpl.rc_context(RC | {"axes.grid.axis": "y"}):
-        figure = Figure(figsize=(WIDTH_IN, 2.7), layout="constrained")
-        axes = figure.add_subplot()
+        figure, axes = new_axes()
         for k, stratum in enumerate(known):
             for b in stratum.bins:
                 if name not in b.means:
@@ -169,7 +168,7 @@ def strata_chart(one: Strata) -> Chart | None:
             axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
         axes.set_xticks(range(len(known)), [_tick(s.label, one.unit) for s in known], fontsize=8.5)
         axes.set_xlim(-0.5, len(known) - 0.5)
-        axes.set_ylim(bottom=0.0)
+        axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])  # the highest marker is whole
         axes.set_ylabel("m between plans in a row")
         axes.set_xlabel(f"{one.axis}, {one.unit}" if one.unit else one.axis)
         axes.tick_params(length=0)

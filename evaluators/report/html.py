@@ -6,6 +6,7 @@ import base64
 import hashlib
 from collections.abc import Mapping
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,14 +61,19 @@ def write_report(run_dir: Path | str) -> Path:
 
 def render_report(run: Run) -> str:
     """Render the report as a string."""
-    environment = Environment(
-        loader=PackageLoader("evaluators.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    environment = _environment()
     style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return environment.get_template("report.html.j2").render(
         style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, **context(run)
     )
+
+
+@cache
+def _environment() -> Environment:
+    """Return the templates; a process compiles each of them once."""
+    loader = PackageLoader("evaluators.report")
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 
 def context(run: Run) -> dict[str, Any]:

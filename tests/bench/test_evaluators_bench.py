@@ -43,6 +43,7 @@ def test_the_search_step_by_step_sees_what_touches():
     assert [bool(one) for one in sides] == [gap == 0 for gap in gap_m]
 
 
+@pytest.mark.slow
 def test_a_table_of_many_rollouts_is_aggregated_right():
     row = bench_table(rollouts=2_000, scenes=50)
     assert (row.rollouts, row.scenes, row.count_errors) == (2_000, 50, 0)

@@ -93,6 +93,7 @@ def test_a_setting_that_given_weights_cannot_run_says_why(tmp_path: Path) -> Non
     assert "not measured: " in text
 
 
+@pytest.mark.slow
 def test_a_row_measured_in_its_own_process_gives_the_same_pictures() -> None:
     options = BenchOptions(overrides=SMALL_DIT, passes=1, quick=True, threads=1)
     chosen = small_settings("untrained=random")

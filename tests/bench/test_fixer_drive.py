@@ -42,6 +42,7 @@ def test_a_drive_in_chunks_shows_the_whole_clips_pictures() -> None:
     assert np.abs(sample.shown.astype(int) - exact).max() <= 1
 
 
+@pytest.mark.slow
 def test_a_speculative_drive_without_tolerance_shows_them_too_and_hits_less() -> None:
     sample = drive_small("speculative", 13, "tolerance_m=0", "tolerance_deg=0")
     check(sample, 13)

@@ -66,6 +66,7 @@ CODECS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CODECS)
 def test_counter_and_torch_agree_on_codecs(name):
     codec = CODECS[name].requires_grad_(False)

@@ -128,7 +128,11 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path: Path, 
     assert {"preset", "metrics", "paired", "censoring", "failures", "speed"} <= set(summary)
     entry = summary["metrics"]["clean"]["collision_any"]
     assert {"mean", "ci95", "ci95_clustered", "n_rollouts", "n_scenes", "unit", "direction"} <= set(entry)
+    assert run_command([*command, "--no-report"]) == 0  # the page of the command before would show another run's numbers
+    assert f"simrun report {tmp_path}" in capsys.readouterr().out
+    assert not (tmp_path / "report.html").exists()
     assert run_command(["report", str(tmp_path)]) == 0
+    assert (tmp_path / "report.html").exists()
 
 
 def test_a_run_folder_that_cannot_be_made_is_a_four_part_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from tests.runtime.test_runs import Heard
 def test_the_verbs_report_what_they_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "run"
     plan = make_plan(expand("smoke/lead_car", SHORT), ("clean",), ("lane-camera",), (0,), RunOptions())
-    execute_run(plan, root, 1, ["simrun"], Heard(), certificate="none")
+    execute_run(plan, root, 1, ["simrun"], Heard(), certificate="none", report=False)
     assert run_command(["fork", str(root), "--cell", CELL, "--at", "0.6", "--out", str(tmp_path / "fork")]) == 0
     assert "continuation      equal to the log, bit for bit" in capsys.readouterr().out
     asked = ["--renderers", "clean,broken-frozen", "--out", str(tmp_path / "p"), "--json"]

@@ -24,7 +24,7 @@ def our_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of ours: one scene, one policy, two seeds, without pictures."""
     root = tmp_path_factory.mktemp("runs") / "own"
     command = ["--renderer", "clean", "--policy", "log-replay", "--seeds", "2", "--images", "none", "--workers", "1", "--quiet"]
-    assert run_command([*command, "--set", "timing.duration_us=1500000", "--out", str(root), "smoke/straight"]) == 0
+    assert run_command([*command, "--no-report", "--set", "timing.duration_us=1500000", "--out", str(root), "smoke/straight"]) == 0
     return root
 
 
@@ -53,7 +53,7 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
 
 def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
     out = tmp_path / "scored"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet"]
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet", "--no-report"]
     assert run_command(command) == 0
     first = (out / "steps.parquet").read_bytes()
     assert run_command(command) == 0
@@ -62,7 +62,7 @@ def test_the_same_command_again_gives_the_same_tables(our_run, tmp_path):
 
 def test_another_set_of_results_in_the_folder_is_not_overwritten(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
-    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet"]
+    command = ["score", str(our_run), "--scene", "smoke/straight", "--out", str(out), "--quiet", "--no-report"]
     assert run_command(command) == 0
     assert run_command([*command, "--preset", "strict"]) == 2
     assert "holds other results" in capsys.readouterr().err
@@ -72,7 +72,7 @@ def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):
     out = tmp_path / "scored"
     pattern = str(golden / "rollouts" / "synthetic-c*-in-a" / "*" / "rollout.asl")
     command = ["score", pattern, "--scene", str(golden / "scenes"), "--preset", "alpasim", "--settings", str(golden / "eval-config.yaml")]
-    assert run_command([*command, "--out", str(out)]) == 0
+    assert run_command([*command, "--no-report", "--out", str(out)]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("[1/2] ")
     want = {row["rollout_id"]: row for row in json.loads((golden / "aggregate" / "results-summary.json").read_text())["rollouts"]}
@@ -92,7 +92,7 @@ def test_golden_logs_by_pattern_with_scenes_by_folder(golden, tmp_path, capsys):
 
 def test_an_incomplete_rollout_is_a_failed_row_and_skips_alpasims_aggregation(golden, tmp_path, capsys):
     folder = golden / "cases" / "failed-rollout"
-    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--preset", "alpasim", "--quiet"]
+    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--no-report", "--preset", "alpasim", "--quiet"]
     assert run_command([*command, "--out", str(tmp_path / "a")]) == 4
     assert "aggregation was not written" in capsys.readouterr().err
     assert not (tmp_path / "a" / "aggregate").exists()
@@ -107,7 +107,7 @@ def test_an_incomplete_rollout_is_a_failed_row_and_skips_alpasims_aggregation(go
 
 def test_a_missing_map_stops_the_scene_score_and_nothing_else(golden, tmp_path, capsys):
     folder = golden / "cases" / "no-map"
-    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--quiet"]
+    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--no-report", "--quiet"]
     assert run_command([*command, "--preset", "alpasim", "--out", str(tmp_path / "a")]) == 5
     assert "missing metric 'offroad'" in capsys.readouterr().err
     assert sorted(p.name for p in (tmp_path / "a" / "aggregate").iterdir()) == ["metrics_results.parquet", "metrics_unprocessed.parquet"]
@@ -126,7 +126,8 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
         (logs / name).mkdir()
         (logs / name / "rollout.asl").write_bytes(first.read_bytes()[:size])
     out = tmp_path / "scored"
-    assert run_command(["score", str(logs), "--scene", str(golden / "scenes" / f"{GOLDEN_SCENE}.usdz"), "--out", str(out)]) == 2
+    scene = str(golden / "scenes" / f"{GOLDEN_SCENE}.usdz")
+    assert run_command(["score", str(logs), "--scene", scene, "--no-report", "--out", str(out)]) == 2
     found = {row["rollout"]: (row["status"], row["failure_class"]) for row in rows(out)}
     assert found == {"whole": ("ok", None), "cut": ("failed", "infrastructure"), "beheaded": ("failed", "input")}
     assert "of 80 control steps" in capsys.readouterr().err
@@ -134,7 +135,7 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
 
 def test_lanes_without_rails_are_centres_widened(golden, tmp_path):
     folder = golden / "cases" / "rails-stripped"
-    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--preset", "alpasim", "--quiet", "--no-rails"]
+    command = ["score", str(folder), "--scene", str(folder / "scenes"), "--no-report", "--preset", "alpasim", "--quiet", "--no-rails"]
     out = tmp_path / "scored"
     assert run_command([*command, "--settings", str(folder / "eval-config.yaml"), "--out", str(out)]) == 0
     want = {row["rollout_id"]: row for row in json.loads((folder / "aggregate" / "results-summary.json").read_text())["rollouts"]}

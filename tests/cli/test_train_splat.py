@@ -41,6 +41,7 @@ def test_files_metrics_and_pictures_and_the_same_command_continues(tmp_path: Pat
     assert json.loads(again.out)["held_out"] == metrics["held_out"]
 
 
+@pytest.mark.slow
 def test_given_images_with_times_and_points_make_a_scene_with_its_actors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenario, images = load_scenario("smoke/lead_car"), tmp_path / "images"
     views = logged_views(scenario, scene_of(scenario), 6, 32, threads=1)

@@ -16,7 +16,7 @@ from alpasim_plugin.control.tracker import MAX_LATERAL_MPS2
 from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_of
 from alpasim_plugin.types import EgoState, Trajectory, Vehicle
-from tests.examples import examples
+from tests.examples import examples, first_of
 
 VEHICLE = Vehicle()
 TRACKER = make_controller("bicycle", VEHICLE)
@@ -45,7 +45,7 @@ def xy(states: list[EgoState]) -> npt.NDArray[np.float64]:
     return np.array([s.T_world_rig[:2, 3] for s in states])
 
 
-@pytest.mark.parametrize("speed", [1.0, 3.0, 5.0, 10.0, 20.0, 35.0])
+@pytest.mark.parametrize("speed", first_of([1.0, 35.0, 3.0, 5.0, 10.0, 20.0], 2))
 def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(speed: float) -> None:
     t = np.arange(0, 40, 0.1)
     states = drive(plan_of(t, speed * t, 0, 0), at(y=0.5, speed=speed), max(6.0, 30.0 / speed))
@@ -58,7 +58,7 @@ def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(
     assert max(abs(s.yaw_rate_radps * s.speed_mps) for s in states) < 1.5, "comfort"
 
 
-@pytest.mark.parametrize(("speed", "radius"), [(2, 6), (5, 10), (10, 20), (15, 60), (30, 200), (35, 400)])
+@pytest.mark.parametrize(("speed", "radius"), first_of([(2, 6), (35, 400), (5, 10), (10, 20), (15, 60), (30, 200)], 2))
 def test_circle_is_held_to_a_centimetre(speed: float, radius: float) -> None:
     t = np.arange(0, 30, 0.1)
     a = speed * t / radius
@@ -69,7 +69,7 @@ def test_circle_is_held_to_a_centimetre(speed: float, radius: float) -> None:
     assert states[-1].speed_mps == pytest.approx(speed, rel=2e-3)
 
 
-@pytest.mark.parametrize("speed", [5.0, 10.0, 20.0, 35.0])
+@pytest.mark.parametrize("speed", first_of([35.0, 5.0, 10.0, 20.0]))
 def test_lane_change_is_followed_within_ten_centimetres(speed: float) -> None:
     t = np.arange(0, 20, 0.1)
     x = speed * t

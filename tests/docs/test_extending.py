@@ -11,7 +11,7 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
-REST = ("--seeds", "1", "--workers", "1", "--images", "none", "--certify", "none", "--json")
+REST = ("--seeds", "1", "--workers", "1", "--images", "none", "--certify", "none", "--no-report", "--json")
 SHORT = ("--set", "timing.duration_us=1200000")
 
 

@@ -128,6 +128,7 @@ def drift(settings: OneFixerSettings, reduced: str, count: int, size: tuple[int,
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_a_long_rollout_stays_finite_in_constant_memory(weights: Path) -> None:
     session = fixer(busy_settings(weights))
     held = set()

@@ -147,6 +147,7 @@ def test_splitting_by_tile_loses_nothing() -> None:
         assert np.all(np.floor(part.means[:, 0]) == i)
 
 
+@pytest.mark.slow
 def test_visible_count_of_a_street_stays_within_budget() -> None:
     from alpasim_plugin.gaussians.scene.builder import build_scene
 

@@ -100,6 +100,7 @@ def test_full_size_has_the_published_number_of_parameters():
     assert {key: tuple(value.shape) for key, value in net.state_dict().items()} == DiTSizes().shapes()
 
 
+@pytest.mark.slow
 def test_full_size_runs_without_numbers_at_544x960():
     sizes = DiTSizes()
     sd = {key: torch.empty(shape, device="meta") for key, shape in sizes.shapes().items()}

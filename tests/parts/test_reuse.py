@@ -24,7 +24,8 @@ class Odd:
     def __init__(self, gain):
         pass
 """
-SHORT = ("--seeds", "1", "--workers", "1", "--images", "none", "--certify", "none", "--json", "--set", "timing.duration_us=1200000")
+QUICK = ("--seeds", "1", "--workers", "1", "--images", "none", "--certify", "none", "--no-report", "--json")
+SHORT = (*QUICK, "--set", "timing.duration_us=1200000")
 
 
 @pytest.fixture

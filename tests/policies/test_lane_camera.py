@@ -13,6 +13,7 @@ from alpasim_plugin.geometry import trajectory_from_poses
 from alpasim_plugin.types import EgoState, Route
 from policies.lane_camera import LaneCamera
 from policies.painted_road import Block, Line, PaintedRoad, Patch, pinhole_camera
+from tests.examples import first_of
 from tests.policies.policy_world import CAMERA, close_loop, look, observe, route_of, scenario_with
 
 ROAD = PaintedRoad()
@@ -98,7 +99,7 @@ def test_lane_is_remembered_over_frames_without_paint() -> None:
 # --- closed loop ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("curvature", "speed"), [(0.0, 14.0), (1 / 100, 12.0), (-1 / 40, 8.0)])
+@pytest.mark.parametrize(("curvature", "speed"), first_of([(-1 / 40, 8.0), (0.0, 14.0), (1 / 100, 12.0)]))
 def test_lane_is_kept_without_any_route(curvature: float, speed: float) -> None:
     drive = close_loop(policy(), PaintedRoad(curvature_1pm=curvature), speed, 5.0, with_route=False)
     assert np.abs(drive.offset_m).max() < 0.6
@@ -119,6 +120,7 @@ def test_car_ahead_is_stopped_for_and_the_car_stays_standing() -> None:
     assert np.diff(drive.speed_mps).min() > -0.75, "and not by slamming the brakes"
 
 
+@pytest.mark.slow
 def test_slower_car_is_followed_at_a_distance() -> None:
     drive = close_loop(policy(), lambda t: PaintedRoad(blocks=(Block(30.0 + 6.0 * t, colour=(210, 210, 215)),)), 10.0, 7.0)
     gap = 30.0 + 6.0 * 6.9 - 2.25 - (drive.s_m[-1] + 1.4 + 4.855 / 2)
@@ -128,11 +130,11 @@ def test_slower_car_is_followed_at_a_distance() -> None:
 
 @pytest.mark.parametrize(
     "flat",
-    [
+    first_of([
         tuple(Patch((30.0, 33.0), (-3.0 + i, -2.5 + i), (225, 225, 225)) for i in range(9)),  # a crosswalk
-        (Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),  # a stop line
-        (Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),  # a shadow
-    ],
+        ((Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),),  # a stop line
+        ((Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),),  # a shadow
+    ]),
     ids=["crosswalk", "stop line", "shadow"],
 )
 def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> None:
@@ -141,6 +143,7 @@ def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> 
     assert np.abs(drive.offset_m).max() < 0.6
 
 
+@pytest.mark.slow
 def test_car_in_the_next_lane_is_passed() -> None:
     drive = close_loop(policy(), PaintedRoad(blocks=(Block(40.0, 3.5), Block(55.0, 3.5))), 10.0, 5.0)
     assert drive.speed_mps.min() > 8.5

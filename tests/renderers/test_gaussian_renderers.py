@@ -92,6 +92,7 @@ def test_severity_zero_and_kind_none_render_the_clean_scene(scenario: Scenario) 
         np.testing.assert_array_equal(make_renderer("3dgs", other).render(request(scenario, left_m=2.0)).rgb, clean.rgb)
 
 
+@pytest.mark.slow
 def test_higher_severity_is_worse(scenario: Scenario) -> None:
     clean = make_renderer("clean", scenario)
     r = request(scenario, left_m=1.5)

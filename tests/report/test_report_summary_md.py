@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,6 +49,7 @@ def test_cut_keeps_within_the_limit_and_stays_text(text: str, limit: int) -> Non
         assert text.startswith(done.removesuffix(CUT_NOTE))
 
 
+@pytest.mark.slow
 def test_huge_summary_is_cut_with_a_note(usual_run: Path, tmp_path: Path) -> None:
     folder = make_run(tmp_path, Plan(renderers=("clean",), scenes=("a",), seeds=(0,), steps=3))
     summary = json.loads((folder / "summary.json").read_text())

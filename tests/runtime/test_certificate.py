@@ -33,7 +33,7 @@ def certificate(plan: RunPlan, root: Path, before: dict | None = None, wanted: C
 
 
 def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Path) -> None:
-    found = execute_run(plan_of(), tmp_path, 1, ["simrun"], Heard()).summary["determinism"]
+    found = execute_run(plan_of(), tmp_path, 1, ["simrun"], Heard(), report=False).summary["determinism"]
     assert found["status"] == "equal"
     assert found["cell"]["scene"] == "smoke-straight"
     assert found["steps"] == 8
@@ -103,10 +103,14 @@ def test_resuming_with_more_rollouts_certifies_the_folder_as_it_is_now(tmp_path:
 
 
 def test_what_cannot_be_repeated_is_said(tmp_path: Path) -> None:
-    assert certificate(plan_of(policy="pure-pursuit"), tmp_path / "off", wanted="none")["reason"] == "switched off with --certify none"
-    measured = certificate(plan_of(policy="pure-pursuit", overrides=("latency.kind=measured",)), tmp_path / "measured")
+    def of_one_scene(policy: str, *overrides: str) -> RunPlan:
+        return make_plan(expand("smoke/straight", (SHORT, *BARE, *overrides)), ("clean",), (policy,), (0,), RunOptions(images="none"))
+
+    off = certificate(of_one_scene("constant-velocity"), tmp_path / "off", wanted="none")
+    assert off["reason"] == "switched off with --certify none"
+    measured = certificate(of_one_scene("constant-velocity", "latency.kind=measured"), tmp_path / "measured")
     assert measured == {"status": "skipped", "reason": "latency 'measured' depends on the machine: no rollout can be repeated"}
-    failed = certificate(plan_of(policy="tests.runtime.broken_policies:Raises"), tmp_path / "failed")
+    failed = certificate(of_one_scene("tests.runtime.broken_policies:Raises"), tmp_path / "failed")
     assert failed == {"status": "skipped", "reason": "no rollout finished"}
     assert certificate_line(failed) == "skipped: no rollout finished"
 

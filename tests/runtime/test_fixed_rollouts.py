@@ -18,6 +18,7 @@ from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
 from alpasim_plugin.types import CameraSpec, Frame, Latency, Observation, Plan, Rates, RenderRequest, Route, Scenario, SensorSpec
 from policies.log_replay import LogReplay
+from tests.examples import first_of
 from tests.fixers.block_fixers import Blend, GivesFloats, GuardSteps, LosesAFrame, Raises, ShiftsTime, fixed_offline
 
 
@@ -131,7 +132,7 @@ def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road:
         assert_same_pictures(run.frames[i : i + 1], offline[i : i + 1])
 
 
-@pytest.mark.parametrize("tolerance_m", [0.0, 0.02, 100.0])
+@pytest.mark.parametrize("tolerance_m", first_of([0.02, 0.0, 100.0]))
 def test_the_history_is_of_true_frames_whatever_the_forecasts_were(straight_road: Scenario, tolerance_m: float) -> None:
     run = drive(straight_road, Zigzag, tolerance_m=tolerance_m, tolerance_deg=180.0)
     facts = run.session.facts()
@@ -153,6 +154,7 @@ def test_a_frame_is_never_further_off_than_the_tolerance(straight_road: Scenario
     assert max(frame.facts.get("forecast_error_m", 0.0) for frame in run.frames) > 0.02
 
 
+@pytest.mark.slow
 def test_the_shown_frame_of_a_hit_is_the_one_of_the_foretold_pose(straight_road: Scenario) -> None:
     run = drive(straight_road, Zigzag, tolerance_m=100.0, tolerance_deg=180.0)
     for start, size in ((13, 8), (21, 8)):
@@ -178,6 +180,7 @@ def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_l
     assert session.facts()["redrafts"] > 0
 
 
+@pytest.mark.slow
 def test_two_rollouts_in_turns_are_each_as_alone(straight_road: Scenario) -> None:
     alone = [drive(straight_road, policy, tolerance_m=0.01) for policy in (Watching, Zigzag)]
     sessions = [session_of(straight_road, Blend, tolerance_m=0.01) for _ in alone]
@@ -250,6 +253,7 @@ def test_cameras_in_step_share_a_fixer_and_not_their_histories(straight_road: Sc
         assert_same_pictures([frame for frame in run.frames if frame.camera == camera], offline)
 
 
+@pytest.mark.slow
 def test_cameras_of_different_periods_have_fixers_of_their_own(straight_road: Scenario) -> None:
     class Uneven(Watching):
         sensors = (SensorSpec("front"), SensorSpec("rear", 200_000))
@@ -272,7 +276,7 @@ def test_the_session_of_a_finished_rollout_is_not_taken_for_another(straight_roa
 # --- chunk ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("policy", [Watching, Zigzag])
+@pytest.mark.parametrize("policy", first_of([Zigzag, Watching]))
 def test_whole_blocks_of_true_frames_equal_the_offline_result(straight_road: Scenario, policy: type[Watching]) -> None:
     run = drive(straight_road, policy, mode="chunk")
     assert [len(call) for call in run.calls] == [5, 8, 8, 8]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,9 +29,9 @@ def plan_of(fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
     return make_plan(refs, ("clean", "onefixer+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer))
 
 
-def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> list[tuple[str, bool]]:
+def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False) -> list[tuple[str, bool]]:
     heard = Heard()
-    execute_run(plan, root, workers, ["simrun"], heard, resume, "none")
+    execute_run(plan, root, workers, ["simrun"], heard, resume, "none", report)
     return heard.fates
 
 
@@ -50,7 +51,7 @@ def _one_core() -> Iterator[None]:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Give a finished run of one worker."""
     root = tmp_path_factory.mktemp("run")
-    run(plan_of(), root)
+    run(plan_of(), root, report=True)
     return root
 
 
@@ -62,16 +63,17 @@ def test_one_and_two_workers_give_the_same_frames_and_scores(finished: Path, tmp
         assert (tmp_path / path.relative_to(finished)).read_bytes() == path.read_bytes()
 
 
-def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path) -> None:
+def test_the_same_command_continues_and_another_setting_does_not_reuse(finished: Path, tmp_path: Path) -> None:
     plan = plan_of()
+    root = tmp_path / "run"
+    shutil.copytree(finished, root)
     before = comparable(finished)
     fixed = next(cell for cell in plan.cells if cell.renderer.name == "onefixer+clean")
-    (finished / fixed.folder / MANIFEST).unlink()
-    assert sorted(run(plan, finished)) == [("ok", False), ("ok", True)]
-    assert comparable(finished) == before
-    again = run(plan_of(fixer=(*SMALL_NET, "tolerance_m=0")), finished, resume=True)
+    (root / fixed.folder / MANIFEST).unlink()
+    assert sorted(run(plan, root)) == [("ok", False), ("ok", True)]
+    assert comparable(root) == before
+    again = run(plan_of(fixer=(*SMALL_NET, "tolerance_m=0")), root, resume=True)
     assert again == [("ok", True), ("ok", False)]  # the plain renderer's is reused
-    run(plan, finished, resume=True)
 
 
 def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
@@ -115,7 +117,7 @@ def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
 
 def test_a_plain_run_knows_nothing_of_fixers(tmp_path: Path) -> None:
     plan = make_plan(expand("smoke/straight", SCENE), ("clean",), ("constant-velocity",), (0,), RunOptions())
-    run(plan, tmp_path)
+    run(plan, tmp_path, report=True)
     assert json.loads((tmp_path / "summary.json").read_text())["fixers"] == {}
     assert 'id="fixers"' not in (tmp_path / "report.html").read_text()
 

@@ -24,7 +24,7 @@ def one_rollout() -> RunPlan:
 
 def run(of: RunPlan, root: Path) -> list[tuple[str, bool]]:
     heard = Heard()
-    execute_run(of, root, 1, ["simrun"], heard, certificate="none")
+    execute_run(of, root, 1, ["simrun"], heard, certificate="none", report=False)
     return heard.fates
 
 

@@ -44,6 +44,7 @@ def test_every_camera_and_frame_agrees(clip, camera):
     assert min(found.ours, found.published) >= 0.95
 
 
+@pytest.mark.slow
 def test_a_wrong_mount_is_noticed(clip):
     """One degree of yaw is what separates the other car's mount from this one's; it costs agreement."""
     other = compare(clip, FRONT_WIDE, orthonormal(T_RIG_FRONT_WIDE), SOLID, every=28)

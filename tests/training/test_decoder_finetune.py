@@ -51,6 +51,7 @@ def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data: Path, 
     assert Rollouts(clips, other, 2, 4, True, tmp_path / "r").digest != rollouts.digest
 
 
+@pytest.mark.slow
 def test_a_generator_without_a_map_is_rolled_out_without_one(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
     with_map, without = (Rollouts(clips, net, 2, 4, use_map, tmp_path / "r") for use_map in (True, False))

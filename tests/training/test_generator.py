@@ -114,6 +114,7 @@ def test_every_variant_trains_by_one_function(data: Path, tmp_path: Path, name: 
     assert start["additional_patch_embedding.proj.1.weight"].shape[1] == (64 if run.variant.mixed else 128)
 
 
+@pytest.mark.slow
 def test_a_run_can_be_stopped_for_what_there_is_and_goes_on(data: Path, tmp_path: Path) -> None:
     path = train_fixer(run_of(data, "base", steps=3), tmp_path / "run", stop_at=2)
     assert read_metadata(path)["note"] == "base, 2 of 3 updates"
