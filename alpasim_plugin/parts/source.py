@@ -119,7 +119,7 @@ def _names(text: bytes) -> Iterator[str]:
 
 
 def _imported(path: str, root: str) -> Iterable[str]:
-    """Return the files that a module imports. Those of our own modules are found once: our files do not come and go while a process runs."""
+    """Return the files that a module imports; of our own modules once, because our files do not come and go while a process runs."""
     if root != OWN_ROOT:
         return _find_imported(path, root)
     stat = os.stat(path)
