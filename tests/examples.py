@@ -22,9 +22,10 @@ def examples(full: int) -> int:
 
 
 def first_of(cases: Sequence[Any], count: int = 1) -> list[Any]:
-    """Return the cases of a parametrised test, all but the first ``count`` of them marked ``slow``."""
-    return [case if k < count else pytest.param(*_values(case), marks=pytest.mark.slow) for k, case in enumerate(cases)]
+    """Return the cases of a test with one parameter, all but the first ``count`` of them marked ``slow``."""
+    return [case if k < count else pytest.param(case, marks=pytest.mark.slow) for k, case in enumerate(cases)]
 
 
-def _values(case: Any) -> tuple[Any, ...]:
-    return case if isinstance(case, tuple) else (case,)
+def first_rows_of(cases: Sequence[tuple[Any, ...]], count: int = 1) -> list[Any]:
+    """Do the same for a test with several parameters, whose cases are tuples of their values."""
+    return [case if k < count else pytest.param(*case, marks=pytest.mark.slow) for k, case in enumerate(cases)]

@@ -27,8 +27,8 @@ LAPTOP = "1:0.1:20:8"
 
 @pytest.mark.parametrize(
     "overrides",
-    first_of([(("history=finalise", "window=4", "holes=noise"),), (("precision=bf16", "codec_precision=bf16", "steps=[1000,500]"),),
-              (("vae.kind=wan", "vae.base=8", "decoder.kind=taehv", "uses_map=false"),)]),
+    first_of([("history=finalise", "window=4", "holes=noise"), ("precision=bf16", "codec_precision=bf16", "steps=[1000,500]"),
+              ("vae.kind=wan", "vae.base=8", "decoder.kind=taehv", "uses_map=false")]),
     ids=",".join,
 )  # fmt: skip
 def test_work_without_numbers_is_the_work_of_the_real_networks(overrides):

@@ -16,7 +16,7 @@ from alpasim_plugin.control.tracker import MAX_LATERAL_MPS2
 from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_of
 from alpasim_plugin.types import EgoState, Trajectory, Vehicle
-from tests.examples import examples, first_of
+from tests.examples import examples, first_of, first_rows_of
 
 VEHICLE = Vehicle()
 TRACKER = make_controller("bicycle", VEHICLE)
@@ -58,7 +58,7 @@ def test_half_a_metre_beside_a_straight_plan_is_closed_with_one_small_overshoot(
     assert max(abs(s.yaw_rate_radps * s.speed_mps) for s in states) < 1.5, "comfort"
 
 
-@pytest.mark.parametrize(("speed", "radius"), first_of([(2, 6), (35, 400), (5, 10), (10, 20), (15, 60), (30, 200)], 2))
+@pytest.mark.parametrize(("speed", "radius"), first_rows_of([(2, 6), (35, 400), (5, 10), (10, 20), (15, 60), (30, 200)], 2))
 def test_circle_is_held_to_a_centimetre(speed: float, radius: float) -> None:
     t = np.arange(0, 30, 0.1)
     a = speed * t / radius

@@ -37,7 +37,7 @@ def others() -> list[np.ndarray]:
     return []
 
 
-@pytest.mark.parametrize("overrides", first_of([(case,) for case in CASES], 4), ids=",".join)
+@pytest.mark.parametrize("overrides", first_of(CASES, 4), ids=",".join)
 def test_blocks_equal_the_whole_clip(weights: Path, others: list[np.ndarray], overrides: tuple[str, ...]) -> None:
     settings = busy_settings(weights, *overrides)
     frames = moving_picture(29)

@@ -28,7 +28,7 @@ def frames_of(session, frames, redo=()):
     return [frame.rgb for frame in out]
 
 
-@pytest.mark.parametrize("overrides", first_of([(case,) for case in CASES], 2), ids=",".join)
+@pytest.mark.parametrize("overrides", first_of(CASES, 2), ids=",".join)
 def test_recorded_blocks_equal_eager_ones(weights: Path, overrides: tuple[str, ...]) -> None:
     settings = busy_settings(weights, *overrides)
     frames = moving_picture(5 + 8 * 7)

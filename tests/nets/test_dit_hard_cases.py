@@ -43,9 +43,8 @@ def test_odd_heads_have_no_rotation():
         axis_widths(7)
 
 
-@pytest.mark.parametrize(
-    "dtype", [torch.bfloat16, *(pytest.param(dtype, marks=pytest.mark.slow) for dtype in (torch.float32, torch.float16))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float16])
 def test_3600_frames_stay_finite_in_constant_memory(dtype):
     net = network(dtype=dtype)
     cache = net.new_cache(1, 2, 2, window=4)

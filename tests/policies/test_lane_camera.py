@@ -13,7 +13,7 @@ from alpasim_plugin.geometry import trajectory_from_poses
 from alpasim_plugin.types import EgoState, Route
 from policies.lane_camera import LaneCamera
 from policies.painted_road import Block, Line, PaintedRoad, Patch, pinhole_camera
-from tests.examples import first_of
+from tests.examples import first_of, first_rows_of
 from tests.policies.policy_world import CAMERA, close_loop, look, observe, route_of, scenario_with
 
 ROAD = PaintedRoad()
@@ -99,7 +99,7 @@ def test_lane_is_remembered_over_frames_without_paint() -> None:
 # --- closed loop ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("curvature", "speed"), first_of([(-1 / 40, 8.0), (0.0, 14.0), (1 / 100, 12.0)]))
+@pytest.mark.parametrize(("curvature", "speed"), first_rows_of([(-1 / 40, 8.0), (0.0, 14.0), (1 / 100, 12.0)]))
 def test_lane_is_kept_without_any_route(curvature: float, speed: float) -> None:
     drive = close_loop(policy(), PaintedRoad(curvature_1pm=curvature), speed, 5.0, with_route=False)
     assert np.abs(drive.offset_m).max() < 0.6
@@ -132,8 +132,8 @@ def test_slower_car_is_followed_at_a_distance() -> None:
     "flat",
     first_of([
         tuple(Patch((30.0, 33.0), (-3.0 + i, -2.5 + i), (225, 225, 225)) for i in range(9)),  # a crosswalk
-        ((Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),),  # a stop line
-        ((Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),),  # a shadow
+        (Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),  # a stop line
+        (Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),  # a shadow
     ]),
     ids=["crosswalk", "stop line", "shadow"],
 )

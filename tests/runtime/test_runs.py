@@ -19,6 +19,7 @@ from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from scenarios.suite import expand
+from tests.runtime.grey_renderer import GREY
 
 SHORT = ("timing.duration_us=1200000", "degradation.kind=surrogate")
 
@@ -44,7 +45,7 @@ def plan_of(policies: tuple[str, ...] = ("lane-camera",), scenes: tuple[str, ...
 def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
     """Plan four rollouts a seed that render next to nothing: what is reused does not depend on the renderer."""
     refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
-    return make_plan(refs, ("clean",), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
+    return make_plan(refs, (GREY,), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
 
 
 def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Heard]:
@@ -92,7 +93,7 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> 
 
 def test_a_failing_policy_is_a_failed_rollout_and_exit_code_4(tmp_path: Path) -> None:
     broken = "tests.runtime.broken_policies:Raises"
-    plan = make_plan(expand("smoke/straight", SHORT), ("clean",), ("constant-velocity", broken), (0, 1), RunOptions())
+    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("constant-velocity", broken), (0, 1), RunOptions())
     result, _ = run(plan, tmp_path)
     assert (result.n_rollouts, result.n_failed, result.exit_code) == (4, 2, 4)
     assert result.summary["failures"]["by_class"] == {"policy": 2}
@@ -107,7 +108,7 @@ def test_a_failing_policy_is_a_failed_rollout_and_exit_code_4(tmp_path: Path) ->
 def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path, seeds: tuple[int, ...]) -> None:
     refs = expand("smoke/straight", SHORT)
     killer = "tests.runtime.broken_policies:KillsItsProcess"
-    plan = make_plan(refs, ("clean",), ("constant-velocity", killer, "pure-pursuit"), seeds, RunOptions())
+    plan = make_plan(refs, (GREY,), ("constant-velocity", killer, "pure-pursuit"), seeds, RunOptions())
     result, _ = run(plan, tmp_path, workers=2)
     assert result.n_failed == len(seeds)
     assert {cell["policy"] for cell in result.summary["failures"]["cells"]} == {killer}

@@ -1,0 +1,17 @@
+"""A renderer that costs nothing: for runs whose subject is what happens to rollouts, not what they show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alpasim_plugin.types import Frame, RenderRequest
+
+GREY = "tests.runtime.grey_renderer:Grey"
+
+
+class Grey:
+    """One grey level."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        shape = (request.camera.height, request.camera.width, 3)
+        return Frame(request.t_us, request.camera.name, np.full(shape, 90, dtype=np.uint8))
