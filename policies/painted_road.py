@@ -121,19 +121,21 @@ class PaintedRoad:
 
     def _colours(self, s_m: F64, offset_m: F64) -> F32:
         """Return the colours ``(N, 3)`` of ground points in road coordinates."""
-        out = np.empty((len(s_m), 3), dtype=np.float32)
-        out[:] = self.grass
+        # Numbers of paints are drawn, a quarter of the bytes of colours.
+        paints: list[Colour] = [self.grass, self.asphalt]
         on_road = (offset_m > self.road_m[0]) & (offset_m < self.road_m[1])
-        out[on_road] = self.asphalt
+        index = on_road.astype(np.uint8)
         for line in self.lines:
             paint = on_road & (np.abs(offset_m - line.offset_m) < self.line_width_m / 2)
             if line.dashed:
-                paint &= np.mod(s_m, PERIOD_M) < DASH_M
-            out[paint] = line.colour
+                paint[paint] = np.mod(s_m[paint], PERIOD_M) < DASH_M
+            index[paint] = len(paints)
+            paints.append(line.colour)
         for patch in self.patches:
             inside = (s_m > patch.s_m[0]) & (s_m < patch.s_m[1]) & (offset_m > patch.offset_m[0]) & (offset_m < patch.offset_m[1])
-            out[on_road & inside] = patch.colour
-        return out
+            index[on_road & inside] = len(paints)
+            paints.append(patch.colour)
+        return np.asarray(np.array(paints, dtype=np.float32)[index])
 
     def _draw(self, image: F32, K: F64, T_world_camera: F64, block: Block, n: int) -> None:
         length, width, height = block.size_m

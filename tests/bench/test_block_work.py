@@ -71,6 +71,7 @@ def test_random_networks_run_at_every_precision():
         assert not pipeline.networks.trained
 
 
+@pytest.mark.slow
 def test_measuring_gives_every_stage():
     settings = small_settings()
     work = block_work(settings, 32, 48, text_tokens=1)

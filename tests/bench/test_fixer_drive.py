@@ -51,6 +51,7 @@ def test_a_speculative_drive_without_tolerance_shows_them_too_and_hits_less() ->
     assert loose.facts["redrafts"] == 0 < sample.facts["redrafts"]
 
 
+@pytest.mark.slow
 def test_nothing_fixed_shows_what_was_rendered() -> None:
     sample = drive(SCENE, 5, SIZE, fixer_settings("identity", ["mode=chunk", "uses_map=true"]), "bench", renderer="clean", threads=1)
     assert np.array_equal(sample.shown, sample.clip.rgb)

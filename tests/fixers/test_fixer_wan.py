@@ -14,6 +14,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.settings import OneFixerSettings
+from tests.examples import first_of
 from tests.fixers.fixer_cases import Recorded, fixer, maps_of, moving_picture, pixels, run_blocks
 
 FRAMES = moving_picture(13)
@@ -45,7 +46,7 @@ def settings_of(*overrides: str) -> OneFixerSettings:
     return settings
 
 
-@pytest.mark.parametrize("decoder", ["latent", "taehv"])
+@pytest.mark.parametrize("decoder", first_of(["taehv", "latent"]))
 def test_blocks_equal_the_whole_clip(paths: list[str], shared_data: Path, decoder: str) -> None:
     taehv = f"weights.decoder={shared_data / 'golden-nets' / 'taehv.weights.safetensors'}"
     settings = settings_of(*paths, f"decoder.kind={decoder}", *([taehv] if decoder == "taehv" else []))

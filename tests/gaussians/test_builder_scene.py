@@ -195,6 +195,7 @@ def test_actors_of_one_scene_differ_in_colour_and_keep_it(street: tuple[Scenario
     np.testing.assert_array_equal(again.levels[0].cloud.sh, street[1].actors["car-1"].levels[0].cloud.sh)
 
 
+@pytest.mark.slow
 def test_dusk_darkens_everything_below_the_sky(street: tuple[Scenario, SceneGraph]) -> None:
     scenario = straight(environment=Environment(sky="dusk"))
     day, dusk = (g.render(view(scenario, 2), {}) for g in (street[1], built(scenario)))

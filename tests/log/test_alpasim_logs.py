@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,9 @@ import pytest
 from alpasim_plugin.geometry import matrix_from_quat
 from alpasim_plugin.log import decode_image, read_asl
 from alpasim_plugin.types import Box
+
+
+read_log = lru_cache(maxsize=64)(read_asl)  # several tests look at the same logs
 
 
 def golden(shared_data: Path) -> list[Path]:
@@ -22,7 +26,7 @@ def test_every_log_written_by_alpasim_is_read(shared_data: Path) -> None:
     logs = golden(shared_data)
     assert len(logs) == 57
     for path in logs:
-        log = read_asl(path)
+        log = read_log(path)
         totals.update(log.info["entries"])
         assert log.warnings == ()
         assert (log.session_uuid, log.scene_id) == (path.parent.name, path.parent.parent.name)
@@ -69,7 +73,7 @@ def test_every_log_written_by_alpasim_is_read(shared_data: Path) -> None:
 )
 def test_golden_headers(shared_data: Path, scene: str, control_us: int, force_gt_us: int, n_actors: int | None) -> None:
     for path in sorted((shared_data / "alpasim-golden" / "rollouts" / scene).rglob("*.asl")):
-        log = read_asl(path)
+        log = read_log(path)
         assert (log.control_us, log.force_gt_us) == (control_us, force_gt_us)
         assert n_actors is None or len(log.actors) == n_actors
         assert decode_image(log.images[0].data).shape == (40, 64, 3)
@@ -89,10 +93,10 @@ def test_golden_plans_rollout_has_empty_and_sampled_answers(shared_data: Path) -
 def test_golden_log_without_actors_has_none(shared_data: Path) -> None:
     logs = list((shared_data / "alpasim-golden/cases/no-actors/rollouts").rglob("*.asl"))
     assert len(logs) == 2
-    assert all(read_asl(path).actors == {} for path in logs)
+    assert all(read_log(path).actors == {} for path in logs)
 
 
 def test_golden_log_of_a_failed_rollout_is_read(shared_data: Path) -> None:
     (path,) = (shared_data / "alpasim-golden/cases/failed-rollout/incomplete").rglob("*.asl")
-    log = read_asl(path)
+    log = read_log(path)
     assert (len(log.ego), log.info["empty_plans"], log.info["n_steps"]) == (27, 1, 46)

@@ -12,6 +12,7 @@ from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text
 from alpasim_plugin.nets.sampling import finalise, mixed_source, sample_block
 from alpasim_plugin.nets.schedule import steps
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from tests.examples import first_of
 from tests.nets.cache_history import history
 from tests.nets.dit_reference import random_weights
 from tests.nets.eager_recorder import EagerRecorder
@@ -60,7 +61,7 @@ def addresses(cache):
     return [part.data_ptr() for part in (cache.keys, cache.values, cache._rows, *table)]
 
 
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("precision", first_of(["fp32", "bf16"]))
 def test_replayed_blocks_are_eager_blocks_bit_for_bit(precision):
     eager, recorded = Drive(precision=precision), Drive(EagerRecorder(), precision=precision)
     places = []

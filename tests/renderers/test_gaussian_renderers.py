@@ -70,6 +70,7 @@ def test_depth_of_the_road_is_that_of_the_plane(scenario: Scenario) -> None:
         assert frame.depth[row, 100:120] == pytest.approx(expected, rel=0.06)
 
 
+@pytest.mark.slow
 def test_error_of_3dgs_grows_with_the_distance_from_the_logged_path(scenario: Scenario) -> None:
     clean, bad = make_renderer("clean", scenario), make_renderer("3dgs", scenario)
     frames = range(4, 36, 8)

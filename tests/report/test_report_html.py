@@ -149,6 +149,7 @@ def test_bare_tables_are_enough(usual_run: Path, tmp_path: Path) -> None:
     assert not [a for a in page.addresses if a.startswith("rollouts/") and a != "rollouts/"]
 
 
+@pytest.mark.slow
 def test_many_scenes_are_capped_and_the_rest_is_named(tmp_path: Path) -> None:
     scenes = tuple(f"city/block-{k:03d}" for k in range(40))
     folder = make_run(tmp_path, Plan(renderers=("clean", "3dgs"), scenes=scenes, seeds=(0,), steps=30, picture_px=(64, 36), clips=False))

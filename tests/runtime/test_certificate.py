@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
@@ -93,6 +94,7 @@ def test_the_same_command_again_keeps_the_certificate_until_the_log_is_another(t
     assert found["first_difference"]["step"] == 7
 
 
+@pytest.mark.slow
 def test_resuming_with_more_rollouts_certifies_the_folder_as_it_is_now(tmp_path: Path) -> None:
     longer = make_plan(expand("smoke/lead_car", (LONGER, *BARE)), ("clean",), ("pure-pursuit",), (0,), RunOptions(images="none"))
     first = certificate(longer, tmp_path)

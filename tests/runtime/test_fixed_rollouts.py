@@ -192,6 +192,7 @@ def test_two_rollouts_in_turns_are_each_as_alone(straight_road: Scenario) -> Non
         assert_same_pictures(came[k], run.frames)
 
 
+@pytest.mark.slow
 def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road: Scenario) -> None:
     ahead, parked = straight_road.actors
     idm = replace(ahead, behaviour=replace(ahead.behaviour, kind="idm", params={"desired_speed_mps": 3.0}))
@@ -201,6 +202,7 @@ def test_a_reactive_actor_that_brakes_unforeseen_makes_a_new_draft(straight_road
     assert facts["redrafts"] > 0
 
 
+@pytest.mark.slow
 def test_an_actor_that_appears_by_its_track_is_foretold(straight_road: Scenario) -> None:
     ahead, parked = straight_road.actors
     late = slice(160, None)  # from 1.6 s on, in the middle of a block

@@ -40,6 +40,7 @@ def times_and_images(path: Path) -> tuple[list[Fraction], U8]:
         return [frame.time * video.format.time_base for frame in frames], np.stack([frame.image for frame in frames])
 
 
+@pytest.mark.slow
 def test_a_freeway_of_an_odd_size_keeps_times_and_picture(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = small(shared_data / FREEWAY, tmp_path / "in.mp4", (150, 84), 15)  # neither side a multiple of 16
     summary = refine(capsys, source, "-o", tmp_path / "out.mp4")

@@ -126,6 +126,7 @@ def test_drives_leave_the_path_and_meet_others(scenario) -> None:
     assert np.mean([m.collision_free for d in drives for m in d.states]) > 0.9
 
 
+@pytest.mark.slow
 def test_batches_depend_on_their_number_alone_and_can_be_learned(root: Path, tmp_path: Path) -> None:
     torch.set_num_threads(1)
     task = PolicyTask(LearnedNet(0), read_demonstrations(root, "train"), PolicyRecipe(batch=6, brightness_jitter=0.0))
