@@ -13,7 +13,6 @@ from alpasim_plugin.geometry import matrix_from_quat
 from alpasim_plugin.log import decode_image, read_asl
 from alpasim_plugin.types import Box
 
-
 read_log = lru_cache(maxsize=64)(read_asl)  # several tests look at the same logs
 
 
