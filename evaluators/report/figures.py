@@ -17,6 +17,7 @@ from evaluators.report.numbers import finite, interval
 from evaluators.report.run_folder import Run
 from evaluators.report.strata import NOT_BESIDE, VALUES, Strata
 
+LETTER_PT, LINE_PT = 6.0, 12.0  # width and height of a letter of a name, points
 CHARACTER_IN = 0.075  # width of a tick label's character, inches: the page's font at 10 points
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
 ERRORS = ("collision_at_fault", "offroad", "route_distance_m")
@@ -91,43 +92,79 @@ def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
     return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
 
 
+@dataclass(frozen=True)
+class _Point:
+    """A renderer in the chart of speed against error."""
+
+    variant: str
+    mean_ms: float
+    p95_ms: float
+    line: _Line
+
+
 def speed_against_error(run: Run, variants: Mapping[str, int]) -> list[Chart]:
-    """Draw milliseconds per frame against what the renderer does to the driving, for each of a few metrics."""
+    """Draw milliseconds per frame against what the renderer does to the driving, for each of a few metrics.
+
+    The time is the mean: a fixer of blocks spends nothing on most frames, so its median says nothing of what a rollout costs.
+    """
     speed = run.summary.get("speed") or {}
-    times = {variant: ms for variant, entry in speed.items() if (ms := finite(entry.get("ms_per_frame_p50"))) is not None and ms > 0}
     paired = run.summary.get("paired") or {}
     charts = []
     for metric in ERRORS:
         points = []
-        for variant, ms in times.items():
+        for variant, times in speed.items():
+            mean_ms, p95_ms = finite(times.get("ms_per_frame_mean")), finite(times.get("ms_per_frame_p95"))
+            if mean_ms is None or mean_ms <= 0:
+                continue
             entry = (paired.get(variant) or {}).get(metric)
-            if entry is None and variant not in paired:
-                points.append((variant, ms, _Line(metric, variants.get(variant, 0), 0.0, 0.0, 0.0, 0.0)))
-            elif entry is not None and (found := _line(metric, variants.get(variant, 0), entry)) is not None:
-                points.append((variant, ms, found[1]))
-        if len(points) >= 2 and any(line.low < line.high or line.centre for _, _, line in points):
-            unit = "points" if in_percent(metric, "") else "m"
-            charts.append(_speed_chart(metric, unit, points))
+            line = _Line(metric, variants.get(variant, 0), 0.0, 0.0, 0.0, 0.0) if entry is None and variant not in paired else None
+            if entry is not None and (found := _line(metric, variants.get(variant, 0), entry)) is not None:
+                line = found[1]
+            if line is not None:
+                points.append(_Point(variant, mean_ms, mean_ms if p95_ms is None else p95_ms, line))
+        if len(points) >= 2 and any(p.line.low < p.line.high or p.line.centre for p in points):
+            charts.append(_speed_chart(metric, "points" if in_percent(metric, "") else "m", points))
     return charts
 
 
-def _speed_chart(metric: str, unit: str, points: Sequence[tuple[str, float, _Line]]) -> Chart:
+def _speed_chart(metric: str, unit: str, points: Sequence[_Point]) -> Chart:
     with mpl.rc_context(RC):
         figure, axes = new_axes()
         axes.axhline(0.0, color=INK, linewidth=0.9, alpha=0.7)
-        for variant, ms, line in points:
-            colour = VARIANT[line.variant % N_COLOURS]
-            axes.plot([ms, ms], [line.low, line.high], color=colour, linewidth=1.8)
-            axes.plot([ms], [line.centre], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=7, label=variant)
-            left = ms <= min(t for _, t, _ in points)  # the intervals of the slower ones lie to its right
-            axes.annotate(
-                variant, (ms, line.centre), (-7 if left else 7, 5), textcoords="offset points", ha="right" if left else "left", color=colour
-            )
-        _time_axis(axes, [ms for _, ms, _ in points])
-        axes.set_xlabel("ms per camera frame, median")
+        for point in points:
+            line, colour = point.line, VARIANT[point.line.variant % N_COLOURS]
+            axes.plot([point.mean_ms, point.mean_ms], [line.low, line.high], color=colour, linewidth=1.8)
+            axes.plot([point.mean_ms, max(point.p95_ms, point.mean_ms)], [line.centre, line.centre], color=colour, linewidth=0.9, alpha=0.7)
+            axes.plot([point.mean_ms], [line.centre], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=7, label=point.variant)
+        _time_axis(axes, [ms for p in points for ms in (p.mean_ms, p.p95_ms)])
+        _name(axes, points)
+        axes.set_xlabel("ms per camera frame: mean, line to the 95th percentile")
         axes.set_ylabel("points worse" if unit == "points" else f"{unit} worse")
         axes.tick_params(length=0)
         return Chart(WORDS.get(metric, metric), "Paired with the baseline, which lies on the line; 95 % over scenes.", themed_svg(figure))
+
+
+def _name(axes: Axes, points: Sequence[_Point]) -> None:
+    """Write each renderer's name beside its point: right and above, or at the nearest height where it covers no other name."""
+    point_px = axes.figure.dpi / 72
+    taken: list[tuple[float, float, float, float]] = []  # left, right, bottom, top in points from the figure's corner
+    for point in sorted(points, key=lambda p: p.mean_ms):
+        x, y = axes.transData.transform((point.mean_ms, point.line.centre)) / point_px
+        width, right_end = LETTER_PT * len(point.variant), axes.bbox.x1 / point_px
+        dx = 7.0 if x + 7.0 + width <= right_end else -7.0 - width
+        steps = sorted((5.0 + LINE_PT * k for k in range(-12, 13)), key=lambda dy: abs(dy - 5.0))
+        boxes = ((x + dx, x + dx + width, y + dy, y + dy + LINE_PT) for dy in steps)
+        bottom, top = axes.bbox.y0 / point_px, axes.bbox.y1 / point_px
+        box = next((b for b in boxes if b[2] >= bottom and b[3] <= top and not any(_overlap(b, t) for t in taken)), None)
+        box = box or (x + dx, x + dx + width, y + 5.0, y + 5.0 + LINE_PT)
+        taken.append(box)
+        colour = VARIANT[point.line.variant % N_COLOURS]
+        place = (point.mean_ms, point.line.centre)
+        axes.annotate(point.variant, place, (box[0] - x, box[2] - y), textcoords="offset points", color=colour)
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[1] and b[0] < a[1] and a[2] < b[3] and b[2] < a[3]
 
 
 def _time_axis(axes: Axes, ms: Sequence[float]) -> None:

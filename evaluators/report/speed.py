@@ -26,7 +26,7 @@ class SpeedRow:
 
     renderer: str
     variant: int
-    cells: tuple[Cell, ...]  # p50, p95, frames per second, first frame
+    cells: tuple[Cell, ...]  # mean, p95, frames per second, first frame
     stages: tuple[Cell, ...]
     bar: tuple[Segment, ...]
     sum_text: str
@@ -60,7 +60,7 @@ def speed(run: Run) -> Speed:
             SpeedRow(
                 renderer,
                 index.get(renderer, 0),
-                tuple(_ms(entry.get(key)) for key in ("ms_per_frame_p50", "ms_per_frame_p95", "frames_per_s", "first_frame_ms")),
+                tuple(_ms(entry.get(key)) for key in ("ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms")),
                 tuple(_stage(stages.get(name)) for name in names),
                 tuple(bar),
                 short(sums[renderer] or None, "ms"),
