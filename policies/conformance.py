@@ -40,6 +40,7 @@ from policies.conformance_faults import (
     difference,
     frame_fault,
     remarks,
+    sensors_fault,
     shape_fault,
     side_fault,
     time_fault,
@@ -148,9 +149,8 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
     scenario = canned_scenario() if scenario is None else scenario
     policy = make_policy(policy, scenario) if isinstance(policy, str) else policy
     cameras = {camera.name: camera for camera in scenario.cameras}
-    unknown = [sensor.camera for sensor in policy.sensors if sensor.camera not in cameras]
-    if unknown:
-        sentence = f"the policy asks for cameras {unknown}; the scenario has {sorted(cameras)}"
+    sentence = sensors_fault(policy.sensors, cameras)
+    if sentence:
         return Report((Check("sensors", False, sentence),), (), (0.0, 0.0))
     used = {sensor.camera: cameras[sensor.camera] for sensor in policy.sensors}
     checks = [Check("sensors", True, f"asks for {sorted(used) or 'no camera'}")]
@@ -175,7 +175,7 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
     median, worst = (float(np.median(durations)), max(durations)) if durations else (0.0, 0.0)
     if durations:
         checks.append(Check("latency", median <= latency_limit_ms, f"plans in {median:.1f} ms, the limit is {latency_limit_ms:.0f} ms"))
-    return Report(tuple(checks), tuple(remarks(plans)), (median, worst))
+    return Report(tuple(checks), () if broken else tuple(remarks(plans)), (median, worst))
 
 
 def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterator[Observation]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Plan
+from alpasim_plugin.plan_check import shape_problem
+from alpasim_plugin.types import F64, Plan, SensorSpec
 
 MIN_HORIZON_S, MAX_STEP_S = 2.0, 0.5
 FIRST_POSE_M = 0.5
@@ -14,20 +15,17 @@ FIRST_POSE_M = 0.5
 Fault = Callable[[Sequence[Plan], Sequence[int], F64], str]
 
 
+def sensors_fault(sensors: object, known: Collection[str]) -> str:
+    """Check that a policy's sensors are a sequence of `SensorSpec` and name cameras that exist."""
+    if not isinstance(sensors, Sequence) or not all(isinstance(sensor, SensorSpec) for sensor in sensors):
+        return f"sensors is {sensors!r:.80}, not a tuple of SensorSpec (alpasim_plugin.types)"
+    unknown = [sensor.camera for sensor in sensors if sensor.camera not in known]
+    return f"the policy asks for cameras {unknown}; the scenario has {sorted(known)}" if unknown else ""
+
+
 def shape_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F64) -> str:
     """Check shapes and finite values of plans and samples."""
-    for plan in plans:
-        n = len(plan.times_us)
-        if n < 2 or plan.xy.shape != (n, 2) or plan.yaw.shape != (n,):
-            shapes = f"times_us {plan.times_us.shape}, xy {plan.xy.shape}, yaw {plan.yaw.shape}"
-            return f"the plan has {shapes}; needed are (T,), (T, 2), (T,) with T >= 2"
-        bad = ~(np.isfinite(plan.xy).all(axis=1) & np.isfinite(plan.yaw))
-        if bad.any():
-            return f"the plan is not finite in {int(bad.sum())} of {n} rows, first in row {int(np.argmax(bad))}"
-        for sample in plan.samples:
-            if sample.shape != (n, 3) or not np.isfinite(sample).all():
-                return f"a sampled alternative is not finite or has shape {sample.shape}, not ({n}, 3)"
-    return ""
+    return next((found for plan in plans if (found := shape_problem(plan, min_rows=2))), "")
 
 
 def time_fault(plans: Sequence[Plan], asked_us: Sequence[int], T_world_first: F64) -> str:

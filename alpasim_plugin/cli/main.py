@@ -32,6 +32,10 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "listing", "list_parts", "EPILOG",
         "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",
     ),
+    "check-policy": (
+        "check_policy", "check_policy", "EPILOG",
+        "Drive a policy through painted situations and name every breach of its contract: shapes, frames, units, time, determinism.",
+    ),
     "doctor": ("doctor", "doctor", "EPILOG", "Test each part on a small case and report what works, what does not, and what to do."),
     "refine": ("refine", "refine", "EPILOG", "Refine a video with a fixer, block by block, at any length in constant memory."),
     "fork": ("fork", "fork", "FORK_EPILOG", "Continue a logged rollout from an instant on with another renderer, policy or seed."),

@@ -22,6 +22,7 @@ from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, write_table
+from alpasim_plugin.stdout import parts_print_to_stderr
 from alpasim_plugin.types import Policy, Renderer, Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
@@ -80,9 +81,10 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).unlink(missing_ok=True)
         scenario = _scenario(cell.ref)
-        parts = builder(cell, options, scenario, threads)
-        with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
-            run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
+        with parts_print_to_stderr():
+            parts = builder(cell, options, scenario, threads)
+            with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
+                run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
         manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))

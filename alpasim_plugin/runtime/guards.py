@@ -9,6 +9,7 @@ import numpy as np
 
 from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
 from alpasim_plugin.pixels import is_black
+from alpasim_plugin.plan_check import plan_problem
 from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest
 
 
@@ -69,20 +70,7 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
         raise PolicyError(
             "querying the policy", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
         ) from error
-    found = _plan_problem(plan, observation.t_us)
+    found = plan_problem(plan, observation.t_us)
     if found:
-        raise PolicyError("querying the policy", name, found, "run the policy through policies.conformance.check_policy")
+        raise PolicyError("querying the policy", name, found, "simrun check-policy finds all faults of a policy")
     return plan
-
-
-def _plan_problem(plan: Plan, now_us: int) -> str:
-    n = len(plan.times_us)
-    if n < 1 or plan.xy.shape != (n, 2) or plan.yaw.shape != (n,):
-        return f"shapes times_us {plan.times_us.shape}, xy {plan.xy.shape}, yaw {plan.yaw.shape} do not match"
-    if not (np.isfinite(plan.xy).all() and np.isfinite(plan.yaw).all()):
-        return "xy or yaw is not finite"
-    if int(plan.times_us[0]) != now_us or np.any(np.diff(plan.times_us) <= 0):
-        return f"times_us starts at {int(plan.times_us[0])} us or does not increase strictly"
-    if any(sample.shape != (n, 3) or not np.isfinite(sample).all() for sample in plan.samples):
-        return f"a sample is not finite or not of shape ({n}, 3)"
-    return ""

@@ -124,6 +124,30 @@ class WrongShape(Honest):
         return replace(plan, yaw=plan.yaw[:-1])
 
 
+class Transposed(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=plan.xy.T.copy())
+
+
+class BareArray(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return plan.xy  # type: ignore[return-value]
+
+
+class Nothing(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return None  # type: ignore[return-value]
+
+
+class ListOfPoses(Honest):
+    def spoil(self, plan: Plan, observation: Observation) -> Plan:
+        return replace(plan, xy=plan.xy.tolist())
+
+
+class CameraNames(Honest):
+    sensors = ("front",)  # type: ignore[assignment]
+
+
 class BadSample(Honest):
     def spoil(self, plan: Plan, observation: Observation) -> Plan:
         return replace(plan, samples=(np.zeros((3, 3)),))
@@ -210,6 +234,11 @@ def test_every_shipped_policy_is_checked_above() -> None:
         (Short, "the plan ends 1.000 s ahead"),
         (Sparse, "up to 1.00 s apart"),
         (WrongShape, "yaw (40,)"),
+        (Transposed, "xy (2, 41), yaw (41,); needed are (T,), (T, 2), (T,) with T >= 2; xy looks transposed"),
+        (BareArray, "act returned a ndarray of shape (41, 2), not a Plan"),
+        (Nothing, "act returned nothing, not a Plan"),
+        (ListOfPoses, "xy is a list, not a numpy array"),
+        (CameraNames, "sensors is ('front',), not a tuple of SensorSpec"),
         (BadSample, "a sampled alternative"),
         (Random, "the same seed and observations give the same plans: they differ by up to"),
         (Remembers, "a reset forgets the drive before: plans differ by up to"),

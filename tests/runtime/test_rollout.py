@@ -125,9 +125,22 @@ class Stale(StandStill):
         return replace(plan, times_us=plan.times_us - 1)
 
 
-@pytest.mark.parametrize(
-    ("policy", "found"), [(Raises, "ValueError: the weights are gone"), (NotFinite, "not finite"), (Stale, "times_us starts at -1 us")]
-)
+class BareArray(StandStill):
+    """Answers with positions alone."""
+
+    def act(self, observation: Observation) -> Plan:
+        return super().act(observation).xy  # type: ignore[return-value]
+
+
+BROKEN = [
+    (Raises, "ValueError: the weights are gone"),
+    (NotFinite, "not finite"),
+    (Stale, "times_us starts at -1 us"),
+    (BareArray, "act returned a ndarray of shape"),
+]
+
+
+@pytest.mark.parametrize(("policy", "found"), BROKEN)
 def test_a_broken_policy_is_named_and_not_driven(straight_road: Scenario, policy: type[StandStill], found: str) -> None:
     with pytest.raises(PolicyError, match=found):
         run_rollout(straight_road, make_renderer("clean", straight_road), policy(), 0)
