@@ -224,6 +224,9 @@ class Degradation:
     severity: float = 1.5  # scales all terms of the surrogate; 0 leaves the scene as built
     onset_m: float = 0.1  # lateral distance from the logged path where the surrogate's error starts to grow
     full_m: float = 2.0  # lateral distance where it is full
+    views_per_s: float = 6.0  # of the log, that the model is fitted to; reconstruction and cycle, as are the next two
+    depth_error: float = 0.1  # spread of the distance of the points it starts from, as a share
+    pose_error_m: float = 0.0  # spread of the poses that the views are believed to have
 
 
 @dataclass(frozen=True)

@@ -224,7 +224,7 @@ def _environment(spec: ScenarioSpec) -> Environment:
 
 def _degradation(spec: ScenarioSpec) -> Degradation:
     d = spec.degradation
-    return Degradation(d.kind, d.share, d.shift_m, d.severity, d.onset_m, d.full_m)
+    return Degradation(d.kind, d.share, d.shift_m, d.severity, d.onset_m, d.full_m, d.views_per_s, d.depth_error, d.pose_error_m)
 
 
 def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None:

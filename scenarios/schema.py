@@ -102,6 +102,9 @@ class DegradationSpec(Part):
     )
     share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
     shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
+    views_per_s: float = Field(default=6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
+    depth_error: float = Field(default=0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
+    pose_error_m: float = Field(default=0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
     severity: NonNegative = Field(default=1.5, description="Surrogate: scales all terms; 0 leaves the scene as built.")
     onset_m: NonNegative = Field(default=0.1, description="Surrogate: distance from the logged path where the error starts to grow.")
     full_m: Positive = Field(default=2.0, description="Surrogate: distance where it is full.")
@@ -119,8 +122,11 @@ class DegradationSpec(Part):
 
 
 DEGRADATION_KEYS = {
-    "reconstruction": ("share",), "cycle": ("share", "shift_m"), "surrogate": ("severity", "onset_m", "full_m"), "none": (),
-}  # fmt: skip
+    "reconstruction": ("share", "views_per_s", "depth_error", "pose_error_m"),
+    "cycle": ("share", "shift_m", "views_per_s", "depth_error", "pose_error_m"),
+    "surrogate": ("severity", "onset_m", "full_m"),
+    "none": (),
+}
 
 
 class BackgroundSpec(Part):

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -28,7 +28,7 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clips import read_video, to_tensor
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
-from alpasim_plugin.training.scenes import DEFAULT_COUNTS, write_scenes
+from alpasim_plugin.training.scenes import SPLITS, Split, write_scenes
 from alpasim_plugin.training.trainer import Schedule, Trainer
 from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
 from alpasim_plugin.training.vae_quality import quality, round_trip
@@ -57,19 +57,21 @@ def train() -> None:
     """Make training data and train networks."""
 
 
-@app.command("scenes", epilog="Example: `simrun train scenes --out data/scenes --split train --count 120`")
+@app.command("scenes", epilog="Example: `simrun train scenes --out data/scenes --split train`")
 def scenes(
     out: RunFolder,
-    split: Annotated[Literal["train", "val", "test"], typer.Option("--split", help="Split to write.")] = "train",
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Number of scenes; by default 120, 20 and 60.")] = None,
-    duration_s: Annotated[float, typer.Option("--duration-s", min=1.0, help="Length of every drive, seconds.")] = 9.9,
+    split: Annotated[Split, typer.Option("--split", help="Split to write.")] = "train",
+    count: Annotated[int | None, typer.Option("--count", min=1, help="Number of scenes; by default 408, 24, 30 and 30.")] = None,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration-s", min=1.0, help="Length of every drive, seconds; by default 6, for tests 19.8.")
+    ] = None,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Sample scenarios; the test split has other families of roads and traffic."""
+    """Sample scenarios; test-unseen has families of roads and traffic, looks and damage that no other split has."""
     del debug
-    console, paths = Console(stderr=True), []
-    for path in write_scenes(out, split, count or DEFAULT_COUNTS[split], duration_s):
+    console, paths, recipe = Console(stderr=True), [], SPLITS[split]
+    for path in write_scenes(out, split, count or recipe.count, duration_s or recipe.duration_s):
         paths.append(str(path))
         console.print(str(path), highlight=False, markup=False, soft_wrap=True)
     if as_json:

@@ -21,14 +21,14 @@ from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
 from alpasim_plugin.training.pair_import import PairSources, import_sequence
 from alpasim_plugin.training.pair_sheet import contact_sheet, measure_sequence, sheet, write_sheet
 from alpasim_plugin.training.pair_store import PairDataset
-from alpasim_plugin.training.pairs import DegradationMode, PairRecipe, make_sequence
+from alpasim_plugin.training.pairs import PairRecipe, make_sequence
 from alpasim_plugin.training.scenes import SPLITS
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand
 
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Processes, one thread each.")]
 RECONSTRUCTIONS_EPILOG = "Example: `simrun train reconstructions suites/urban --jobs 2`"
-PAIRS_EPILOG = "Example: `simrun train pairs data/scenes --out data/pairs --jobs 2`"
+PAIRS_EPILOG = "Example: `simrun train pairs data/scenes --out data/pairs --split val,train --jobs 2`"
 SHEET_EPILOG = "Example: `simrun train pairs-sheet data/pairs --out sheet`"
 IMPORT_EPILOG = (
     "Example: `simrun train import-pairs data/pairs --name drive1 --rgb-input render.mp4 --rgb-gt log/ --opacity alpha.mp4 --sdmap map.mp4 "
@@ -75,14 +75,10 @@ class _Fitted:
 def pairs(
     scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")],
-    split: Annotated[str, typer.Option("--split", help="Splits, comma-separated.")] = ",".join(SPLITS),
+    split: Annotated[str, typer.Option("--split", help="Splits, comma-separated, in this order.")] = "val,train",
     source: Annotated[str, typer.Option("--source", help="Renderer of the degraded frames.")] = "3dgs",
-    degradation: Annotated[
-        DegradationMode,
-        typer.Option("--degradation", help="mixed: reconstruction or cycle render, at random; as-set: as in the scenario."),
-    ] = "mixed",
     max_offset_m: Annotated[float, typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres.")] = 1.5,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the degradation and of the lateral offset.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the lateral offset.")] = 0,
     count: Annotated[int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")] = None,
     jobs: Jobs = 1,
     as_json: AsJson = False,
@@ -96,7 +92,7 @@ def pairs(
     if not work:
         raise InputError("making training pairs", str(scenes), f"no scenario in {split}", "make some with 'simrun train scenes'")
     console, began = Console(stderr=True), time.perf_counter()
-    maker = _Maker(out, PairRecipe(source=source, degradation=degradation, max_offset_m=max_offset_m), seed)
+    maker = _Maker(out, PairRecipe(source=source, max_offset_m=max_offset_m), seed)
     rows = []
     for number, (scene, made) in enumerate(parallel_map(maker, work, jobs), start=1):
         rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})
@@ -159,7 +155,7 @@ def import_pairs(
     sdmap: Annotated[Path, typer.Option("--sdmap", help="Semantic map, likewise.")],
     poses: Annotated[Path, typer.Option("--poses", help="T_world_camera of every frame, OpenCV axes: .npy (T, 4, 4) or JSON.")],
     name: Annotated[str, typer.Option("--name", help="Name of the sequence.")],
-    split: Annotated[str, typer.Option("--split", help="train, val or test.")] = "train",
+    split: Annotated[str, typer.Option("--split", help="train, val, or a test split.")] = "train",
     fps: Annotated[float, typer.Option("--fps", help="Frames per second, for poses without times.")] = 10.0,
     size: Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Scale all images to this size.")] = None,
     as_json: AsJson = False,
@@ -169,7 +165,8 @@ def import_pairs(
     del debug
     if split not in SPLITS or not name or Path(name).name != name or name.startswith("."):
         asked = f"--split {split} --name {name}"
-        raise InputError("importing training pairs", asked, "not a valid split and name", "give train, val or test, and a plain name")
+        known = ", ".join(SPLITS)
+        raise InputError("importing training pairs", asked, "not a valid split and name", f"give one of {known}, and a plain name")
     sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)
     folder = out / split / name
     frames = import_sequence(sources, folder, fps=fps, size=_size(size), facts={"split": split})

@@ -19,7 +19,7 @@ from alpasim_plugin.gaussians.scene.sky_mask import SkyView
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_files import write_model
 from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe
-from alpasim_plugin.renderers.reconstruction_start import rough_start
+from alpasim_plugin.renderers.reconstruction_start import misplaced, rough_start
 from alpasim_plugin.types import Scenario
 
 FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in
@@ -38,6 +38,7 @@ def build(scenario: Scenario, recipe: ReconstructionRecipe, threads: int | None,
         raise InputError("fitting a reconstruction", f"scene {scenario.scene_id!r}", "no camera", "give the scenario a camera")
     splat = recipe.splat
     views = logged_views(scenario, scene_of(scenario), splat.views, splat.width, aside_m=recipe.aside_m, threads=threads)
+    views = misplaced(views, recipe.pose_error_m, scenario.scene_id, splat.seed)
     boxes = {a.actor_id: a.box for a in scenario.actors}
     start = rough_start(views, boxes, recipe, scenario.scene_id)
     start = Start(start.background, start.actors if recipe.fit_actors else {})

@@ -9,7 +9,7 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.types import Scenario
 
 # By second of the log and camera, so that a longer drive is fitted no worse.
-VIEWS_PER_S, POINTS_PER_S, FULL_STEPS_PER_S = 6.0, 2_400, 50.0
+POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
 FEWEST_VIEWS, MOST_VIEWS, MOST_POINTS, MOST_STEPS = 12, 180, 72_000, 1500
 
 
@@ -25,6 +25,7 @@ class ReconstructionRecipe:
         range_error: Spread of these points' distance from their view, as a share of it.
         size: Of the Gaussians at the start, in distances to their neighbours: below one, the ground shows through until they have grown.
         opacity: Of the Gaussians at the start.
+        pose_error_m: Spread of the views' believed places, metres; their directions err in proportion.
     """
 
     splat: SplatRecipe
@@ -34,6 +35,7 @@ class ReconstructionRecipe:
     range_error: float = 0.1
     size: float = 0.6
     opacity: float = 0.2
+    pose_error_m: float = 0.0
 
 
 def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
@@ -53,9 +55,10 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
     points = min(MOST_POINTS, max(POINTS_PER_S, round(POINTS_PER_S * watched_s)))
     splat = SplatRecipe(
         steps=max(1, round(amount.share * min(MOST_STEPS, FULL_STEPS_PER_S * watched_s))),
-        views=min(MOST_VIEWS, max(FEWEST_VIEWS, round(VIEWS_PER_S * watched_s))),
+        views=min(MOST_VIEWS, max(FEWEST_VIEWS, round(amount.views_per_s * watched_s))),
         width=160, points=points, cap=points, hold_out_every=0, sh_degree=1, lr_means=4e-4, lr_means_end=4e-5, lr_scales=1e-2,
         lr_quaternions=2e-3, lr_opacities=0.05, lr_colour=5e-3, densify_every=0,
     )  # fmt: skip
     on_path = amount.kind == "reconstruction"
-    return ReconstructionRecipe(splat, 0.0 if on_path else amount.shift_m, on_path)
+    aside_m = 0.0 if on_path else amount.shift_m
+    return ReconstructionRecipe(splat, aside_m, on_path, range_error=amount.depth_error, pose_error_m=amount.pose_error_m)

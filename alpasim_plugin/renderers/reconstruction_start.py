@@ -1,4 +1,4 @@
-"""The rough points that the fit behind ``3dgs`` starts from: depth of a few views, wrong by patches, as matching images gives it."""
+"""What the fit behind ``3dgs`` starts from: poses that drift, and depth of a few views, wrong by patches, as matching images gives both."""
 
 from __future__ import annotations
 
@@ -17,6 +17,30 @@ from alpasim_plugin.types import F32, Box
 
 PATCH_SHARE = 0.075  # of the image's width: neighbours within a patch are wrong together
 LEAST, MOST = 0.5, 2.0  # a depth is never wrong by more than these factors
+POSE_KNOT_VIEWS = 4  # the error of poses is drawn every so many views and interpolated: registration drifts, it does not jump
+TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
+
+
+def misplaced(views: Sequence[PosedView], spread_m: float, scene_id: str, seed: int) -> list[PosedView]:
+    """Return the views with the poses that registration believes: moved and turned by smooth errors of normal spread.
+
+    Args:
+        views: In order of time.
+        spread_m: Along each axis of the camera; directions turn by `TURN_RAD_PER_M` of it about each axis. 0 changes nothing.
+        scene_id, seed: Key of the random stream.
+    """
+    if spread_m == 0:
+        return list(views)
+    knots = stream(scene_id, seed, "reconstruction.poses").standard_normal((len(views) // POSE_KNOT_VIEWS + 2, 6))
+    at = np.arange(len(views)) / POSE_KNOT_VIEWS
+    errors = spread_m * np.stack([np.interp(at, np.arange(len(knots)), column) for column in knots.T], axis=1)  # (V, 6)
+    out = []
+    for view, error in zip(views, errors, strict=True):
+        T = np.eye(4)
+        T[:3, :3] = cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0]
+        T[:3, 3] = error[:3]
+        out.append(replace(view, camera=replace(view.camera, T_camera_world=T @ view.camera.T_camera_world)))
+    return out
 
 
 def rough_start(views: Sequence[PosedView], boxes: Mapping[str, Box], recipe: ReconstructionRecipe, scene_id: str) -> Start:

@@ -1,12 +1,11 @@
-"""Render training pairs from scenarios: degraded and clean frames and the semantic map, along paths offset from the log."""
+"""Render training pairs from scenarios: frames degraded as the scenario says, clean frames and the map, along paths offset from the log."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -19,13 +18,10 @@ from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
 from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.training.pair_store import SEQUENCE_FILE, Pair, write_sequence
-from alpasim_plugin.types import F64, CameraSpec, Degradation, RenderRequest, Scenario
+from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario
 from alpasim_plugin.world.ground import ground_pose
 
 DOING = "making training pairs"
-DegradationMode = Literal["mixed", "as-set"]
-FIT_SHARES = (0.08, 0.24)  # of the fit's schedule, sampled for mixed sequences, so that the quality of the renderer varies
-SHIFT_M = 1.0  # of the cycle render (paper, App. A); the side is random
 MOVING_M = 2.0  # an actor with a longer track counts as moving
 
 
@@ -36,8 +32,6 @@ class PairRecipe:
     Args:
         source: Renderer of the degraded frames.
         target: Renderer of the clean frames.
-        degradation: ``mixed`` samples, with equal probability, a reconstruction viewed from an offset path or a cycle render viewed from
-            the logged path; ``as-set`` uses the scenario's setting.
         max_offset_m: Largest lateral offset from the logged path; the offset varies smoothly, and is zero in cycle renders.
         interval_us: Time between frames.
         camera: Name of the scenario's camera; None for the first.
@@ -45,7 +39,6 @@ class PairRecipe:
 
     source: str = "3dgs"
     target: str = "clean"
-    degradation: DegradationMode = "mixed"
     max_offset_m: float = 1.5
     interval_us: int = 100_000
     camera: str | None = None
@@ -55,10 +48,10 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
     """Render one sequence of a scenario unless an equal one exists.
 
     Args:
-        scenario: Rendered over its whole duration.
+        scenario: Rendered over its whole duration; its section ``degradation`` says how the source differs from the target.
         folder: ROOT/SPLIT/SEQUENCE.
         recipe: Definition of the sequence.
-        seed: Of the degradation, the lateral offset and the source renderer.
+        seed: Of the lateral offset and the source renderer.
         split, family: Stored in sequence.json.
         threads: Threads of the rasteriser.
 
@@ -68,7 +61,6 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
     Raises:
         InputError: The scenario has no such camera.
     """
-    scenario = replace(scenario, degradation=draw_degradation(scenario, recipe, seed))
     info = {
         "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "split": split, "family": family,
         "recipe": asdict(recipe), "degradation": asdict(scenario.degradation),
@@ -82,17 +74,6 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
     facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
     write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads), len(times), facts)
     return True
-
-
-def draw_degradation(scenario: Scenario, recipe: PairRecipe, seed: int) -> Degradation:
-    """Return the degradation of a sequence."""
-    if recipe.degradation == "as-set":
-        return scenario.degradation
-    rng = stream(scenario.scene_id, seed, "training.degradation")
-    is_cycle, side, share = rng.random() < 0.5, rng.random() < 0.5, round(float(rng.uniform(*FIT_SHARES)), 2)
-    if is_cycle:
-        return Degradation("cycle", share=share, shift_m=SHIFT_M if side else -SHIFT_M)
-    return Degradation("reconstruction", share=share)
 
 
 def pair_frames(scenario: Scenario, camera: CameraSpec, recipe: PairRecipe, seed: int, threads: int) -> Iterator[Pair]:
