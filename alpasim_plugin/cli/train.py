@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli import train_pairs
+from alpasim_plugin.cli import train_pairs, train_scenes
 from alpasim_plugin.cli.train_decoder import EPILOG as DECODER_EXAMPLE
 from alpasim_plugin.cli.train_decoder import decoder
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
@@ -28,7 +28,6 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clips import read_video, to_tensor
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
-from alpasim_plugin.training.scenes import SPLITS, Split, write_scenes
 from alpasim_plugin.training.trainer import Schedule, Trainer
 from alpasim_plugin.training.vae import VaeRecipe, VaeTask, measure_stats
 from alpasim_plugin.training.vae_quality import quality, round_trip
@@ -46,6 +45,8 @@ app.command("policy", epilog=POLICY_EPILOG)(policy)
 app.command("perceptual", epilog=PERCEPTUAL_EXAMPLE)(perceptual)
 app.command("perceptual-check", epilog=CHECK_EPILOG)(perceptual_check)
 app.command("splat", epilog=SPLAT_EXAMPLE)(splat)
+app.command("scenes", epilog=train_scenes.SCENES_EPILOG)(train_scenes.scenes)
+app.command("check-scenes", epilog=train_scenes.CHECK_EPILOG)(train_scenes.check_frozen)
 app.command("reconstructions", epilog=train_pairs.RECONSTRUCTIONS_EPILOG)(train_pairs.reconstructions)
 app.command("pairs", epilog=train_pairs.PAIRS_EPILOG)(train_pairs.pairs)
 app.command("pairs-sheet", epilog=train_pairs.SHEET_EPILOG)(train_pairs.pairs_sheet)
@@ -55,27 +56,6 @@ app.command("import-pairs", epilog=train_pairs.IMPORT_EPILOG)(train_pairs.import
 @app.callback()
 def train() -> None:
     """Make training data and train networks."""
-
-
-@app.command("scenes", epilog="Example: `simrun train scenes --out data/scenes --split train`")
-def scenes(
-    out: RunFolder,
-    split: Annotated[Split, typer.Option("--split", help="Split to write.")] = "train",
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Number of scenes; by default 408, 24, 30 and 30.")] = None,
-    duration_s: Annotated[
-        float | None, typer.Option("--duration-s", min=1.0, help="Length of every drive, seconds; by default 6, for tests 19.8.")
-    ] = None,
-    as_json: AsJson = False,
-    debug: Debug = False,
-) -> None:
-    """Sample scenarios; test-unseen has families of roads and traffic, looks and damage that no other split has."""
-    del debug
-    console, paths, recipe = Console(stderr=True), [], SPLITS[split]
-    for path in write_scenes(out, split, count or recipe.count, duration_s or recipe.duration_s):
-        paths.append(str(path))
-        console.print(str(path), highlight=False, markup=False, soft_wrap=True)
-    if as_json:
-        print(json.dumps({"split": split, "scenes": len(paths), "paths": paths}))
 
 
 @app.command("vae", epilog="Example: `simrun train vae data/pairs --video drive.mp4 --out runs/vae --steps 4000`")

@@ -1,0 +1,84 @@
+"""The test scenes as they were frozen before training began: hashes of their files, and the check that they are still those.
+
+``configs/fixers/test-scenes.json`` holds, by split, the SHA-256 of every scenario file by its name, and one of all of them. Numbers on other
+scenes are not comparable with published ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from alpasim_plugin.atomic import write_json
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.training.scenes import TEST_SPLITS
+
+DOING = "checking test scenes"
+RECORD = Path(__file__).parents[2] / "configs" / "fixers" / "test-scenes.json"
+
+
+@dataclass(frozen=True)
+class FrozenSplit:
+    """One split.
+
+    Attributes:
+        sha256: Of the lines ``NAME HASH`` of all scenes in order of name.
+        scenes: File name without suffix to the SHA-256 of the file's bytes.
+    """
+
+    sha256: str
+    scenes: Mapping[str, str]
+
+
+def hash_scenes(folder: Path) -> FrozenSplit:
+    """Hash the scenario files of a folder.
+
+    Raises:
+        InputError: There are none.
+    """
+    scenes = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob("*.yaml"))}
+    if not scenes:
+        raise InputError(DOING, str(folder), "no scenario", f"write them with 'simrun train scenes --split {folder.name}'")
+    lines = "".join(f"{name} {digest}\n" for name, digest in scenes.items())
+    return FrozenSplit(hashlib.sha256(lines.encode()).hexdigest(), scenes)
+
+
+def freeze_scenes(folder: Path, record: Path, splits: Iterable[str] = TEST_SPLITS) -> dict[str, FrozenSplit]:
+    """Write the hashes of the splits below a folder of scenes.
+
+    Raises:
+        InputError: A split without scenes, or a record that exists already: what is frozen stays.
+    """
+    if record.exists():
+        raise InputError("freezing test scenes", str(record), "it exists", "remove it if the scenes are really to change")
+    found = {split: hash_scenes(folder / split) for split in splits}
+    write_json(record, {split: asdict(frozen) for split, frozen in found.items()})
+    return found
+
+
+def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
+    """Compare the splits below a folder of scenes with the record.
+
+    Returns:
+        The splits, which are those of the record.
+
+    Raises:
+        InputError: Another scene, one too few or one too many, or no readable record.
+    """
+    try:
+        known = {split: FrozenSplit(**entry) for split, entry in json.loads(record.read_text(encoding="utf-8")).items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(DOING, str(record), str(error), "give the record that 'simrun train check-scenes --freeze' wrote") from error
+    for split, frozen in known.items():
+        found = hash_scenes(folder / split)
+        differ = sorted({name for name, _ in frozen.scenes.items() ^ found.scenes.items()})
+        if differ or found.sha256 != frozen.sha256:
+            shown = ", ".join(differ[:5]) or "the hash of all scenes"
+            raise InputError(
+                DOING, f"{folder / split} against {record}", f"{max(len(differ), 1)} differ: {shown}",
+                f"write the scenes again with 'simrun train scenes --split {split}', into an empty folder",
+            )  # fmt: skip
+    return known
