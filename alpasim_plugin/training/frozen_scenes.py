@@ -1,7 +1,7 @@
 """The test scenes as they were frozen before training began: hashes of their files, and the check that they are still those.
 
-``configs/fixers/test-scenes.json`` holds, by split, the SHA-256 of every scenario file by its name, and one of all of them. Numbers on other
-scenes are not comparable with published ones.
+``configs/fixers/test-scenes.json`` holds, by split, the SHA-256 of every scenario file by its name, and one of all of them. Numbers on
+other scenes are not comparable with published ones.
 """
 
 from __future__ import annotations
