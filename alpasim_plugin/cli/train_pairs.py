@@ -169,16 +169,19 @@ def import_pairs(
         raise InputError("importing training pairs", asked, "not a valid split and name", f"give one of {known}, and a plain name")
     sources = PairSources(rgb_input, rgb_gt, opacity, sdmap, poses)
     folder = out / split / name
-    frames = import_sequence(sources, folder, fps=fps, size=_size(size), facts={"split": split})
+    frames = import_sequence(sources, folder, fps=fps, size=parse_size(size) if size else None, facts={"split": split})
     Console(stderr=True).print(f"{folder}: {frames} frames", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"folder": str(folder), "split": split, "frames": frames}))
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse ``WIDTHxHEIGHT``.
+
+    Raises:
+        InputError: Other text.
+    """
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-        raise InputError("importing training pairs", f"--size {text}", "not a size", "give WIDTHxHEIGHT, for example 256x144")
+        raise InputError("reading a size", f"--size {text}", "not a size", "give WIDTHxHEIGHT, for example 256x144")
     return int(parts[0]), int(parts[1])

@@ -73,6 +73,11 @@ def read_video(path: Path, width: int, height: int, first: float = 0.0, last: fl
     frames = frames[round(first * len(frames)) : round(last * len(frames))]
     if not len(frames):
         raise InputError(DOING, str(path), f"no frame between shares {first} and {last}", "widen the share")
+    return fitted(frames, width, height)
+
+
+def fitted(frames: U8, width: int, height: int) -> U8:
+    """Scale frames ``(T, H, W, 3)`` to cover ``width x height`` and cut that from the centre."""
     h, w = frames.shape[1:3]
     scale = max(width / w, height / h)
     wide, high = round(w * scale), round(h * scale)

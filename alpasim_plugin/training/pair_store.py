@@ -128,6 +128,15 @@ class PairSequence:
         return array
 
 
+def is_made(folder: Path, info: Mapping[str, Any]) -> bool:
+    """Return whether a folder holds a complete sequence that was made in the same way: its sequence.json agrees with ``info``."""
+    path = folder / SEQUENCE_FILE
+    if not path.exists():
+        return False
+    document = json.loads(path.read_text(encoding="utf-8"))
+    return all(document.get(key) == value for key, value in info.items())
+
+
 class PairDataset:
     """The complete sequences of one split, in order of name; `refresh` finds new ones.
 

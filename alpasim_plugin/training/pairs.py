@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from alpasim_plugin.seeding import stream
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.training.pair_store import SEQUENCE_FILE, Pair, write_sequence
+from alpasim_plugin.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario
 from alpasim_plugin.world.ground import ground_pose
 
@@ -65,7 +64,7 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
         "scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "split": split, "family": family,
         "recipe": asdict(recipe), "degradation": asdict(scenario.degradation),
     }  # fmt: skip
-    if _is_made(folder, info):
+    if is_made(folder, info):
         return False
     camera = _camera(scenario, recipe.camera)
     times = range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
@@ -121,11 +120,3 @@ def _camera(scenario: Scenario, name: str | None) -> CameraSpec:
             return camera
     known = sorted(c.name for c in scenario.cameras)
     raise InputError(DOING, f"camera {name!r}", f"scene {scenario.scene_id!r} has {known}", "name one of them")
-
-
-def _is_made(folder: Path, info: dict[str, object]) -> bool:
-    path = folder / SEQUENCE_FILE
-    if not path.exists():
-        return False
-    document = json.loads(path.read_text(encoding="utf-8"))
-    return all(document.get(key) == value for key, value in info.items())
