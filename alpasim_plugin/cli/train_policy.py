@@ -18,7 +18,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.demonstrations import DEMONSTRATIONS_FILE, DemonstrationRecipe, read_demonstrations, write_demonstrations
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.policy import PolicyRecipe, PolicyTask, measure
-from alpasim_plugin.training.scenes import SPLITS
+from alpasim_plugin.training.scenes import SPLITS, TEST_SPLITS
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 from policies.learned_net import LearnedNet, save_net
 from scenarios.load import load_scenario
@@ -48,14 +48,14 @@ class PolicyCard(ModelCard):
 def policy_data(
     scenes: Annotated[Path, typer.Argument(help="Folder that 'simrun train scenes' wrote: SPLIT/FAMILY_NUMBER.yaml.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write to; complete scenes are kept.")],
-    split: Annotated[str, typer.Option("--split", help="'train', or 'val' to measure on; never 'test'.")] = "train",
+    split: Annotated[str, typer.Option("--split", help="'train', or 'val' to measure on; never a test split.")] = "train",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the perturbed rollouts.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
     """Render perturbed rollouts off the logged paths, with the path and speeds of a privileged expert as labels."""
     del debug
-    if split not in SPLITS or split == "test":
+    if split not in SPLITS or split in TEST_SPLITS:
         raise InputError("writing demonstrations", f"--split {split}", "not a training split", "give train or val")
     paths = scene_files(scenes, split)
     if not paths:

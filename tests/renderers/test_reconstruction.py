@@ -11,19 +11,22 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.gaussians.fit.views import logged_views
 from alpasim_plugin.geometry import inverse
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache
+from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache, scene_of
 from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
 from alpasim_plugin.renderers.reconstruction_files import HASHES, read_model
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
+from alpasim_plugin.renderers.reconstruction_start import misplaced
 from alpasim_plugin.types import BackgroundFile, Behaviour, Degradation, Environment, Latency, Scenario
 from tests.gaussians.scene_maps import line, parked, road_lanes, straight, with_camera
 from tests.renderers.test_gaussian_renderers import psnr, request
 
 ACTORS = (parked("ahead", 19.0, -1.8), parked("never-seen", -30.0, -1.8))
 FITTED = Degradation("reconstruction", share=0.4)
+DAMAGE = {"views_per_s": 20.0, "depth_error": 0.3, "pose_error_m": 0.1}
 
 
 def street(degradation: Degradation = FITTED) -> Scenario:
@@ -158,6 +161,7 @@ def test_key_follows_what_is_seen_and_how_it_is_fitted_and_nothing_else() -> Non
         replace(scenario, lane_map=replace(scenario.lane_map, lanes=other_lanes)),
         replace(scenario, environment=replace(scenario.environment, buildings=0.4)),
         replace(scenario, degradation=replace(FITTED, share=0.5)),
+        *(replace(scenario, degradation=replace(FITTED, **{key: value})) for key, value in DAMAGE.items()),
         replace(scenario, degradation=Degradation("cycle", share=0.4)),
         with_camera(scenario, 96, 54),
     ]
@@ -193,3 +197,25 @@ def test_longer_logs_and_more_cameras_get_more_views_points_and_steps() -> None:
     long, two = recipe_of(scenario).splat, recipe_of(replace(scenario, cameras=scenario.cameras * 2)).splat
     for name in ("views", "points", "steps"):
         assert getattr(short, name) < getattr(long, name) < getattr(two, name)
+
+
+def test_recipe_has_the_views_depth_error_and_pose_error_of_the_scenario() -> None:
+    log_s = 1.4
+    recipe = recipe_of(street(replace(FITTED, **DAMAGE)))
+    assert recipe.splat.views == round(20.0 * log_s)
+    assert (recipe.range_error, recipe.pose_error_m) == (0.3, 0.1)
+
+
+def test_views_are_misplaced_smoothly_by_the_pose_error_and_not_at_all_by_none() -> None:
+    scenario = street()
+    views = logged_views(scenario, scene_of(scenario), 8, 32)
+    many = [replace(views[0], name=str(i)) for i in range(400)]
+    assert all(a is b for a, b in zip(misplaced(many, 0.0, "s", 0), many, strict=True))
+    moved = misplaced(many, 0.1, "s", 0)
+    errors = np.array([a.camera.T_camera_world @ inverse(b.camera.T_camera_world) for a, b in zip(moved, many, strict=True)])
+    assert 0.06 < errors[:, :3, 3].std() < 0.12
+    turned_deg = np.degrees(np.arccos(np.clip((np.trace(errors[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert 0.2 < turned_deg.mean() < 0.6
+    assert np.abs(np.diff(errors[:, :3, 3], axis=0)).mean() < 0.5 * errors[:, :3, 3].std()
+    again = misplaced(many, 0.1, "s", 0)
+    assert all(np.array_equal(a.camera.T_camera_world, b.camera.T_camera_world) for a, b in zip(moved, again, strict=True))

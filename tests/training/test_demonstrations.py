@@ -164,5 +164,5 @@ def test_commands_train_a_policy_that_can_be_loaded(root: Path, tmp_path: Path) 
     assert card["data"]["scenes"] == {"lead": 1}
     assert card["steps"] == 2
     assert card["parameters"] < 600_000
-    refused = CliRunner().invoke(app, ["policy-data", str(root), "--out", str(tmp_path), "--split", "test"])
+    refused = CliRunner().invoke(app, ["policy-data", str(root), "--out", str(tmp_path), "--split", "test-known"])
     assert isinstance(refused.exception, InputError)

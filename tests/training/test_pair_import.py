@@ -110,8 +110,8 @@ def test_what_cannot_be_read_is_named(sources: PairSources, tmp_path: Path, chan
 def test_command_imports_and_refuses_names_that_are_paths(sources: PairSources, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = [word for name, path in vars(sources).items() for word in (f"--{name.replace('_', '-')}", str(path))]
     command = ["train", "import-pairs", str(tmp_path / "pairs"), *options]
-    assert run_command([*command, "--name", "drive", "--split", "test", "--size", "24x16"]) == 0
-    assert PairDataset(tmp_path / "pairs", "test").sequences[0].clip.rgb_gt.shape == (6, 16, 24, 3)
+    assert run_command([*command, "--name", "drive", "--split", "test-known", "--size", "24x16"]) == 0
+    assert PairDataset(tmp_path / "pairs", "test-known").sequences[0].clip.rgb_gt.shape == (6, 16, 24, 3)
     for bad in (["--name", "../drive"], ["--name", "drive", "--split", "tests"], ["--name", "drive", "--size", "big"]):
         assert run_command([*command, *bad]) == 2
     assert "give WIDTHxHEIGHT" in capsys.readouterr().err
