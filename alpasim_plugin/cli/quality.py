@@ -76,7 +76,7 @@ def quality(
     data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/pairs.md).")],
     out: Annotated[Path, typer.Option("--out", help="Folder for results; the same command continues there.")],
     fixers: Annotated[str, typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE.")] = "3dgs",
-    split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test",
+    split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     baseline: Annotated[str, typer.Option("--baseline", help="Variant that the others are compared with.")] = RAW,
     frames: Annotated[int, typer.Option("--frames", min=2, help="First frames of every clip; shorter clips are taken whole.")] = 198,
     clips: Annotated[int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")] = None,

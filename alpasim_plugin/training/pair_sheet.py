@@ -14,7 +14,7 @@ import numpy as np
 
 from alpasim_plugin.atomic import write_text
 from alpasim_plugin.image_metrics import psnr_db, ssim
-from alpasim_plugin.training.pair_store import PairSequence
+from alpasim_plugin.training.pair_store import PairClip, PairSequence
 from alpasim_plugin.types import U8
 
 EVERY = 5  # every 5th frame is measured, since consecutive frames are similar
@@ -36,7 +36,7 @@ class SequenceFacts:
         hole_share: Share of pixels with opacity below one half.
         luminance: Mean of rgb_gt, 0..1.
         map_share: Share of non-black pixels of the semantic map.
-        travel_m: Length of the camera path.
+        travel_m: Length of the camera path; None where poses are unknown.
     """
 
     split: str
@@ -50,7 +50,7 @@ class SequenceFacts:
     hole_share: float
     luminance: float
     map_share: float
-    travel_m: float
+    travel_m: float | None
 
 
 def measure_sequence(sequence: PairSequence, split: str) -> SequenceFacts:
@@ -70,8 +70,13 @@ def measure_sequence(sequence: PairSequence, split: str) -> SequenceFacts:
         _mean([float(np.mean(clip.opacity[i] < HOLE_BELOW)) for i in index]),
         _mean([float(np.mean(clip.rgb_gt[i])) / 255 for i in index]),
         _mean([float(np.mean(clip.sdmap[i].max(axis=-1) > 0)) for i in index]),
-        float(np.linalg.norm(np.diff(clip.T_world_camera[:, :3, 3], axis=0), axis=1).sum()),
+        _travel_m(clip),
     )
+
+
+def _travel_m(clip: PairClip) -> float | None:
+    places = np.asarray(clip.T_world_camera[:, :3, 3])
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()) if np.isfinite(places).all() else None
 
 
 def sheet(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
@@ -102,8 +107,10 @@ def _group(facts: Sequence[SequenceFacts]) -> dict[str, Any]:
             for kind in sorted({f.degradation for f in facts})
         },
     }
-    for name in ("ssim", "hole_share", "luminance", "map_share", "travel_m"):
+    for name in ("ssim", "hole_share", "luminance", "map_share"):
         out[name] = _mean([getattr(f, name) for f in facts])
+    known_m = [f.travel_m for f in facts if f.travel_m is not None]
+    out["travel_m"] = _mean(known_m) if known_m else None
     return out
 
 
@@ -122,7 +129,7 @@ def markdown(document: Mapping[str, Any]) -> str:
         ("ssim", "SSIM of input", "{:.3f}"), ("hole_share", "pixels missing", "{:.2%}"), ("luminance", "mean luminance", "{:.2f}"),
         ("map_share", "pixels with map", "{:.1%}"), ("travel_m", "metres driven, mean", "{:.0f}"),
     ):  # fmt: skip
-        rows.append([title, *(form.format(c[name]) for c in columns.values())])
+        rows.append([title, *("-" if c[name] is None else form.format(c[name]) for c in columns.values())])
     head = ["", *columns]
     table = [head, ["---"] * len(head), *rows]
     edges = document["all"]["psnr_histogram"]["edges_db"]

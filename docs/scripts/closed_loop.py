@@ -2,8 +2,9 @@
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:2] [--set KEY=VALUE]...
 
-SCENES is the folder of test scenes that ``simrun train scenes --split test`` wrote; RUNS (default: runs/closed-loop) keeps the run folders,
-so a second call continues an interrupted first one. Behind a policy's name stands its number of seeds.
+SCENES is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen ones; RUNS (default:
+runs/closed-loop) keeps the run folders, so a second call continues an interrupted first one. Behind a policy's name stands its number of
+seeds.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 from results import DOCS, number, replace
+
+from alpasim_plugin.training.frozen_scenes import check_scenes
 
 VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
 RENDERERS = ("clean", "3dgs", "onefixer")
@@ -71,7 +74,7 @@ def families(rows: list[dict[str, Any]]) -> str:
 
 def family(row: dict[str, Any]) -> str:
     """Return the family in a scene's name: SPLIT-FAMILY-NUMBER."""
-    return str(row["scene"]).split("-")[1].replace("_", " ")
+    return str(row["scene"]).split("-")[-2].replace("_", " ")
 
 
 def main() -> None:
@@ -82,9 +85,7 @@ def main() -> None:
     parser.add_argument("--policies", default="learned:5,lane-camera:5")
     parser.add_argument("--set", dest="settings", action="append", default=[])
     given = parser.parse_args()
-    scenes = sorted(str(path) for path in given.scenes.glob("*.yaml"))
-    if not scenes:
-        sys.exit(f"no scenes in {given.scenes}: run 'simrun train scenes --split test' first")
+    scenes = [str(given.scenes / split / f"{name}.yaml") for split, frozen in check_scenes(given.scenes).items() for name in frozen.scenes]
     settings = [word for value in given.settings for word in ("--set", value)]
     parts = []
     for name in given.policies.split(","):

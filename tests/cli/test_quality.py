@@ -41,7 +41,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pairs")
     for name in ("a", "b"):
-        make(root, "test", name, frames=FRAMES)
+        make(root, "test-known", name, frames=FRAMES)
     return root
 
 
@@ -77,7 +77,7 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
 def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: Path) -> None:
     networks = (("perceptual-syn", identity("perceptual-syn", None)),)
     variant = parse_variants("identity", [])[0]
-    work = Work(data / "test" / "b", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
+    work = Work(data / "test-known" / "b", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
     row = finish(work)
     stamp = work.row_file.stat().st_mtime_ns
     assert finish(work) == row

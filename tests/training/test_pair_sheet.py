@@ -77,3 +77,14 @@ def test_command_prints_json_and_writes_table_and_picture(
     assert (tmp_path / "sheet" / "sheet.jpg").stat().st_size > 1000
     assert run_command(["train", "pairs-sheet", str(tmp_path / "nothing")]) == 2
     assert "no finished sequence" in capsys.readouterr().err
+
+
+def test_unknown_poses_give_no_distance_instead_of_zero(tmp_path: Path) -> None:
+    folder = tmp_path / "train" / "drive"
+    unknown = flat(51, 15, 0)._replace(T_world_camera=np.full((4, 4), np.nan))
+    write_sequence(folder, [unknown] * 3, 3, {"family": "video"})
+    facts = measure_sequence(PairSequence(folder), "train")
+    assert facts.travel_m is None
+    document = sheet([facts])
+    json.dumps(document, allow_nan=False)
+    assert "| metres driven, mean | - | - |" in markdown(document)
