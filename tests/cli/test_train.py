@@ -66,7 +66,7 @@ def test_scenes_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 def test_pairs_made_and_kept_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "scenes" / "val").mkdir(parents=True)
     (tmp_path / "scenes" / "val" / "mine.yaml").write_text(BARE)
-    command = ("pairs", tmp_path / "scenes", "--out", tmp_path / "pairs", "--split", "val", "--source", "clean", "--degradation", "as-set")
+    command = ("pairs", tmp_path / "scenes", "--out", tmp_path / "pairs", "--split", "val", "--source", "clean")
     first, again = (run_train(capsys, *command)[0] for _ in range(2))
     assert (first["sequences"], first["made"], again["made"]) == (1, 1, 0)
     assert Path(first["rows"][0]["folder"], "sequence.json").is_file()
