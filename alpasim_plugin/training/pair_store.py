@@ -17,7 +17,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -30,6 +30,7 @@ from alpasim_plugin.types import F64, I64, U8
 SEQUENCE_FILE = "sequence.json"
 CONTENT = "content"
 READING = "reading training pairs"
+OPEN_CLIPS = 100  # at a time; each holds a file for every channel, and a process may often open 1024
 
 
 class Pair(NamedTuple):
@@ -100,20 +101,10 @@ class PairSequence:
         """Digest of its arrays, which identifies the data."""
         return str(self.info.get(CONTENT) or _content(self.folder))
 
-    @cached_property
+    @property
     def clip(self) -> PairClip:
-        """The frames that every channel has, as memory maps."""
-        arrays = {name: self._open(name) for name in CHANNELS}
-        size = arrays["rgb_gt"].shape[1:3]
-        for name in ("rgb_input", "opacity", "sdmap"):
-            if arrays[name].shape[1:3] != size:
-                raise InputError(READING, str(self.folder), f"{name} is {arrays[name].shape[1:3]}, rgb_gt {size}", "make all of one size")
-        length = min(len(a) for a in arrays.values())
-        if length == 0:
-            raise InputError(
-                READING, str(self.folder), "no frame that every channel has", "remove the folder and run 'simrun train pairs' again"
-            )
-        return PairClip(**{name: a[:length] for name, a in arrays.items()})
+        """The frames that every channel has, as memory maps; they are closed when many other sequences have been used since."""
+        return _opened(self)
 
     def _open(self, name: str) -> Any:
         path = self.folder / f"{name}.npy"
@@ -126,6 +117,22 @@ class PairSequence:
             found = f"{array.dtype} with {array.ndim} axes"
             raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/pairs.md)")
         return array
+
+
+@lru_cache(maxsize=OPEN_CLIPS)
+def _opened(sequence: PairSequence) -> PairClip:
+    arrays = {name: sequence._open(name) for name in CHANNELS}
+    size = arrays["rgb_gt"].shape[1:3]
+    for name in ("rgb_input", "opacity", "sdmap"):
+        if arrays[name].shape[1:3] != size:
+            found = f"{name} is {arrays[name].shape[1:3]}, rgb_gt {size}"
+            raise InputError(READING, str(sequence.folder), found, "make all of one size")
+    length = min(len(a) for a in arrays.values())
+    if length == 0:
+        raise InputError(
+            READING, str(sequence.folder), "no frame that every channel has", "remove the folder and run 'simrun train pairs' again"
+        )
+    return PairClip(**{name: a[:length] for name, a in arrays.items()})
 
 
 def is_made(folder: Path, info: Mapping[str, Any]) -> bool:

@@ -1,13 +1,15 @@
 """Pairs on disk: whole or not there, readable while more are written, refused when damaged."""
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.training.pair_store import CHANNELS, Pair, PairDataset, PairSequence, write_sequence
+from alpasim_plugin.training.pair_store import CHANNELS, OPEN_CLIPS, Pair, PairDataset, PairSequence, write_sequence
 
 from .pair_files import make, pair
 
@@ -103,3 +105,17 @@ def test_cut_beyond_the_end_is_refused(tmp_path: Path) -> None:
 
 def test_facts_are_plain_json(tmp_path: Path) -> None:
     assert json.loads((make(tmp_path).folder / "sequence.json").read_text())["scene_id"] == "a"
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts the open files of the process")
+def test_many_sequences_are_read_with_few_open_files(tmp_path: Path) -> None:
+    first = make(tmp_path, name="0", frames=2, height=4, width=4)
+    for i in range(1, OPEN_CLIPS + 8):
+        shutil.copytree(first.folder, tmp_path / "train" / str(i))
+    before = len(os.listdir("/proc/self/fd"))
+    dataset = PairDataset(tmp_path, "train")
+    shown = [sequence.clip.rgb_gt[1, 0, 0, 0] for sequence in dataset.sequences]
+    assert len(shown) == OPEN_CLIPS + 8
+    assert len(set(map(int, shown))) == 1
+    assert len(os.listdir("/proc/self/fd")) - before <= OPEN_CLIPS * len(CHANNELS)
+    np.testing.assert_array_equal(dataset.sequences[0].clip.rgb_gt, first.clip.rgb_gt)
