@@ -150,7 +150,7 @@ class BenchOptions:
         seed: Of the noise and of stand-in weights.
     """
 
-    name: str = "onefixer-tiny"
+    name: str = "onefixer-dit-tiny"
     overrides: tuple[str, ...] = ()
     device: str = "cpu"
     threads: int | None = None

@@ -28,7 +28,7 @@ Examples:
 
 
 def fixer(
-    name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer-tiny",
+    name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer-dit-tiny",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="A setting in force for every row: fixer.key=value.")] = None,
     sizes: Annotated[str, typer.Option("--sizes", help="Image sizes, comma-separated.")] = "256x144",
     frames: Annotated[int, typer.Option("--frames", min=13, help="Least length of the drive; blocks are completed.")] = 69,

@@ -30,7 +30,7 @@ Examples:
 
 - `simrun refine drive.mp4 -o refined.mp4 --compare side.mp4`
 
-- `simrun refine render.mp4 --opacity alpha.mp4 --sdmap map.mp4 --fixer onefixer-tiny --set fixer.window=12 -o refined.mp4`
+- `simrun refine render.mp4 --opacity alpha.mp4 --sdmap map.mp4 --set fixer.holes=render -o refined.mp4`
 """
 
 
@@ -39,7 +39,7 @@ def refine(
     out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4).")],
     opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey video, white where the input is reliable.")] = None,
     sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Video of the semantic map (docs/semantic-map.md).")] = None,
-    fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer-tiny",
+    fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixer's noise.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
