@@ -33,7 +33,9 @@ def onefixer_settings(name: str) -> OneFixerSettings:
     """
     settings = fixer_settings(name)
     if not isinstance(settings, OneFixerSettings):
-        raise InputError("choosing a fixer to train", f"--fixer {name}", "it has no networks", "choose a block generator, such as onefixer-dit-tiny")
+        raise InputError(
+            "choosing a fixer to train", f"--fixer {name}", "it has no networks", "choose a block generator, such as onefixer-dit-tiny"
+        )
     return settings
 
 

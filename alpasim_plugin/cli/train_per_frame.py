@@ -12,7 +12,7 @@ from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.settings import PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.precision import choose_precision
 from alpasim_plugin.training.pixel_rollout import PixelObjectives
 from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
@@ -25,7 +25,7 @@ Examples:
 
 - `simrun train per-frame data/pairs --video data/video --out runs/s --steps 20000 --decay-from 16000`
 
-- `simrun train per-frame data/pairs --out runs/s2 --init runs/s/state.safetensors`: further, on other data
+- `simrun train per-frame data/pairs --out runs/s2 --init runs/s/state.safetensors --warmup 0`: further, on other data
 """
 
 
@@ -40,6 +40,7 @@ def per_frame(
     ] = None,
     stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
     lr: options.PeakLr = 1e-3,
+    warmup: Annotated[int, typer.Option("--warmup", min=0, help="Updates of rising learning rate; 0 where a run goes on.")] = 100,
     ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.998,
     streams: Annotated[int, typer.Option("--streams", min=1, help="Streams of frames in a batch.")] = 6,
     frames: Annotated[int, typer.Option("--frames", min=2, help="Frames of an update: k, that gradients pass through.")] = 4,
@@ -81,7 +82,7 @@ def per_frame(
         data, video, seed=seed, batch=streams, frames=frames, crop=(height, width), episode=episode, shares=shares, count=sequences
     )
     schedule = Schedule(
-        steps, peak_lr=lr, warmup=100, clip=0.5, ema=ema, save_every=save_every, decay_from=decay_from or max(4 * steps // 5, 1)
+        steps, peak_lr=lr, warmup=warmup, clip=0.5, ema=ema, save_every=save_every, decay_from=decay_from or max(4 * steps // 5, 1)
     )
     objectives = PixelObjectives(perceptual, temporal, flow, horizon=frames)
     distance = progress.perceptual_term(metric_weights) if perceptual else None

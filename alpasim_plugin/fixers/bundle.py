@@ -16,7 +16,8 @@ from torch import Tensor
 
 from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.settings import OneFixerSettings, PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE

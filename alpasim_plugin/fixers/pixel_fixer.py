@@ -13,7 +13,8 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.pixel_noise import pixel_noise
 from alpasim_plugin.fixers.pixel_pipeline import PixelInputs, fix_frame, load_generator
-from alpasim_plugin.fixers.settings import FixerSettings, PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import DOING, HALF, Views, group_views
 from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
 from alpasim_plugin.nets.pixel_source import sparse_source

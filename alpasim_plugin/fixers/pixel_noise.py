@@ -36,8 +36,8 @@ def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pi
     index = (pixels[:, None] * CHANNELS + np.arange(CHANNELS)).astype(np.uint64) * np.uint64(2)
     with np.errstate(over="ignore"):  # arithmetic modulo 2^64
         u, v = (_uniform(key + (index + np.uint64(i + 1)) * ODD) for i in range(2))
-    normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)  # Box and Muller, 1958
-    return normal.astype(np.float32)
+    normal: F32 = (np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)).astype(np.float32)  # Box and Muller, 1958
+    return normal
 
 
 def _uniform(x: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from torch import Tensor
 from alpasim_plugin.errors import FixerError, InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.keep_render import render_share
-from alpasim_plugin.fixers.settings import PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
 from alpasim_plugin.nets.precision import Choice, choose_precision
 from alpasim_plugin.nets.sampling import interpolant

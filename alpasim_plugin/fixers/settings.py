@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -43,17 +44,6 @@ class FixerSettings(Part):
     def load(cls, name: str, overrides: Sequence[str] = ()) -> Self:
         """Return the settings of a fixer's name; see `load_settings`."""
         return load_settings(name, cls, overrides)
-
-
-class PixelSizesSettings(Part):
-    """Sizes of a generator in pixels where they are not read off weights."""
-
-    widths: tuple[Positive, Positive, Positive] = Field(default=(48, 64, 160), description="Channels at 1/4, 1/8 and 1/16.")
-    blocks: tuple[int, int, int, int, int] = Field(
-        default=(0, 1, 1, 1, 1), description="Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4."
-    )
-    detail: Positive = Field(default=16, description="Channels of the detail path at 1/2.")
-    hidden: int = Field(default=16, ge=0, description="Recurrent channels at 1/4.")
 
 
 class DiTSettings(Part):
@@ -136,7 +126,7 @@ def check_steps(steps: tuple[float, ...]) -> None:
     Raises:
         ValueError: With what to write, as pydantic's validators report it.
     """
-    if any(b >= a for a, b in zip(steps, steps[1:], strict=False)) or steps[0] != 1000 or steps[-1] <= 0:
+    if any(b >= a for a, b in pairwise(steps)) or steps[0] != 1000 or steps[-1] <= 0:
         raise ValueError(f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
 
 
@@ -183,44 +173,6 @@ class OneFixerSettings(FixerSettings):
             raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
         if self.decoder.kind == "taehv" and self.vae.kind != "wan":
             raise ValueError(f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan")
-        return self
-
-
-class PixelFixerSettings(FixerSettings):
-    """A causal generator in pixels, one frame at a time."""
-
-    uses_map: bool = Field(default=True, description="Whether the semantic map is drawn and given to the fixer.")
-    generator: PixelSizesSettings = Field(default=PixelSizesSettings(), description="Sizes where no weights say them.")
-    weights: WeightsSettings = Field(default=WeightsSettings(), description="File with weights: `bundle` alone.")
-    untrained: Literal["identity", "random", "refuse"] = Field(
-        default="refuse", description="Initialisation without weights: returns the render (identity), random, or an error (refuse)."
-    )
-    steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
-    holes: Literal["noise", "render"] = Field(
-        default="noise", description="Source of a frame where the render is transparent: noise (Eq. 1), or the render."
-    )
-    keep_render: bool = Field(
-        default=True, description="Keep the render where it is opaque, the change is large, and neither map nor history supports it."
-    )
-    precision: Literal["auto", "fp32", "bf16"] = Field(
-        default="auto", description="Of the network. auto: bf16 where the machine has matrix instructions for it, else fp32."
-    )
-
-    @field_validator("steps", mode="before")
-    @classmethod
-    def _counted(cls, value: Any) -> Any:
-        return counted_steps(value)
-
-    @model_validator(mode="after")
-    def _consistent(self) -> PixelFixerSettings:
-        check_steps(self.steps)
-        blocks = {key: FixerSettings.model_fields[key].default for key in ("block_latents", "mode", "tolerance_m", "tolerance_deg")}
-        for key, value in blocks.items():
-            if getattr(self, key) != value:
-                raise ValueError(f"{key} = {getattr(self, key)} | one frame at a time has no blocks: leave it out, or take a onefixer-dit")
-        parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self.weights, key) is not None]
-        if parts:
-            raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")
         return self
 
 

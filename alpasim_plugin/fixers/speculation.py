@@ -54,9 +54,7 @@ class SpeculativeRenderer(Renderer):
         first: One that is made already.
     """
 
-    def __init__(
-        self, runner: BlockRunner, make_fixer: Callable[[], Fixer], settings: FixerSettings, first: Fixer | None = None
-    ) -> None:
+    def __init__(self, runner: BlockRunner, make_fixer: Callable[[], Fixer], settings: FixerSettings, first: Fixer | None = None) -> None:
         self.runner, self.settings = runner, settings
         self._make = make_fixer
         self._spare: Fixer | None = first or make_fixer()

@@ -62,7 +62,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(B, H, W, channels)`` to the same shape."""
-        return self.second(activation(self.first(x), inplace=True)).add_(x)
+        branch: Tensor = self.second(activation(self.first(x), inplace=True))
+        return branch.add_(x)
 
 
 class Downsample(nn.Linear):

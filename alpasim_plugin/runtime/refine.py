@@ -116,11 +116,17 @@ def refine_video(
     begin = time.perf_counter()
     stats = StreamStats()
     with ExitStack() as stack:
-        readers: dict[str, Reader] = {role: stack.enter_context(_reader(path)) for role, path in files.inputs.items()}
+        readers: dict[str, Reader] = {}
+        for role, path in files.inputs.items():
+            readers[role] = _reader(path)
+            stack.enter_context(readers[role])
         check_formats(readers)
         source = readers["input"].format
         fixer = make_fixer()
-        writers: dict[str, Writer] = {role: stack.enter_context(_writer(path, readers["input"])) for role, path in files.results.items()}
+        writers: dict[str, Writer] = {}
+        for role, path in files.results.items():
+            writers[role] = _writer(path, readers["input"])
+            stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer):
             for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):

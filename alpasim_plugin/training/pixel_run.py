@@ -12,7 +12,7 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import parts_of, save_bundle
-from alpasim_plugin.fixers.settings import PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes

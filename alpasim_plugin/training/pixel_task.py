@@ -19,12 +19,30 @@ SEEN = 2  # frames of the perceptual term in an update
 class FrameBatch(Protocol):
     """Consecutive frames of B streams; images ``(B, T, C, H, W)``, as `alpasim_plugin.training.streams.StreamBatch` holds them."""
 
-    render: Tensor
-    opacity: Tensor
-    map: Tensor
-    target: Tensor
-    fresh: Tensor  # (B,) whether a stream starts anew at this update
-    kind: Tensor  # (B,) what it shows
+    @property
+    def render(self) -> Tensor:
+        """Degraded frames, in [-1, 1]."""
+        ...
+
+    @property
+    def opacity(self) -> Tensor:
+        """Theirs, 0 to 1, one channel."""
+        ...
+
+    @property
+    def map(self) -> Tensor:
+        """Semantic maps in [-1, 1]; -1 is black, or no map."""
+        ...
+
+    @property
+    def target(self) -> Tensor:
+        """Clean frames, in [-1, 1]."""
+        ...
+
+    @property
+    def fresh(self) -> Tensor:
+        """``(B,)`` whether a stream starts anew at this update."""
+        ...
 
 
 class FrameStreams(Protocol):
@@ -45,7 +63,6 @@ class NoisyBatch:
 
     sample: PixelSample
     fresh: Tensor
-    kind: Tensor
 
 
 class PixelTask:
@@ -85,7 +102,7 @@ class PixelTask:
         frames = render.shape[1]
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
         sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, int(rng.integers(frames)), seen)
-        return NoisyBatch(sample, got.fresh, got.kind)
+        return NoisyBatch(sample, got.fresh)
 
     def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of an update and what is logged; the state goes on to the next."""

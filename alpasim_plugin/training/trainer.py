@@ -241,7 +241,9 @@ class Trainer(Generic[Batch]):
         steps, decay_from = json.loads(meta.get("end", "[null, null]"))
         if decay_from is not None and self.step > decay_from and [steps, decay_from] != [self.schedule.steps, self.schedule.decay_from]:
             found = f"its decay from {decay_from} to {steps} has begun: it is at {self.step}"
-            raise InputError("continuing a training run", str(path), found, "give the same steps and decay, or begin a run from its weights")
+            raise InputError(
+                "continuing a training run", str(path), found, "give the same steps and decay, or begin a run from its weights"
+            )
         tensors = load_file(str(path))
         self._kept = {key.removeprefix(CARRIED): value for key, value in tensors.items() if key.startswith(CARRIED)}
         if self._carried is not None:

@@ -18,7 +18,9 @@ FACTS: dict[str, MetricInfo] = {
     WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
     DRIFT: MetricInfo("dB", "higher", "mean", "PSNR of the last 50 frames minus that of frames 50 to 100"),
     **{
-        name: MetricInfo("", "lower", "mean", f"step across the borders of {side}-pixel cells over other steps, on flat surfaces; 1: no grid")
+        name: MetricInfo(
+            "", "lower", "mean", f"step across the borders of {side}-pixel cells over other steps, on flat surfaces; 1: no grid"
+        )
         for side, name in GRID.items()
     },
     MS: MetricInfo("ms", "lower", "median", "time of the fixer per frame"),

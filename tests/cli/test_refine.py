@@ -96,7 +96,9 @@ def test_folders_of_pictures_pass_without_a_codec(tmp_path: Path, capsys: pytest
     assert run_command([*command, "--overwrite"]) == 0
 
 
-def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path) -> None:
+def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path
+) -> None:
     good, mixed, empty = pictures(tmp_path / "good"), pictures(tmp_path / "mixed"), tmp_path / "empty"
     empty.mkdir()
     assert cv2.imwrite(str(mixed / "frame_01.png"), np.zeros((20, 64, 3), np.uint8))
@@ -107,7 +109,8 @@ def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(tmp_path: Pat
     assert cv2.imwrite(str(deep / "a.png"), np.zeros((36, 64, 3), np.uint16))
     cases = [
         ([str(empty)], "no .png files"), ([str(mixed)], "frame_01.png is 64x20, the first is 64x36"), ([str(deep)], "16 bits"),
-        ([str(broken)], "frame_02.png is no readable picture"), ([str(good), "--opacity", str(source)], "the opacity is a video, the input a folder"),
+        ([str(broken)], "frame_02.png is no readable picture"),
+        ([str(good), "--opacity", str(source)], "the opacity is a video, the input a folder"),
         ([str(pictures(tmp_path / "clear", channels=4))], "4 channels"),
     ]  # fmt: skip
     for arguments, mention in cases:

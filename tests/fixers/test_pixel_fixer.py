@@ -18,7 +18,7 @@ from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle, save_bundle
 from alpasim_plugin.fixers.keep_render import render_share
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_noise import pixel_noise
-from alpasim_plugin.fixers.settings import PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from alpasim_plugin.types import U8, BlockRule, Frame

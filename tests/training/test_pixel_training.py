@@ -1,4 +1,4 @@
-"""The per-frame generator's training: objectives against their definition, gradients through k frames, resumed runs equal to the last bit."""
+"""The per-frame generator's training: objectives against their definition, gradients through k frames, resumed runs are equal."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.bundle import parts_of
-from alpasim_plugin.fixers.settings import PixelFixerSettings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.nets.pixel_source import pixel_source
@@ -32,7 +32,6 @@ class Batch:
     map: Tensor
     target: Tensor
     fresh: Tensor
-    kind: Tensor
 
 
 class Streams:
@@ -42,7 +41,7 @@ class Streams:
         source = torch.Generator().manual_seed(i)
         target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
         opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
-        return Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]), torch.zeros(2, dtype=torch.int64))
+        return Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]))
 
     def facts(self) -> dict[str, Any]:
         return {"streams": "dark"}
@@ -52,7 +51,9 @@ def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
     got = Streams().update(seed)
     render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity))
     torch.manual_seed(seed)
-    return PixelSample(render, truth, sdmap, opacity, torch.randn_like(render), torch.randn_like(render[:, 0]), torch.full((2,), t), 1, (0, 2))
+    return PixelSample(
+        render, truth, sdmap, opacity, torch.randn_like(render), torch.randn_like(render[:, 0]), torch.full((2,), t), 1, (0, 2)
+    )
 
 
 def generator() -> PixelGenerator:
