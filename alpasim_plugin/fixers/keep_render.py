@@ -13,12 +13,12 @@ from torch import Tensor
 CELL = 8  # pixels of the side of a cell; changes are judged by cells
 REACH = 2  # cells around, where the map or the last output may support a change
 OPAQUE = (0.9, 0.98)  # opacity of a cell: below the first the generator is free, above the second the render is fully trusted
-LARGE = (0.35, 0.6)  # mean change of a cell, of a range of 2: below the first it is never touched, above the second not believed
+LARGE = (0.3, 0.5)  # mean change of a cell, of a range of 2: below the first it is never touched, above the second not believed
 MAPPED = 0.02  # share of a cell's range that drawn map covers
 
 
-def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor) -> Tensor:
-    """Return the weight of the render in the picture.
+def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, before: Tensor) -> Tensor | None:
+    """Return the weight of the render in the picture; None where it is 0 everywhere.
 
     Args:
         out: ``(B, H, W, 3)`` generated frame.
@@ -30,11 +30,11 @@ def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, be
     Returns:
         ``(B, H, W, 1)``, 0 nearly everywhere.
     """
-    change = _cells((out - render).abs().mean(-1, keepdim=True))
+    change = _cells((out - render).abs_()).mean(1, keepdim=True)
     if float(change.amax()) <= LARGE[0]:
-        return out.new_zeros(())
+        return None
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
-    mapped = F.max_pool2d(_cells((sdmap + 1).mean(-1, keepdim=True) / 2), 2 * REACH + 1, 1, REACH) > MAPPED
+    mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, 2 * REACH + 1, 1, REACH) > MAPPED
     now, past = _cells(out), _cells(before)
     low, high = (-F.max_pool2d(-past, 2 * REACH + 1, 1, REACH), F.max_pool2d(past, 2 * REACH + 1, 1, REACH))
     beyond = torch.relu(now - high).amax(1, keepdim=True) + torch.relu(low - now).amax(1, keepdim=True)

@@ -123,7 +123,7 @@ class PixelFixer(Fixer):
 
         joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True))) if len(states) > 1 else states[0]
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
-        images = video[:, :height, :width].clamp(-1, 1).add_(1).mul_(HALF).round_().to(torch.uint8).cpu().numpy()
+        images = after.output[:, :height, :width].add(1).mul_(HALF).round_().to(torch.uint8).cpu().numpy()
         found = []
         for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
             before = None if past is None else (past.fixed, past.raw)

@@ -17,6 +17,7 @@ from alpasim_plugin.errors import FixerError, InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.keep_render import render_share
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.recorded_step import RecordedStep
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
 from alpasim_plugin.nets.precision import Choice, choose_precision
 from alpasim_plugin.nets.sampling import interpolant
@@ -32,6 +33,7 @@ class LoadedGenerator:
     """A generator ready to run; read-only and stateless, so rollouts share it."""
 
     net: PixelGenerator
+    step: RecordedStep  # the same at t = 1
     trained: bool
     note: str  # description of the weights, for labels
     precision: Choice
@@ -79,15 +81,17 @@ def fix_frame(
     Returns:
         ``(B, H, W, 3)``, not clipped to [-1, 1], and the state after the frame, whose last output is this one.
     """
-    net, render = generator.net, inputs.render
+    render = inputs.render
     images = render, inputs.opacity, inputs.sdmap, state
-    out, after = net(*images, source(0))
+    out, after = generator.step(*images, source(0))
     for index, level in enumerate(from_names(settings.steps)[1:], start=1):
         t = level.sigma
-        out, after = net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t))
+        out, after = generator.net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t))
     if settings.keep_render:
-        out = torch.lerp(out, render, render_share(out, inputs.render, inputs.opacity, inputs.sdmap, state.output))
-        after = after._replace(output=out.clamp(-1, 1))
+        share = render_share(out, render, inputs.opacity, inputs.sdmap, state.output)
+        if share is not None:
+            out = torch.lerp(out, render, share)
+            after = after._replace(output=out.clamp(-1, 1))
     return out, after
 
 
@@ -100,7 +104,8 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     else:
         net, trained, note = _untrained(settings), False, f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
-    return LoadedGenerator(net, trained, note, precision, torch.device(device))
+    step = RecordedStep(net) if device == "cpu" else RecordedStep(net, None)
+    return LoadedGenerator(net, step, trained, note, precision, torch.device(device))
 
 
 def _untrained(settings: PixelFixerSettings) -> PixelGenerator:

@@ -18,13 +18,14 @@ from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle, save_bundle
 from alpasim_plugin.fixers.keep_render import render_share
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_noise import pixel_noise
+from alpasim_plugin.fixers.pixel_pipeline import load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from alpasim_plugin.types import U8, BlockRule, Frame
 from tests.fixers.fixer_cases import SIZE, maps_of, moving_picture, pixels, small_settings
 
-FRAMES = moving_picture(8)
+FRAMES = moving_picture(12)  # the last ones through a recording of the network
 MAPS = maps_of(FRAMES)
 SIZES = PixelSizes((8, 12, 16), (0, 1, 1, 1, 1), 8, 4)
 
@@ -76,6 +77,7 @@ def test_streaming_equals_the_rollout_of_the_training(bundle: Path) -> None:
     with torch.no_grad():
         whole = pixel_losses(net, sample, net.start(render[:, 0]), PixelObjectives(0, 0, 0, horizon=99), None).predictions[0]
     expected = whole.clamp(-1, 1).add(1).mul(127.5).round().to(torch.uint8).numpy()
+    assert load_generator(at(bundle)).step.recorded  # the last frames went through a recording
     assert np.abs(streamed.astype(int) - pixels(FRAMES)).mean() > 2  # these weights do something
     assert np.abs(streamed.astype(int) - expected).max() <= 1
 
@@ -195,7 +197,8 @@ def test_an_untrained_generator_returns_the_render(bundle: Path) -> None:
 def share(out: Tensor, opacity: float = 1.0, sdmap: float = -1.0, before: Tensor | None = None) -> Tensor:
     road = torch.full((1, 64, 64, 3), -0.2)
     before = road if before is None else before
-    return render_share(out, road, torch.full((1, 64, 64, 1), opacity), torch.full_like(road, sdmap), before)
+    found = render_share(out, road, torch.full((1, 64, 64, 1), opacity), torch.full_like(road, sdmap), before)
+    return torch.zeros(1, 64, 64, 1) if found is None else found
 
 
 def invented(level: float = 0.9) -> Tensor:
