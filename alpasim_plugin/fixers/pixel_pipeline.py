@@ -113,9 +113,8 @@ def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
         do = "give --set fixer.weights.bundle=FILE; for timing alone, fixer.untrained=random"
         raise InputError(DOING, f"{settings.name}, weights.bundle", "no weights, and settings.untrained is 'refuse'", do)
     given = settings.generator
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed("fixer", 0, settings.name) % 2**63)
-        net = PixelGenerator(PixelSizes(given.widths, given.blocks, given.detail, given.hidden))
+    sizes = PixelSizes(given.widths, given.blocks, given.detail, given.hidden)
+    net = PixelGenerator.random(sizes, derive_seed("fixer", 0, settings.name))
     if settings.untrained == "identity":
         torch.nn.init.zeros_(net.write.weight)
     return net

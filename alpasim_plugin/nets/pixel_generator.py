@@ -18,6 +18,7 @@ from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
+from torch.random import fork_rng
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import listed, weight
@@ -102,6 +103,13 @@ class PixelGenerator(nn.Module):
         self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
         repeat_per_pixel(self.write, DETAIL)
         nn.init.zeros_(self.time.weight)
+
+    @classmethod
+    def random(cls, sizes: PixelSizes, seed: int) -> Self:
+        """Return an untrained network: its weights are a function of the seed, and torch's own random state stays as it was."""
+        with fork_rng(devices=[]):
+            torch.manual_seed(seed % 2**63)
+            return cls(sizes)
 
     def start(self, render: Tensor) -> PixelState:
         """Return the state before a rollout: the first render stands for the past.

@@ -99,9 +99,7 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
     Raises:
         InputError: A bundle of another kind, or of other sizes than the settings.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed("training", run.seed, "pixel.weights") % 2**63)
-        net = PixelGenerator(sizes_of(run.settings))
+    net = PixelGenerator.random(sizes_of(run.settings), derive_seed("training", run.seed, "pixel.weights"))
     if run.init is None or _is_checkpoint(run.init):
         return net
     tensors = parts_of(load_weights(run.init, dtype=torch.float32)).get("generator")
