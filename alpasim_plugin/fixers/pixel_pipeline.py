@@ -113,7 +113,7 @@ def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
         do = "give --set fixer.weights.bundle=FILE; for timing alone, fixer.untrained=random"
         raise InputError(DOING, f"{settings.name}, weights.bundle", "no weights, and settings.untrained is 'refuse'", do)
     given = settings.generator
-    sizes = PixelSizes(given.widths, given.blocks, given.detail, given.hidden)
+    sizes = PixelSizes(**given.model_dump())
     net = PixelGenerator.random(sizes, derive_seed("fixer", 0, settings.name))
     if settings.untrained == "identity":
         torch.nn.init.zeros_(net.write.weight)

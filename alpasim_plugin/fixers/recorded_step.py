@@ -33,7 +33,7 @@ class RecordedStep:
 
     def __call__(self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor) -> tuple[Tensor, PixelState]:
         """Return the clean frame and the state after it; see `PixelGenerator.forward`."""
-        images = render, opacity, sdmap, *state, source
+        images = render, opacity, sdmap, source, *state
         shape = tuple(render.shape)
         self._calls[shape] += 1
         if self._after is not None and shape not in self.recorded and self._calls[shape] > self._after:
@@ -49,11 +49,9 @@ class _Step(nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(
-        self, render: Tensor, opacity: Tensor, sdmap: Tensor, output: Tensor, last: Tensor, hidden: Tensor, source: Tensor
-    ) -> tuple[Tensor, ...]:
-        out, state = self.net(render, opacity, sdmap, PixelState(output, last, hidden), source)
-        return (out, *state)
+    def forward(self, render: Tensor, opacity: Tensor, sdmap: Tensor, source: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        out, after = self.net(render, opacity, sdmap, PixelState(*state), source)
+        return (out, *after)
 
 
 def _record(step: _Step, images: tuple[Tensor, ...]) -> Any:

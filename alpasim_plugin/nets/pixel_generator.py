@@ -23,6 +23,7 @@ from torch.random import fork_rng
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import listed, weight
 from alpasim_plugin.nets.pixel_layers import Conv3, Downsample, ResidualBlock, Upsample, activation, cells, pixels, repeat_per_pixel, small
+from alpasim_plugin.nets.pixel_memory import FrameMemory, MemoryState
 
 GRID_PX = 16  # sides are multiples of it
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
@@ -39,13 +40,15 @@ class PixelSizes:
         widths: Channels at 1/4, 1/8 and 1/16.
         blocks: Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4.
         detail: Channels of the detail path at 1/2.
-        hidden: Recurrent channels at 1/4; 0: the state is images only.
+        hidden: Recurrent channels at 1/4; 0: none.
+        memory: Past frames that are attended to at 1/16 (`nets.pixel_memory`); 0: none.
     """
 
     widths: tuple[int, int, int] = (48, 80, 160)
     blocks: tuple[int, int, int, int, int] = (0, 1, 1, 1, 1)
     detail: int = 16
     hidden: int = 16
+    memory: int = 0
 
 
 class PixelState(NamedTuple):
@@ -54,6 +57,8 @@ class PixelState(NamedTuple):
     output: Tensor  # (B, H, W, 3) its last output, in [-1, 1]
     render: Tensor  # (B, H, W, 3) what that was made from
     hidden: Tensor  # (B, H / 4, W / 4, hidden) in (-1, 1)
+    kept: Tensor  # (B, memory, cells at 1/16, channels) keys and values of past frames
+    frames: Tensor  # (B, 1, 1, 1) how many came so far
 
     def detached(self) -> PixelState:
         """Return the same values, cut off from the graph that made them."""
@@ -92,6 +97,7 @@ class PixelGenerator(nn.Module):
         self.encode8 = _blocks(at8, depth[1])
         self.down16 = Downsample(at8, at16)
         self.middle = _blocks(at16, depth[2])
+        self.memory = FrameMemory(at16, sizes.memory) if sizes.memory else None
         self.up8 = Upsample(at16, at8)
         self.decode8 = _blocks(at8, depth[3])
         self.up4 = Upsample(at8, at4)
@@ -118,7 +124,10 @@ class PixelGenerator(nn.Module):
             render: ``(B, H, W, 3)`` the first frame.
         """
         b, h, w, _ = render.shape
-        return PixelState(render, render, render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden))
+        hidden = render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden)
+        at16 = (h // GRID_PX) * (w // GRID_PX)
+        empty = MemoryState(render.new_zeros(b, 0, at16, 0), render.new_zeros(b, 1, 1, 1))
+        return PixelState(render, render, hidden, *(empty if self.memory is None else self.memory.start(render, at16)))
 
     def forward(
         self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None, t: Tensor | None = None
@@ -148,6 +157,9 @@ class PixelGenerator(nn.Module):
             x8 = x8 + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
         x8 = self.encode8(x8)
         y = self.middle(self.down16(activation(x8)))
+        kept, frames = state.kept, state.frames
+        if self.memory is not None:
+            y, (kept, frames) = self.memory(y, MemoryState(kept, frames))
         y = self.decode8(self.up8(y).add_(x8))
         y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
@@ -155,7 +167,7 @@ class PixelGenerator(nn.Module):
         fine = activation(self.read(fine).add_(self.up2(y)), inplace=True)
         fine = activation(self.refine(fine), inplace=True)
         out = pixels(self.write(fine), DETAIL).float() + render
-        return out, PixelState(out.clamp(-1, 1), render, hidden)
+        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames)
 
     @classmethod
     def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
@@ -197,4 +209,5 @@ def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
     hidden = width("remember.weight") if "remember.weight" in tensors else 0
     widths = (width("stem.weight"), width("down8.weight"), width("down16.weight"))
     blocks = (depth("encode4"), depth("encode8"), depth("middle"), depth("decode8"), depth("decode4"))
-    return PixelSizes(widths, blocks, width("refine.weight"), hidden)
+    memory = width("memory.age") if "memory.age" in tensors else 0
+    return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory)

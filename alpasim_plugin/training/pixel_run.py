@@ -113,8 +113,7 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
 
 def sizes_of(settings: PixelFixerSettings) -> PixelSizes:
     """Return the sizes that the settings name."""
-    given = settings.generator
-    return PixelSizes(given.widths, given.blocks, given.detail, given.hidden)
+    return PixelSizes(**settings.generator.model_dump())
 
 
 def write_bundle(run: PixelRun, path: Path, weights: Mapping[str, Tensor], updates: int) -> Path:

@@ -85,6 +85,27 @@ def test_the_state_is_all_that_goes_on() -> None:
     assert not torch.equal(net(*clip[3], after_two)[0], whole[3])  # and the past is seen
 
 
+def test_attention_reaches_frames_that_the_images_of_the_state_do_not() -> None:
+    sizes = PixelSizes((8, 8, 8), detail=8, hidden=0, memory=2)
+    net = network(sizes=sizes)
+    clip = frames(7)
+    plain = PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=0))
+    plain.load_state_dict({key: value for key, value in net.state_dict().items() if not key.startswith("memory.")})
+    torch.testing.assert_close(
+        rolled(net, clip)[0][6], rolled(plain.requires_grad_(False), clip)[0][6]
+    )  # it begins as if it were not there
+    torch.nn.init.normal_(net.memory.out.weight)  # type: ignore[union-attr]
+    assert PixelGenerator.from_state_dict(net.state_dict()).sizes == sizes
+    whole, state = rolled(net, clip)
+    assert state.frames.flatten().tolist() == [7, 7]
+    assert state.kept.shape == (2, 2, 6, 128)  # of frames 0 and 4
+    forgetful = state.detached()._replace(kept=torch.zeros_like(state.kept))
+    assert not torch.allclose(net(*clip[0], forgetful)[0], net(*clip[0], state)[0])
+    _, early = rolled(net, clip[:3])
+    blank = early._replace(kept=torch.cat([early.kept[:, :1], torch.full_like(early.kept[:, 1:], 9.0)], dim=1))
+    torch.testing.assert_close(net(*clip[3], blank)[0], whole[3])  # slots that nothing has filled yet are not seen
+
+
 def test_clips_of_a_batch_do_not_see_each_other() -> None:
     net, clip = network(), frames(3)
     whole, _ = rolled(net, clip)
