@@ -72,7 +72,7 @@ class FrameMemory(nn.Module):
 
 def _heads(x: Tensor) -> Tensor:
     """Split ``(B, N, width)`` to ``(B, heads, N, width / heads)``."""
-    return x.unflatten(-1, (HEADS, -1)).transpose(1, 2)
+    return x.view(*x.shape[:2], HEADS, x.shape[2] // HEADS).transpose(1, 2)
 
 
 def _waves(h: int, w: int, like: Tensor) -> Tensor:
