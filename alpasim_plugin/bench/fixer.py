@@ -12,55 +12,30 @@ Settings run on a clip from a recorded drive; both modes of the closed loop run 
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
 
-import numpy as np
 import torch
 
+from alpasim_plugin.bench import pixel_fixer
 from alpasim_plugin.bench.fixer_drive import drive
+from alpasim_plugin.bench.fixer_rows import DRIVEN, SCENE, Bench, BenchOptions, Case, Row, difference, in_own_process, p50_p95
 from alpasim_plugin.bench.fixer_speed import Clip, Timing, measure
 from alpasim_plugin.bench.stand_in import save_stand_in
 from alpasim_plugin.bench.whole_clip import whole_clip
-from alpasim_plugin.errors import FixerError, InputError, SimrunError
+from alpasim_plugin.errors import InputError, SimrunError
 from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.refine import Difference
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.types import U8
 
-Weights = Literal["stand-in", "identity", "random"]
-SCENE = "bench-fixer"  # key of the noise
-DRIVEN = "smoke/lead_car"  # a curve, a car ahead and an oncoming one
 SLOW_FRAMES = 21  # of a slow row's clip: three blocks
 NO_WEIGHTS = tuple(f"weights.{part}=null" for part in ("bundle", "dit", "vae", "decoder", "prompt"))
 LIGHT = ("vae.kind=wan", "vae.base=24")  # LightVAE's width
-
-
-@dataclass(frozen=True)
-class Case:
-    """One setting to measure.
-
-    Attributes:
-        group: What it varies: precision, window, history, decoder.
-        name: The setting.
-        overrides: Settings on top of the base, ``key=value``.
-        weights: ``stand-in``: the fixer's own, or random ones where it has none; ``identity``, ``random``: an untrained fixer's.
-        slow: Left out of a quick run, and measured over fewer frames.
-    """
-
-    group: str
-    name: str
-    overrides: tuple[str, ...] = ()
-    weights: Weights = "stand-in"
-    slow: bool = False
 
 
 BASE = Case("precision", "float32")
@@ -99,84 +74,6 @@ def cases(latents: int) -> tuple[Case, ...]:
     )
 
 
-@dataclass(frozen=True)
-class Row:
-    """What one setting costs and how far its images are off.
-
-    Attributes:
-        group, name: The setting.
-        weights: Which weights.
-        size: Width and height, pixels.
-        frames: Frames of the clip.
-        ms: By stage, ``all-in`` and its processor time ``cpu``: median and 95th percentile over blocks after the first, milliseconds per
-            frame.
-        first_ms: First block, whole, all-in.
-        load_ms: Networks from nothing to ready.
-        peak_mb: Largest memory beyond an empty process, 1e6 bytes; None where the system does not tell.
-        rounding: Mean, largest and PSNR (None: equal) against the same setting in float32 over the whole clip; None where there is none.
-        model: The same against the base over the whole clip; None where the networks are others.
-        hit_rate: Share of the predicted frames that were shown; None where nothing is predicted.
-        guarded: Frames that the guard replaced by the raw ones; they are left out of the errors.
-        problem: Why the setting was not measured, else empty.
-    """
-
-    group: str
-    name: str
-    weights: str
-    size: tuple[int, int]
-    frames: int
-    ms: dict[str, tuple[float, float]]
-    first_ms: float | None = None
-    load_ms: float | None = None
-    peak_mb: float | None = None
-    rounding: tuple[float, int, float | None] | None = None
-    model: tuple[float, int, float | None] | None = None
-    hit_rate: float | None = None
-    guarded: int = 0
-    problem: str = ""
-
-
-@dataclass(frozen=True)
-class BenchOptions:
-    """How to measure.
-
-    Attributes:
-        name: The fixer.
-        overrides: The user's settings, in force for every row.
-        device, threads: Where, and with how many threads.
-        passes: Runs over the clip per row, timed, and as many again with a clock at every stage.
-        quick: Leave out what is slow.
-        only: Groups to measure; empty for all.
-        seed: Of the noise and of stand-in weights.
-    """
-
-    name: str = "onefixer-tiny"
-    overrides: tuple[str, ...] = ()
-    device: str = "cpu"
-    threads: int | None = None
-    passes: int = 3
-    quick: bool = False
-    only: tuple[str, ...] = ()
-    seed: int = 0
-
-    def includes(self, case: Case) -> bool:
-        """Say whether a case is to be measured."""
-        return not (case.slow and self.quick) and (not self.only or case.group in self.only)
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Result of a bench.
-
-    Attributes:
-        rows: One per size and setting.
-        facts: Fixer, scene, machine, load, versions.
-    """
-
-    rows: list[Row]
-    facts: dict[str, Any]
-
-
 def bench_fixer(
     options: BenchOptions, sizes: list[tuple[int, int]], frames: int, on_row: Callable[[Row], None] = lambda row: None
 ) -> Bench:
@@ -196,8 +93,14 @@ def bench_fixer(
     recorded = fixer_settings("identity", ["mode=chunk", "uses_map=true"])
     for size in sizes:
         with tempfile.TemporaryDirectory(prefix="simrun-bench-") as folder:
-            settings = CaseSettings(options, Path(folder))  # refuses bad settings before anything is driven
+            chosen = fixer_settings(options.name, options.overrides)
+            per_frame = chosen if isinstance(chosen, PixelFixerSettings) else None
+            settings = None if per_frame else CaseSettings(options, Path(folder))  # refuses bad settings before anything is driven
             clip = drive(DRIVEN, frames, size, recorded, SCENE, seed=options.seed, threads=options.threads).clip
+            if per_frame is not None:
+                rows += pixel_fixer.bench_clip(options, per_frame, clip, on_row)
+            if settings is None:
+                continue
             rows += bench_clip(options, clip, on_row)
             for case in filter(options.includes, LOOPS):
                 rows.append(_loop_row(settings, case, frames, size))
@@ -322,34 +225,7 @@ def _loop_row(of: CaseSettings, case: Case, frames: int, size: tuple[int, int]) 
     )
 
 
-def difference(images: U8, reference: U8) -> tuple[float, int, float | None] | None:
-    """Return mean and largest difference in grey levels, and PSNR in dB, None for equal clips; None for no images at all."""
-    if not len(images):
-        return None
-    total = Difference()
-    for image, expected in zip(images, reference, strict=True):
-        total.add(image, expected)
-    return total.mean_levels, total.max_levels, total.psnr_db if total.squared else None
-
-
-def p50_p95(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
-    """Return median and 95th percentile by name; empty series are left out.
-
-    Example:
-        >>> p50_p95({"dit": [1.0, 3.0, 2.0], "encode": []})
-        {'dit': (2.0, 2.9)}
-    """
-    return {name: (float(np.median(ms)), float(np.percentile(ms, 95))) for name, ms in series.items() if len(ms)}
-
-
 def measured(options: BenchOptions, settings: OneFixerSettings, clip: Clip, own_process: bool) -> Timing:
-    """Time a setting over a clip, in a fresh process if asked: no kernel is warm there, and the memory is this setting's alone."""
+    """Time a setting over a clip, in a fresh process if asked."""
     arguments = (settings, clip, SCENE, options.seed, options.device, options.threads, options.passes)
-    if not own_process:
-        return measure(*arguments)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        try:
-            return pool.submit(measure, *arguments).result()
-        except BrokenProcessPool as error:
-            do = "see its message above; a process without one ran out of memory"
-            raise FixerError("measuring a fixer", settings.name, "its process ended early", do) from error
+    return in_own_process(settings.name, measure, *arguments) if own_process else measure(*arguments)

@@ -106,7 +106,7 @@ def measure(
     Returns:
         Times, memory and the first pass's images.
     """
-    before_mb = _status_mb("VmRSS") if device == "cpu" else 0.0
+    before_mb = resident_mb("VmRSS") if device == "cpu" else 0.0
     clock = StageClock(device)
     begin = clock.now()
     fixer = OneFixer(settings, scene_id, seed, device, threads)
@@ -133,13 +133,13 @@ def measure(
                 images += [frame.rgb for frame in fixed]
                 guarded += [bool(frame.events) for frame in fixed]
         if run == passes - 1:
-            peak_mb = _status_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
+            peak_mb = resident_mb("VmHWM") if device == "cpu" else torch.cuda.max_memory_allocated(device) / MB
             timing.peak_mb = None if peak_mb is None or before_mb is None else peak_mb - before_mb
     timing.images, timing.guarded = np.stack(images), np.array(guarded)
     return timing
 
 
-def _status_mb(key: str) -> float | None:
+def resident_mb(key: str) -> float | None:
     """Return an entry of ``/proc/self/status`` in 1e6 bytes, None where the system has no such file."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from alpasim_plugin.bench.fixer import Row
+from alpasim_plugin.bench.fixer_rows import Row
 from alpasim_plugin.fixers.stage_clock import TIMED
 
 HEAD = (
@@ -22,7 +22,7 @@ HEAD = (
 NEAR = 0.15  # decades between points that share a label
 FEW = 3  # up to so many names are written to the right of their points, more to the left
 FLOOR = 1e-4  # grey levels; where the plot puts errors that are zero
-MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P"}
+MARKERS = {"precision": "o", "window": "s", "history": "^", "decoder": "D", "mode": "P", "guard": "v", "source": "<", "cameras": ">"}
 MARK = "<!-- bench fixer: {} -->"
 
 

@@ -20,7 +20,7 @@ from evaluators.video.perceptual import ImageDistance
 from evaluators.video.summary import TRUTH
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 1  # of what a row holds and how it is measured; part of its key
+VERSION = 2  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 

@@ -12,7 +12,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.bench.fixer import Bench, BenchOptions, Row, bench_fixer
+from alpasim_plugin.bench.fixer import bench_fixer
+from alpasim_plugin.bench.fixer_rows import Bench, BenchOptions, Row
 from alpasim_plugin.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
@@ -28,7 +29,7 @@ Examples:
 
 
 def fixer(
-    name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer-tiny",
+    name: Annotated[str, typer.Option("--fixer", help="A fixer of the onefixer family, or NAME@STEPS.")] = "onefixer",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="A setting in force for every row: fixer.key=value.")] = None,
     sizes: Annotated[str, typer.Option("--sizes", help="Image sizes, comma-separated.")] = "256x144",
     frames: Annotated[int, typer.Option("--frames", min=13, help="Least length of the drive; blocks are completed.")] = 69,

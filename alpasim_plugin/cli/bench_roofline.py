@@ -26,7 +26,7 @@ Examples:
 
 - `simrun bench roofline --fixer onefixer-2b --size 960x544 --on h200 --measure --device cuda`
 
-- `simrun bench roofline --fixer onefixer-tiny --size 256x144 --on 3:0.15:20:8 --measure --device cpu`
+- `simrun bench roofline --fixer onefixer-dit-tiny --size 256x144 --on 3:0.15:20:8 --measure --device cpu`
 """
 
 

@@ -74,7 +74,7 @@ def _fixer() -> str:
     grey = [Frame(i, "front", np.full((32, 48, 3), 40 * i, dtype=np.uint8)) for i in range(fixer.blocks.first)]
     fixed = fixer.step(grey, [frame.rgb for frame in grey])
     refused = sum(bool(frame.events) for frame in fixed)
-    return f"{fixer.label}: a block of {len(fixed)} frames fixed, {refused} refused by its guard"
+    return f"{fixer.label}: {len(fixed)} of {len(grey)} frames fixed, {refused} refused by its guard"
 
 
 def _video() -> str:

@@ -1,4 +1,4 @@
-"""``simrun refine``: apply a fixer to a video file."""
+"""``simrun refine``: apply a fixer to a video file or a folder of pictures."""
 
 from __future__ import annotations
 
@@ -30,21 +30,23 @@ Examples:
 
 - `simrun refine drive.mp4 -o refined.mp4 --compare side.mp4`
 
-- `simrun refine render.mp4 --opacity alpha.mp4 --sdmap map.mp4 --fixer onefixer-tiny --set fixer.window=12 -o refined.mp4`
+- `simrun refine frames -o refined`: folders of PNG, without a codec between
+
+- `simrun refine render.mp4 --opacity alpha.mp4 --sdmap map.mp4 --set fixer.holes=render -o refined.mp4`
 """
 
 
 def refine(
-    source: Annotated[Path, typer.Argument(metavar="IN.mp4", help="Any video: any size, frame rate and length.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4).")],
-    opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey video, white where the input is reliable.")] = None,
-    sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Video of the semantic map (docs/semantic-map.md).")] = None,
-    fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer-tiny",
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A video of any size, rate and length, or a folder of PNG.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4); a folder of PNG without a suffix.")],
+    opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey, white where the input is reliable; in the input's form.")] = None,
+    sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Semantic map (docs/semantic-map.md), in the input's form.")] = None,
+    fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixer's noise.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
-    compare: Annotated[Path | None, typer.Option("--compare", help="Also write input and result side by side (MP4).")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="Also write input and result side by side.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace results that exist.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the summary.")] = False,

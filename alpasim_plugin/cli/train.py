@@ -15,6 +15,8 @@ from alpasim_plugin.cli import train_pairs, train_scenes
 from alpasim_plugin.cli.train_decoder import EPILOG as DECODER_EXAMPLE
 from alpasim_plugin.cli.train_decoder import decoder
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
+from alpasim_plugin.cli.train_per_frame import EPILOG as PER_FRAME_EXAMPLES
+from alpasim_plugin.cli.train_per_frame import per_frame
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
 from alpasim_plugin.cli.train_perceptual import perceptual
 from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_check
@@ -37,6 +39,7 @@ app = typer.Typer(no_args_is_help=True, help="Make training data and train netwo
 WIDTH, HEIGHT = 256, 144
 
 EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
+app.command("per-frame", epilog=PER_FRAME_EXAMPLES)(per_frame)
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("decoder", epilog=DECODER_EXAMPLE)(decoder)
 app.command("painter", hidden=True)(decoder)  # former name
@@ -69,7 +72,7 @@ def vae(
     steps: Steps = 4000,
     seed: Seed = 0,
     init: Annotated[Path | None, typer.Option("--init", help="Initial weights: an autoencoder, or a fixer's bundle.")] = None,
-    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the autoencoder's sizes.")] = "onefixer-tiny",
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the autoencoder's sizes.")] = "onefixer-dit-tiny",
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:

@@ -33,7 +33,9 @@ def onefixer_settings(name: str) -> OneFixerSettings:
     """
     settings = fixer_settings(name)
     if not isinstance(settings, OneFixerSettings):
-        raise InputError("choosing a fixer to train", f"--fixer {name}", "it has no networks", "choose a onefixer, such as onefixer-tiny")
+        raise InputError(
+            "choosing a fixer to train", f"--fixer {name}", "it has no networks", "choose a block generator, such as onefixer-dit-tiny"
+        )
     return settings
 
 
@@ -70,7 +72,7 @@ def train_fixer_command(
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
     threads: options.Threads = None,
     seed: options.Seed = 0,
-    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer-tiny",
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer-dit-tiny",
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
@@ -97,7 +99,7 @@ def memory_command(
     clips: Annotated[int, typer.Option("--clips", min=1, help="Clips per batch.")] = 1,
     columns: Annotated[int, typer.Option("--columns", min=2, help="Width in latents.")] = 32,
     rows: Annotated[int, typer.Option("--rows", min=2, help="Height in latents.")] = 18,
-    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer-tiny",
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer-dit-tiny",
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:

@@ -6,13 +6,15 @@ from collections.abc import Callable
 
 from alpasim_plugin.fixers.block_runner import BlockRunner
 from alpasim_plugin.fixers.chunk import ChunkRenderer
+from alpasim_plugin.fixers.per_frame import PerFrameRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.parts import complete
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.types import Fixer, Frame, RenderRequest, Scenario
+from alpasim_plugin.types import BlockRule, Fixer, Frame, RenderRequest, Scenario
 
-FixedRenderer = SpeculativeRenderer | ChunkRenderer
+FixedRenderer = PerFrameRenderer | SpeculativeRenderer | ChunkRenderer
+ONE_BY_ONE = BlockRule(1, 1)
 
 
 def fixed_renderer(
@@ -24,9 +26,9 @@ def fixed_renderer(
 ) -> FixedRenderer:
     """Return one rollout's renderer whose frames are fixed.
 
-    A fixer works in blocks (5 frames first, then 8), but the poses of a block's later frames are not known when its first frame falls
-    due. ``settings.mode`` chooses between ``speculative`` (`alpasim_plugin.fixers.speculation`) and ``chunk``
-    (`alpasim_plugin.fixers.chunk`).
+    A fixer of single frames fixes each as it is rendered (`alpasim_plugin.fixers.per_frame`). Others work in blocks (5 frames first, then
+    8), but the poses of a block's later frames are not known when its first frame falls due: ``settings.mode`` chooses between
+    ``speculative`` (`alpasim_plugin.fixers.speculation`) and ``chunk`` (`alpasim_plugin.fixers.chunk`).
 
     Args:
         render: The base renderer of the same rollout; its frames are checked.
@@ -41,6 +43,9 @@ def fixed_renderer(
     def make() -> Fixer:
         return complete(make_fixer(), Fixer)
 
+    first = make()
+    if first.blocks == ONE_BY_ONE:
+        return PerFrameRenderer(runner, first)
     if settings.mode == "chunk":
-        return ChunkRenderer(runner, make())
-    return SpeculativeRenderer(runner, make, settings)
+        return ChunkRenderer(runner, first)
+    return SpeculativeRenderer(runner, make, settings, first)

@@ -1,14 +1,14 @@
-"""Weights of a fixer in one safetensors file: transformer, autoencoder, prompt, and the settings they were trained with.
+"""Weights of a fixer in one safetensors file: its networks, and the settings they were trained with.
 
-Keys carry their part: ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's), ``prompt.text``. The header holds ``format``,
-``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained with. Only safetensors is read: a pickle is
-refused.
+Keys carry their part. A bundle of the kind ``block`` has ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and
+``prompt.text``; one of the kind ``per-frame`` has ``generator.``. The header holds ``format``, ``kind``, ``trained``, ``note`` and
+``settings``, the JSON of the settings that the weights were trained with. Only safetensors is read: a pickle is refused.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,16 +16,51 @@ from torch import Tensor
 
 from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 
+BundleSettings = OneFixerSettings | PixelFixerSettings
 FORMAT = "simrun-fixer-1"
-PARTS = ("dit", "vae", "decoder", "prompt")
-MUST_MATCH = ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled")  # other values give wrong images
-MAY_DIFFER = ("steps", "history", "window", "sink", "holes", "uses_map")  # named in the label
 DOING = "loading a fixer's weights"
+RENAMED = {"onefixer-tiny": "onefixer-dit-tiny", "onefixer-s": "onefixer-dit-s"}  # former names in the headers of older bundles
+OLDEST_KIND = "block"  # of bundles whose header names none
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a kind of bundle holds.
+
+    Args:
+        needed, optional: Parts.
+        must_match: Settings that give wrong images at other values than those of the training.
+        may_differ: Settings that may have other values, which the label then names.
+    """
+
+    needed: frozenset[str]
+    optional: frozenset[str]
+    must_match: tuple[str, ...]
+    may_differ: tuple[str, ...]
+
+    def problems(self, parts: Iterable[str]) -> list[str]:
+        """Return what is missing and what does not belong."""
+        found = set(parts)
+        return [f"no {part}.*" for part in sorted(self.needed - found)] + [
+            f"unknown part {part}.*" for part in sorted(found - self.needed - self.optional)
+        ]
+
+
+KINDS: Mapping[str, Kind] = {
+    "block": Kind(
+        frozenset({"dit", "vae"}),
+        frozenset({"decoder", "prompt"}),
+        ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled"),
+        ("steps", "history", "window", "sink", "holes", "uses_map"),
+    ),
+    "per-frame": Kind(frozenset({"generator"}), frozenset(), (), ("steps", "holes", "uses_map")),
+}
 
 
 @dataclass(frozen=True)
@@ -38,47 +73,61 @@ class Bundle:
 
 
 def save_bundle(
-    path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: OneFixerSettings, *, trained: bool, note: str = ""
+    path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: BundleSettings, *, trained: bool, note: str = ""
 ) -> None:
     """Write a bundle atomically.
 
     Args:
         path: A ``.safetensors`` file.
-        parts: State dicts by part: ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``: tokens, text_width).
+        parts: State dicts by part: ``generator``; or ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``:
+            tokens, text_width).
         settings: What the weights were trained with.
         trained: Whether they were learned.
         note: Description for labels.
 
     Raises:
-        InputError: A part that is not known, or no transformer or autoencoder.
+        InputError: A part that is not known, or one that is missing.
     """
-    unknown, missing = sorted(set(parts) - set(PARTS)), sorted({"dit", "vae"} - set(parts))
-    if unknown or missing:
-        found = f"parts {sorted(parts)}"
-        raise InputError("saving a fixer's weights", str(path), found, f"give dit and vae, and nothing but {', '.join(PARTS)}")
+    kind = kind_of(settings)
+    problems = KINDS[kind].problems(parts)
+    if problems:
+        do = f"give {', '.join(sorted(KINDS[kind].needed))}, and nothing else but {', '.join(sorted(KINDS[kind].optional)) or 'these'}"
+        raise InputError("saving a fixer's weights", str(path), "; ".join(problems), do)
     tensors = {f"{part}.{key}": value for part, sd in parts.items() for key, value in sd.items()}
     plain = settings.model_dump(mode="json", exclude={"weights"})
-    write_safetensors(path, tensors, {"format": FORMAT, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)})
+    header = {"format": FORMAT, "kind": kind, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)}
+    write_safetensors(path, tensors, header)
 
 
-def read_bundle(path: str | Path, settings: OneFixerSettings) -> Bundle:
+def kind_of(settings: BundleSettings) -> str:
+    """Return the kind of bundle that a fixer's settings take."""
+    return "per-frame" if isinstance(settings, PixelFixerSettings) else "block"
+
+
+def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
     """Read a bundle for use with some settings.
 
     Raises:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
     header, trained_with = _header(path)
-    differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*MUST_MATCH, *MAY_DIFFER)]
-    wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in MUST_MATCH]
+    name = kind_of(settings)
+    found_kind = header.get("kind", OLDEST_KIND)
+    if found_kind != name:
+        do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
+        raise InputError(DOING, f"{path} with the settings of {settings.name}", f"a bundle of the kind {found_kind!r}, not {name!r}", do)
+    kind = KINDS[name]
+    differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*kind.must_match, *kind.may_differ)]
+    wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in kind.must_match]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
     parts = parts_of(load_weights(path, sha256=settings.weights.sha256.bundle))
-    unknown, missing = sorted(set(parts) - set(PARTS)), sorted({"dit", "vae"} - set(parts))
-    if unknown or missing:
-        found = "; ".join([f"no {part}.*" for part in missing] + [f"unknown part {part}.*" for part in unknown])
-        raise InputError(DOING, str(path), found, f"write it with save_bundle (parts {', '.join(PARTS)})")
+    problems = kind.problems(parts)
+    if problems:
+        do = f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})"
+        raise InputError(DOING, str(path), "; ".join(problems), do)
     trained = header.get("trained") == "true"
-    others = [f"{key} {used} instead of {due}" for key, due, used in differs if due != used and key in MAY_DIFFER]
+    others = [f"{key} {used} instead of {due}" for key, due, used in differs if due != used and key in kind.may_differ]
     note = ", ".join(text for text in ("" if trained else "untrained", header.get("note", ""), *others) if text)
     return Bundle(parts, trained, note or "trained")
 
@@ -91,7 +140,7 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
     """
     _, trained_with = _header(path)
     name = str(trained_with.pop("name"))
-    return name, (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
+    return RENAMED.get(name, name), (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
 
 
 def load_tiny_vae(path: str | Path) -> TinyVAE:

@@ -1,16 +1,18 @@
-"""The factory of ``onefixer`` in all its sizes: what a run knows of it without loading a network."""
+"""The factories of ``onefixer`` in all its forms: what a run knows of it without loading a network."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.interfaces import Declaration
 from alpasim_plugin.nets.headers import read_metadata
 
 if TYPE_CHECKING:
     from alpasim_plugin.fixers.onefixer import OneFixer
+    from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 
 PARTS = ("bundle", "dit", "vae", "decoder", "prompt")
 
@@ -22,7 +24,14 @@ def onefixer(settings: OneFixerSettings, scene_id: str, seed: int = 0, device: s
     return OneFixer(settings, scene_id, seed, device, threads)
 
 
-def describe(settings: OneFixerSettings) -> Declaration:
+def per_frame(settings: PixelFixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> PixelFixer:
+    """Make one rollout's session; see `alpasim_plugin.fixers.pixel_fixer.PixelFixer`."""
+    from alpasim_plugin.fixers.pixel_fixer import PixelFixer  # loads torch
+
+    return PixelFixer(settings, scene_id, seed, device, threads)
+
+
+def describe(settings: OneFixerSettings | PixelFixerSettings) -> Declaration:
     """Say whose weights the settings name.
 
     Raises:
@@ -43,3 +52,5 @@ def describe(settings: OneFixerSettings) -> Declaration:
 
 onefixer.settings_model = OneFixerSettings  # type: ignore[attr-defined]
 onefixer.describe = describe  # type: ignore[attr-defined]
+per_frame.settings_model = PixelFixerSettings  # type: ignore[attr-defined]
+per_frame.describe = describe  # type: ignore[attr-defined]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -112,6 +113,23 @@ class WeightsSettings(Part):
         return self
 
 
+def counted_steps(value: Any) -> Any:
+    """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
+    if isinstance(value, int) and not isinstance(value, bool):
+        return schedule.names(value)
+    return tuple(value) if isinstance(value, list) else value  # strict validation takes no list for a tuple after this step
+
+
+def check_steps(steps: tuple[float, ...]) -> None:
+    """Refuse steps that do not fall from 1000.
+
+    Raises:
+        ValueError: With what to write, as pydantic's validators report it.
+    """
+    if any(b >= a for a, b in pairwise(steps)) or steps[0] != 1000 or steps[-1] <= 0:
+        raise ValueError(f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
+
+
 class OneFixerSettings(FixerSettings):
     """A causal latent fixer: autoencoder, transformer with history, flow steps."""
 
@@ -142,15 +160,11 @@ class OneFixerSettings(FixerSettings):
     @field_validator("steps", mode="before")
     @classmethod
     def _counted(cls, value: Any) -> Any:
-        """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
-        if isinstance(value, int) and not isinstance(value, bool):
-            return schedule.names(value)
-        return tuple(value) if isinstance(value, list) else value  # strict validation takes no list for a tuple after this step
+        return counted_steps(value)
 
     @model_validator(mode="after")
     def _consistent(self) -> OneFixerSettings:
-        if any(b >= a for a, b in zip(self.steps, self.steps[1:], strict=False)) or self.steps[0] != 1000 or self.steps[-1] <= 0:
-            raise ValueError(f"steps = {list(self.steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
+        check_steps(self.steps)
         if self.sink > self.window:
             raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
         if self.history == "none" and self.block_latents != 1:
@@ -191,7 +205,7 @@ def _without_shipped(document: Document, overrides: Sequence[str]) -> Document:
     weights = document.data.get("weights")
     if not isinstance(weights, dict) or weights.get("bundle") is None or "weights.bundle" in keys:
         return document
-    sizes = sorted(key for key in keys if key.partition(".")[0] in ("dit", "vae"))
+    sizes = sorted(key for key in keys if key.partition(".")[0] in ("dit", "vae", "generator"))
     if sizes:
         found = f"the weights in {weights['bundle']} have their sizes"
         do = "add --set fixer.weights.bundle=null for an untrained network of other sizes, or give a bundle of yours"

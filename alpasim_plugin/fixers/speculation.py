@@ -51,12 +51,13 @@ class SpeculativeRenderer(Renderer):
         runner: Renders and calls the fixer.
         make_fixer: Makes a fixer at the start of its history.
         settings: Tolerances.
+        first: One that is made already.
     """
 
-    def __init__(self, runner: BlockRunner, make_fixer: Callable[[], Fixer], settings: FixerSettings) -> None:
+    def __init__(self, runner: BlockRunner, make_fixer: Callable[[], Fixer], settings: FixerSettings, first: Fixer | None = None) -> None:
         self.runner, self.settings = runner, settings
         self._make = make_fixer
-        self._spare: Fixer | None = make_fixer()
+        self._spare: Fixer | None = first or make_fixer()
         self.label, self.trained, blocks = self._spare.label, self._spare.trained, self._spare.blocks
         self.lookahead = max(1, max(blocks.first, blocks.then) - 1)  # at least the next frame, which tells cameras of other rates apart
         self._groups: dict[tuple[int, ...], _CameraGroup] = {}

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
 from typing import Literal, TypeVar
 
 import torch
@@ -20,6 +22,36 @@ Precision = Literal["fp32", "bf16", "fp16"]
 DTYPES: Mapping[Precision, torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 Net = TypeVar("Net", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A precision, and the reason for it."""
+
+    name: Literal["fp32", "bf16"]
+    why: str
+
+
+@cache
+def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu") -> Choice:
+    """Return the precision of convolutions that pays on this machine; the machine is asked once per process.
+
+    ``auto`` is bfloat16 on a GPU and on a processor with matrix or dot-product instructions for it (AMX, AVX-512 BF16). Anywhere else
+    bfloat16 is emulated and takes several times as long as float32.
+
+    Example:
+        >>> choose_precision("fp32")
+        Choice(name='fp32', why='as set')
+    """
+    if wanted != "auto":
+        return Choice(wanted, "as set")
+    if device.split(":")[0] == "cuda":
+        return Choice("bf16", "a GPU")
+    probes = {"AMX": torch.cpu._is_amx_tile_supported, "AVX-512 BF16": torch.cpu._is_avx512_bf16_supported}
+    found = [label for label, probe in probes.items() if probe()]
+    if found:
+        return Choice("bf16", f"the processor has {found[0]}")
+    return Choice("fp32", "the processor has no instructions for bfloat16")
 
 
 def at_precision(net: CosmosCausalDiT, precision: Precision) -> CosmosCausalDiT:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-_ONEFIXER = "alpasim_plugin.fixers.factory:onefixer"
+_PER_FRAME = "alpasim_plugin.fixers.factory:per_frame"
+_BLOCKS = "alpasim_plugin.fixers.factory:onefixer"
 _BROKEN = "alpasim_plugin.renderers.broken:"
 
 BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
@@ -20,10 +21,11 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "broken-late": (f"{_BROKEN}late_renderer", "deliberate fault: images 1 s old"),
     },
     "fixer": {
-        "onefixer": (_ONEFIXER, "one-step causal fixer, the size for a CPU (onefixer-tiny)"),
-        "onefixer-tiny": (_ONEFIXER, "one-step causal fixer for a CPU, 256x144"),
-        "onefixer-s": (_ONEFIXER, "one-step causal fixer for a small GPU"),
-        "onefixer-2b": (_ONEFIXER, "one-step causal fixer of the size of OmniDreams single view; needs its weights"),
+        "onefixer": (_PER_FRAME, "one-step causal generator in pixels, frame by frame, for a CPU"),
+        "onefixer-m": (_PER_FRAME, "the same at three times the work, for bfloat16 instructions or a GPU"),
+        "onefixer-dit-tiny": (_BLOCKS, "one-step causal transformer on latents, block by block, for a CPU at 256x144"),
+        "onefixer-dit-s": (_BLOCKS, "the same for a small GPU"),
+        "onefixer-2b": (_BLOCKS, "the same at the size of OmniDreams single view; needs its weights"),
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
     "policy": {

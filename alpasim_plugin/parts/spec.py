@@ -49,7 +49,7 @@ class PartSpec:
 
     @property
     def label(self) -> str:
-        """Give the part and its weights in a few words: "onefixer-tiny, trained"."""
+        """Give the part and its weights in a few words: "onefixer, trained"."""
         own = getattr(self.settings, "name", "") or self.name
         return f"{own}, {self.note}" if self.note else own
 

@@ -9,7 +9,8 @@ COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
 
 
 def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts``, ``frames`` and ``blocks``.
+    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and ``frames``; ``blocks`` unless the
+    mode is ``frame``.
 
     In speculative mode also the counts of `alpasim_plugin.fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
     predicted frames within tolerance), and the largest ``forecast_error`` and ``shown_error``.
@@ -23,7 +24,7 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
         if not facts:
             continue
         entry = {key: facts[0][key] for key in ("label", "trained", "mode")} | {"rollouts": len(facts)}
-        entry |= {key: sum(one[key] for one in facts) for key in ("frames", "blocks")}
+        entry |= {key: sum(one[key] for one in facts) for key in ("frames", "blocks") if key in facts[0]}
         if entry["mode"] == "speculative":
             entry |= {key: sum(one[key] for one in facts) for key in COUNTS}
             entry["hit_rate"] = round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None

@@ -1,4 +1,4 @@
-"""Refine a video file: read, fix block by block, write; optionally with videos of opacity and semantic map.
+"""Refine a video file or a folder of pictures: read, fix block by block, write; optionally with opacity and semantic map.
 
 Only the current block is held in memory. The result is renamed to its final name when it is complete.
 """
@@ -17,10 +17,13 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
+from alpasim_plugin.log.picture_folder import PictureFolderReader, PictureFolderWriter
 from alpasim_plugin.log.video_reader import TimedFrame, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
 from alpasim_plugin.types import F32, U8, Fixer, Frame
 
+Reader = VideoReader | PictureFolderReader
+Writer = VideoWriter | PictureFolderWriter
 DOING = "refining a video"
 CAMERA = "video"
 SAME_RATE = 5e-4  # relative; 29.97 and 30 differ by twice that
@@ -32,10 +35,10 @@ class RefineFiles:
     """The files of a refinement.
 
     Attributes:
-        source: The video.
-        out: The refined video (MP4).
-        opacity: Grey video, white where the source is reliable; None is opaque everywhere.
-        sdmap: Video of the semantic map; None is no map.
+        source: The video, or a folder of PNG.
+        out: The refined video (MP4), or a folder of PNG where the name has no suffix.
+        opacity: Like the source, grey, white where it is reliable; None is opaque everywhere.
+        sdmap: Like the source, the semantic map; None is no map.
         compare: Also write source and result side by side here.
         overwrite: Whether existing results may be replaced.
     """
@@ -113,15 +116,17 @@ def refine_video(
     begin = time.perf_counter()
     stats = StreamStats()
     with ExitStack() as stack:
-        readers = {role: stack.enter_context(VideoReader(path, DOING)) for role, path in files.inputs.items()}
+        readers: dict[str, Reader] = {}
+        for role, path in files.inputs.items():
+            readers[role] = _reader(path)
+            stack.enter_context(readers[role])
         check_formats(readers)
         source = readers["input"].format
-        rate = source.rate or 1 / source.time_base
         fixer = make_fixer()
-        writers = {
-            role: stack.enter_context(VideoWriter(path, source.time_base, rate, source.colour, source.pixel_aspect))
-            for role, path in files.results.items()
-        }
+        writers: dict[str, Writer] = {}
+        for role, path in files.results.items():
+            writers[role] = _writer(path, readers["input"])
+            stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer):
             for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
@@ -167,16 +172,28 @@ def check_names(files: RefineFiles) -> None:
         resolved[path.resolve()] = role
         if not path.parent.is_dir():
             raise InputError(DOING, str(path), f"no folder {path.parent}", "make it first")
-        if path.is_dir():
-            raise InputError(DOING, str(path), f"the {role} is a folder", "name a file in it")
+        if path.suffix.lower() not in ("", ".mp4"):
+            do = "results are MP4 files or folders of PNG: name it .mp4, or without a suffix"
+            raise InputError(DOING, str(path), f"suffix {path.suffix!r} of the {role}", do)
+        if path.is_dir() and (path.suffix or any(file.suffix != ".png" for file in path.iterdir())):
+            raise InputError(DOING, str(path), f"the {role} is a folder with other things than pictures", "name a new folder or file")
         if path.exists() and not files.overwrite:
             raise InputError(DOING, str(path), f"the {role} exists already", "choose another name, or pass --overwrite")
-        if path.suffix.lower() != ".mp4":
-            raise InputError(DOING, str(path), f"suffix {path.suffix!r} of the {role}", "results are MP4 files: name it .mp4")
 
 
-def check_formats(readers: Mapping[str, VideoReader]) -> None:
-    """Refuse opacity and map videos whose size, frame rate or stated number of frames is not the source's.
+def _reader(path: Path) -> Reader:
+    return PictureFolderReader(path, DOING) if path.is_dir() else VideoReader(path, DOING)
+
+
+def _writer(path: Path, source: Reader) -> Writer:
+    if not path.suffix:
+        return PictureFolderWriter(path, source.names if isinstance(source, PictureFolderReader) else None)
+    stated = source.format
+    return VideoWriter(path, stated.time_base, stated.rate or 1 / stated.time_base, stated.colour, stated.pixel_aspect)
+
+
+def check_formats(readers: Mapping[str, Reader]) -> None:
+    """Refuse opacity and maps of another form, size, frame rate or stated number of frames than the source's.
 
     Raises:
         InputError: With both values.
@@ -184,6 +201,9 @@ def check_formats(readers: Mapping[str, VideoReader]) -> None:
     source = readers["input"].format
     for role, reader in readers.items():
         mine = reader.format
+        if type(reader) is not type(readers["input"]):
+            found = f"the {role} is a {_form(reader)}, the input a {_form(readers['input'])}"
+            raise InputError(DOING, str(reader.path), found, "give both as videos, or both as folders of PNG")
         if (mine.width, mine.height) != (source.width, source.height):
             found = f"the {role} is {mine.width}x{mine.height}, the input {source.width}x{source.height}"
             raise InputError(DOING, str(reader.path), found, "give both at one size")
@@ -195,7 +215,11 @@ def check_formats(readers: Mapping[str, VideoReader]) -> None:
             raise InputError(DOING, str(reader.path), found, "give both at one frame rate")
 
 
-def _joined(readers: Mapping[str, VideoReader], timing: list[TimedFrame]) -> Iterator[tuple[Frame, U8 | None]]:
+def _form(reader: Reader) -> str:
+    return "folder" if isinstance(reader, PictureFolderReader) else "video"
+
+
+def _joined(readers: Mapping[str, Reader], timing: list[TimedFrame]) -> Iterator[tuple[Frame, U8 | None]]:
     """Yield the source's frames with opacity and map, and append their times to ``timing``."""
     roles = list(readers)
     starts: list[Fraction] = []
@@ -215,7 +239,7 @@ def _joined(readers: Mapping[str, VideoReader], timing: list[TimedFrame]) -> Ite
         yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
 
 
-def _check_times(index: int, times_s: Mapping[str, Fraction], readers: Mapping[str, VideoReader]) -> None:
+def _check_times(index: int, times_s: Mapping[str, Fraction], readers: Mapping[str, Reader]) -> None:
     rate = readers["input"].format.rate
     for role, time_s in times_s.items():
         if rate and abs(time_s - times_s["input"]) > 1 / (2 * rate):

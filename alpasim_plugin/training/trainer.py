@@ -1,6 +1,7 @@
 """The training loop: gradient accumulation, clipping, EMA of the weights, log, checkpoints, resume, stop at a non-finite loss.
 
-The batch of step i is a function of i only, so a resumed run has the same batches as an uninterrupted one and ends with equal weights.
+The batch of step i is a function of i only, and what a task carries from one step to the next is part of the checkpoint. So a resumed run
+ends with the weights of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from safetensors import safe_open
@@ -20,26 +21,32 @@ from torch import Tensor, nn
 
 from alpasim_plugin.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.nets.checkpoints import listed, load_weights
 
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
 
 STATE_FILE, LOG_FILE, BAD_FILE = "state.safetensors", "log.jsonl", "bad_batch.pt"
+CARRIED = "carried."
 
 
 @dataclass(frozen=True)
 class Schedule:
     """Optimisation schedule.
 
+    The learning rate rises linearly, then falls to a hundredth along a cosine. With ``decay_from`` it stays at its peak until that update,
+    so that a run whose end is not known yet can go on: ``steps`` and ``decay_from`` may be changed until the decay begins.
+
     Args:
         steps: Total updates.
-        peak_lr: Learning rate after the warm-up, with cosine decay to a hundredth.
+        peak_lr: Learning rate after the warm-up.
         warmup: Updates of linear warm-up.
         accumulate: Batches per update.
         clip: Largest gradient norm.
         weight_decay: Of AdamW, on matrices and kernels only.
         ema: Decay of the exponential moving average of the weights.
         save_every: Updates between checkpoints.
+        decay_from: Update at which the decay begins; None: at the end of the warm-up.
     """
 
     steps: int
@@ -50,13 +57,35 @@ class Schedule:
     weight_decay: float = 0.01
     ema: float = 0.999
     save_every: int = 200
+    decay_from: int | None = None
 
     def lr(self, step: int) -> float:
         """Return the learning rate of an update, counted from 0."""
         if step < self.warmup:
             return self.peak_lr * (step + 1) / self.warmup
-        t = (step - self.warmup) / max(self.steps - self.warmup, 1)
+        begin = self.warmup if self.decay_from is None else max(self.decay_from, self.warmup)
+        t = max(step - begin, 0) / max(self.steps - begin, 1)
         return self.peak_lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(t, 1.0))))
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a folder's other runs must have in common with this one."""
+        facts = asdict(self)
+        for open_end in ("steps", "decay_from") if self.decay_from is not None else ("decay_from",):
+            del facts[open_end]
+        return facts
+
+
+class Carried(Protocol):
+    """What a task carries from one batch to the next, such as the state of a recurrent network."""
+
+    def carried(self) -> Mapping[str, Tensor]:
+        """Return it as named tensors; empty before the first batch."""
+        ...
+
+    def carry(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take what `carried` returned at a checkpoint."""
+        ...
 
 
 class Trainer(Generic[Batch]):
@@ -70,9 +99,10 @@ class Trainer(Generic[Batch]):
         loss: Maps a batch and its number to the loss and values for the log.
         facts: Identity of the run; a folder of another run is refused.
         autocast: Precision of the forward pass, or None.
+        carried: What the task carries from batch to batch, or None.
 
     Raises:
-        InputError: The folder holds another run.
+        InputError: The folder holds another run, or one whose decay has begun under another schedule.
     """
 
     def __init__(
@@ -84,9 +114,10 @@ class Trainer(Generic[Batch]):
         loss: Callable[[Batch, int], Loss],
         facts: Mapping[str, Any],
         autocast: torch.dtype | None = None,
+        carried: Carried | None = None,
     ) -> None:
         self.module, self.folder, self.schedule = module, folder, schedule
-        self._batch, self._loss, self._autocast = batch, loss, autocast
+        self._batch, self._loss, self._autocast, self._carried = batch, loss, autocast, carried
         self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
         decayed = [p for p in self.parameters.values() if p.ndim > 1]
         plain = [p for p in self.parameters.values() if p.ndim <= 1]
@@ -94,7 +125,8 @@ class Trainer(Generic[Batch]):
         self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr, betas=(0.9, 0.99))
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
         self.step = 0
-        self._facts = json.dumps({**facts, "schedule": asdict(schedule)}, sort_keys=True, default=str)
+        self._kept: dict[str, Tensor] = {}
+        self._facts = json.dumps({**facts, "schedule": schedule.identity}, sort_keys=True, default=str)
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
@@ -114,6 +146,22 @@ class Trainer(Generic[Batch]):
             if self.step % self.schedule.save_every == 0 or self.step == last:
                 self.save()
 
+    def begin_from(self, checkpoint: Path) -> None:
+        """Start a run at the weights, averages and moments of another run's checkpoint; does nothing once this run has updates.
+
+        Raises:
+            InputError: A checkpoint of other parameters.
+        """
+        if self.step:
+            return
+        tensors = load_weights(checkpoint)
+        missing = sorted(name for name in self.parameters if f"average.{name}" not in tensors or f"weight.{name}" not in tensors)
+        wrong = sorted(name for name, p in self.parameters.items() if name not in missing and tensors[f"weight.{name}"].shape != p.shape)
+        if missing or wrong:
+            found = "; ".join(filter(None, (listed("no weights of", missing), listed("another shape of", wrong))))
+            raise InputError("beginning a training run", str(checkpoint), found, f"give the {STATE_FILE} of a run with the same network")
+        self._take(tensors)
+
     def averaged(self) -> dict[str, Tensor]:
         """Return the module's state dict with averaged (EMA) parameters."""
         return {**self.module.state_dict(), **self.average}
@@ -124,7 +172,10 @@ class Trainer(Generic[Batch]):
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
         for name, p in self.parameters.items():
             tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state[p].items()}
-        write_safetensors(self.folder / STATE_FILE, tensors, {"step": str(self.step), "facts": self._facts})
+        if self._kept:
+            tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self._kept.items()}
+        meta = {"step": str(self.step), "facts": self._facts, "end": json.dumps([self.schedule.steps, self.schedule.decay_from])}
+        write_safetensors(self.folder / STATE_FILE, tensors, meta)
 
     def _update(self) -> dict[str, float]:
         began = time.perf_counter()
@@ -150,6 +201,7 @@ class Trainer(Generic[Batch]):
             group["lr"] = lr
         self.optimiser.step()
         self.step += 1
+        self._kept = {} if self._carried is None else dict(self._carried.carried())  # only now: a failed update leaves the last one's
         self._update_average()
         return {**sums, "grad_norm": norm, "lr": lr, "s": time.perf_counter() - began}
 
@@ -185,15 +237,28 @@ class Trainer(Generic[Batch]):
             raise InputError(
                 "continuing a training run", str(path), f"the folder has {meta['facts']}, this run {self._facts}", "choose another folder"
             )
-        tensors = load_file(str(path))
         self.step = int(meta["step"])
+        steps, decay_from = json.loads(meta.get("end", "[null, null]"))
+        if decay_from is not None and self.step > decay_from and [steps, decay_from] != [self.schedule.steps, self.schedule.decay_from]:
+            found = f"its decay from {decay_from} to {steps} has begun: it is at {self.step}"
+            raise InputError(
+                "continuing a training run", str(path), found, "give the same steps and decay, or begin a run from its weights"
+            )
+        tensors = load_file(str(path))
+        self._kept = {key.removeprefix(CARRIED): value for key, value in tensors.items() if key.startswith(CARRIED)}
+        if self._carried is not None:
+            self._carried.carry(self._kept)
+        self._take(tensors)
+        self._cut_log()
+
+    def _take(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take weights, averages and moments from a checkpoint's tensors."""
         with torch.no_grad():
             for name, p in self.parameters.items():
                 p.copy_(tensors[f"weight.{name}"])
                 self.average[name].copy_(tensors[f"average.{name}"])
                 moments = {k.split(".")[1]: t for k, t in tensors.items() if k.startswith("moment.") and k.split(".", 2)[2] == name}
                 self.optimiser.state[p] = {k: t if k == "step" else t.to(p.device) for k, t in moments.items()}
-        self._cut_log()
 
     def _cut_log(self) -> None:
         """Drop log rows of updates after the checkpoint, which are repeated."""

@@ -1,4 +1,4 @@
-"""Time blocks of ``onefixer-tiny`` for several widths of its autoencoder: ``python docs/scripts/fixer_widths.py [THREADS]``.
+"""Time blocks of ``onefixer-dit-tiny`` for several widths of its autoencoder: ``python docs/scripts/fixer_widths.py [THREADS]``.
 
 Random frames of 256x144 with holes and semantic maps, chunk by chunk. Random weights stand in for the shipped ones, whose sizes are fixed;
 the history is kept from the last forward (`finalise`, as shipped, adds a forward a block). Prints milliseconds a frame: the median of
@@ -22,8 +22,8 @@ BLOCKS, SIZE = 10, (144, 256)
 
 def ms_a_frame(widths: str, threads: int) -> float:
     """Return the median time a frame of one fixer's blocks after the second."""
-    settings = fixer_settings("onefixer-tiny", [f"vae.widths=[{widths}]", *UNTRAINED])
-    fixer = make_fixer("onefixer-tiny", settings, scene_id="widths", threads=threads)
+    settings = fixer_settings("onefixer-dit-tiny", [f"vae.widths=[{widths}]", *UNTRAINED])
+    fixer = make_fixer("onefixer-dit-tiny", settings, scene_id="widths", threads=threads)
     rng, t_us, spent = stream("widths", 0, "frames"), 0, []
     for block in range(BLOCKS):
         n = fixer.blocks.frames(block)

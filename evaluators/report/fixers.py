@@ -11,7 +11,11 @@ from evaluators.report.numbers import Cell, finite, fixed, missing, plural, shor
 GUARD = "fixer-"
 COLUMNS = (  # head, what it means
     ("fixer", "what it is, and whose weights it has"),
-    ("mode", "speculative: blocks are drafted along the plan in force; chunk: the plan is committed for a whole block"),
+    (
+        "mode",
+        "frame: every frame is fixed as it is rendered; speculative: blocks are drafted along the plan in force; "
+        "chunk: the plan is committed for a whole block",
+    ),
     ("frames", "camera frames that went through it"),
     ("hit rate", "share of drafted frames whose true pose came within tolerance"),
     ("redrafts", "blocks that were made again on the way, per block"),

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from alpasim_plugin.image_metrics import grid_ratio
 from alpasim_plugin.types import F64, U8
-from evaluators.video.facts import DRIFT, PSNR, SSIM, WARP, WARP_LATE
+from evaluators.video.facts import DRIFT, GRID, PSNR, SSIM, WARP, WARP_LATE
 from evaluators.video.frames import identical_frames, psnr_db, ssim
 from evaluators.video.perceptual import ImageDistance, picture_distances
 from evaluators.video.warp import late_window, warp_l1
 
 SETTLED = slice(50, 100)  # frames that the end of a long clip is held against
 END = 50  # frames at the end
+GRID_EVERY = 4  # frames: a grid stands still
 
 
 @dataclass(frozen=True)
@@ -21,11 +23,12 @@ class ClipQuality:
 
     series: Mapping[str, F64]
     identical: int  # frames that equal the truth
+    grid: Mapping[str, float] = field(default_factory=dict)  # of the whole clip
 
     @property
     def means(self) -> dict[str, float]:
         """One value a metric: the mean over the clip; the late window of Warp L1; the drift of clips that are long enough for it."""
-        out = {name: float(values.mean()) for name, values in self.series.items()}
+        out = {name: float(values.mean()) for name, values in self.series.items()} | dict(self.grid)
         if WARP in self.series:
             pairs = self.series[WARP]
             out[WARP_LATE] = float(pairs[late_window(len(pairs))].mean())
@@ -45,11 +48,14 @@ def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, ImageDistanc
         EvaluatorError: Videos that do not belong together.
     """
     series: dict[str, F64] = {}
+    grid: dict[str, float] = {}
     if truth is not None:
         series = {PSNR: psnr_db(made, truth), SSIM: ssim(made, truth)}
         series |= {name: picture_distances(net, made, truth) for name, net in networks.items()}
+        ratios = {name: grid_ratio(made[::GRID_EVERY], truth[::GRID_EVERY], side) for side, name in GRID.items()}
+        grid = {name: ratio for name, ratio in ratios.items() if ratio is not None}
     series[WARP] = warp_l1(made)
-    return ClipQuality(series, 0 if truth is None else identical_frames(made, truth))
+    return ClipQuality(series, 0 if truth is None else identical_frames(made, truth), grid)
 
 
 def drift_of(psnr: F64 | None) -> float | None:

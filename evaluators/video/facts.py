@@ -6,6 +6,7 @@ from evaluators.metrics import MetricInfo, declare
 
 PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
 DRIFT = "drift_psnr_db"
+GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
 
 FACTS: dict[str, MetricInfo] = {
     PSNR: MetricInfo("dB", "higher", "mean", "peak signal-to-noise ratio of frames, identical ones count as 100 dB"),
@@ -16,6 +17,12 @@ FACTS: dict[str, MetricInfo] = {
     WARP: MetricInfo("", "lower", "mean", "change from frame to frame beyond the video's own motion"),
     WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
     DRIFT: MetricInfo("dB", "higher", "mean", "PSNR of the last 50 frames minus that of frames 50 to 100"),
+    **{
+        name: MetricInfo(
+            "", "lower", "mean", f"step across the borders of {side}-pixel cells over other steps, on flat surfaces; 1: no grid"
+        )
+        for side, name in GRID.items()
+    },
     MS: MetricInfo("ms", "lower", "median", "time of the fixer per frame"),
 }
 for _name, _facts in FACTS.items():

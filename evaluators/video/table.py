@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from evaluators.video.facts import DRIFT, FACTS, MS, PSNR, SSIM, WARP, WARP_LATE
+from evaluators.video.facts import DRIFT, FACTS, GRID, MS, PSNR, SSIM, WARP, WARP_LATE
 
 TITLES = {
     PSNR: "PSNR, dB", SSIM: "SSIM", WARP: "Warp L1 x 1e4", WARP_LATE: "late Warp L1 x 1e4", DRIFT: "drift, dB", MS: "ms per frame",
+    GRID[4]: "grid of 4", GRID[16]: "grid of 16",
 }  # fmt: skip
 SCALE = {WARP: 1e4, WARP_LATE: 1e4}
-DIGITS = {PSNR: 2, SSIM: 4, WARP: 1, WARP_LATE: 1, DRIFT: 2, MS: 1}
+DIGITS = {PSNR: 2, SSIM: 4, WARP: 1, WARP_LATE: 1, DRIFT: 2, MS: 1, GRID[4]: 3, GRID[16]: 3}
 ARROWS = {"higher": "\u2191", "lower": "\u2193", "none": ""}
 
 

@@ -102,7 +102,7 @@ def test_gpu_that_is_too_small_is_an_error_with_both_numbers(monkeypatch):
 @pytest.mark.slow
 def test_command_prints_the_table_and_the_measurement():
     sets = [part for text in SMALL_DIT for part in ("--set", f"fixer.{text}")]
-    args = ["roofline", "--fixer", "onefixer-tiny", "--size", "48x32", "--on", LAPTOP, "--text-tokens", "1", *sets]
+    args = ["roofline", "--fixer", "onefixer-dit-tiny", "--size", "48x32", "--on", LAPTOP, "--text-tokens", "1", *sets]
     plain = CliRunner().invoke(app, args, catch_exceptions=False)
     assert plain.exit_code == 0
     assert "| dit |" in plain.stdout

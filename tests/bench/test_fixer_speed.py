@@ -71,7 +71,7 @@ def test_stand_in_weights_follow_their_seed_and_say_that_they_are_untrained(stan
     assert all(torch.equal(same[key], first[key]) for key in first)
     other = load_weights(tmp_path / "other.safetensors")
     assert not torch.equal(other["dit.final_layer.linear.weight"], first["dit.final_layer.linear.weight"])
-    fixer = make_fixer("onefixer-tiny", settings(f"weights.bundle={stand_in}"), scene_id="scene")
+    fixer = make_fixer("onefixer-dit-tiny", settings(f"weights.bundle={stand_in}"), scene_id="scene")
     assert not fixer.trained
     assert "random" in fixer.label
 

@@ -94,7 +94,7 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
 
 
 def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
-    variants = parse_variants(f"3dgs,two=onefixer@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"])
+    variants = parse_variants(f"3dgs,two=onefixer-dit-tiny@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"])
     assert [variant.label for variant in variants] == ["3dgs", "two", "small"]
     assert variants[0].spec is None
     two, small = (variant.spec.settings for variant in variants[1:] if variant.spec)
@@ -104,7 +104,7 @@ def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
     assert (two.window, small.window, len(two.steps)) == (6, 5, 2)
     assert small.dit.width == 24
     assert small.weights.bundle == str(bundle)
-    assert bundle_fixer(bundle)[0] == "onefixer-tiny"
+    assert bundle_fixer(bundle)[0] == "onefixer-dit-tiny"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 from fractions import Fraction
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -68,3 +69,51 @@ def test_bad_options_are_four_part_errors(source: Path, options: list[str], ment
     assert mention in error
     assert error.startswith("error: ")
     assert not source.with_name("out.mp4").exists()
+
+
+def pictures(folder: Path, count: int = 3, height: int = 36, channels: int = 3) -> Path:
+    folder.mkdir()
+    for i in range(count):
+        shape = (height, 64, channels) if channels > 1 else (height, 64)
+        noise = np.random.default_rng(i).integers(0, 256, shape, dtype=np.uint8)
+        assert cv2.imwrite(str(folder / f"frame_{i:02d}.png"), noise)
+    return folder
+
+
+def test_folders_of_pictures_pass_without_a_codec(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, alpha = pictures(tmp_path / "in"), pictures(tmp_path / "alpha", channels=1)
+    out, side = tmp_path / "out", tmp_path / "side"
+    command = ["refine", str(source), "-o", str(out), "--fixer", "identity", "--opacity", str(alpha), "--compare", str(side)]
+    assert run_command(command) == 0
+    assert "equal" in capsys.readouterr().out
+    assert sorted(file.name for file in out.iterdir()) == [f"frame_{i:02d}.png" for i in range(3)]
+    for i in range(3):
+        name = f"frame_{i:02d}.png"
+        assert np.array_equal(cv2.imread(str(out / name)), cv2.imread(str(source / name)))  # to the last bit
+        assert cv2.imread(str(side / name)).shape == (36, 128, 3)
+    assert run_command(command) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert run_command([*command, "--overwrite"]) == 0
+
+
+def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: Path
+) -> None:
+    good, mixed, empty = pictures(tmp_path / "good"), pictures(tmp_path / "mixed"), tmp_path / "empty"
+    empty.mkdir()
+    assert cv2.imwrite(str(mixed / "frame_01.png"), np.zeros((20, 64, 3), np.uint8))
+    broken = pictures(tmp_path / "broken")
+    (broken / "frame_02.png").write_bytes(b"no picture")
+    deep = tmp_path / "deep"
+    deep.mkdir()
+    assert cv2.imwrite(str(deep / "a.png"), np.zeros((36, 64, 3), np.uint16))
+    cases = [
+        ([str(empty)], "no .png files"), ([str(mixed)], "frame_01.png is 64x20, the first is 64x36"), ([str(deep)], "16 bits"),
+        ([str(broken)], "frame_02.png is no readable picture"),
+        ([str(good), "--opacity", str(source)], "the opacity is a video, the input a folder"),
+        ([str(pictures(tmp_path / "clear", channels=4))], "4 channels"),
+    ]  # fmt: skip
+    for arguments, mention in cases:
+        assert run_command(["refine", *arguments, "-o", str(tmp_path / "out"), "--fixer", "identity"]) == 2
+        assert mention in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()

@@ -35,7 +35,7 @@ class Recorded:
         return self.list_of_frames
 
 
-def small_settings(*overrides: str, name: str = "onefixer-tiny") -> OneFixerSettings:
+def small_settings(*overrides: str, name: str = "onefixer-dit-tiny") -> OneFixerSettings:
     settings = fixer_settings(name, (*SMALL_DIT, *overrides))
     assert isinstance(settings, OneFixerSettings)
     return settings

@@ -62,7 +62,7 @@ def refusal(settings: OneFixerSettings) -> str:
 def test_a_bundle_is_loaded_whole(bundle: Path) -> None:
     session = fixer(at(bundle))
     assert session.trained
-    assert session.label == "onefixer-tiny, 500 steps"
+    assert session.label == "onefixer-dit-tiny, 500 steps"
     assert session.networks.text.keys_values[0][0].shape[1] == 2
     out = pixels(run_blocks(session, FRAMES, MAPS))
     assert np.abs(out.astype(int) - pixels(FRAMES)).max() > 2
@@ -104,7 +104,7 @@ def test_missing_extra_and_transposed_tensors_are_named(bundle: Path) -> None:
 def test_a_bundle_without_an_autoencoder_is_refused(bundle: Path) -> None:
     spoil(bundle, **{key.replace(".", "__"): None for key in load_file(bundle) if key.startswith("vae.")})
     assert "no vae.*" in refusal(at(bundle))
-    with pytest.raises(InputError, match="give dit and vae"):
+    with pytest.raises(InputError, match="give dit, vae"):
         save_bundle(bundle, {"dit": {}}, at(bundle), trained=False)
 
 

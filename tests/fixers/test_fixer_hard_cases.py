@@ -164,10 +164,10 @@ def test_reduced_precision_over_3600_frames(weights: Path, precision: str) -> No
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_the_shipped_size_over_900_frames(tmp_path: Path, precision: str) -> None:
     path = tmp_path / "stand_in.safetensors"
-    plain = fixer_settings("onefixer-tiny", ["holes=noise"])
+    plain = fixer_settings("onefixer-dit-tiny", ["holes=noise"])
     assert isinstance(plain, OneFixerSettings)
     save_stand_in(path, plain)
-    settings = fixer_settings("onefixer-tiny", ["holes=noise", f"weights.bundle={path}"])
+    settings = fixer_settings("onefixer-dit-tiny", ["holes=noise", f"weights.bundle={path}"])
     assert isinstance(settings, OneFixerSettings)
     torch.set_num_threads(2)
     series = drift(settings, precision, 900, (144, 256))

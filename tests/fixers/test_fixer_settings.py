@@ -18,13 +18,13 @@ from alpasim_plugin.types import BlockRule
 from tests.fixers.fixer_cases import small_settings
 
 
-def refusal(*overrides: str, name: str = "onefixer") -> str:
+def refusal(*overrides: str, name: str = "onefixer-dit-tiny") -> str:
     with pytest.raises(InputError) as caught:
         fixer_settings(name, overrides)
     return str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["onefixer", "onefixer-tiny", "onefixer-s", "onefixer-2b", "identity"])
+@pytest.mark.parametrize("name", ["onefixer", "onefixer-m", "onefixer-dit-tiny", "onefixer-dit-s", "onefixer-2b", "identity"])
 def test_every_fixer_has_settings_that_load(name: str) -> None:
     assert name in names("fixer")
     assert isinstance(fixer_settings(name), FixerSettings)
@@ -36,19 +36,15 @@ def test_sizes_are_what_their_names_promise() -> None:
         assert isinstance(settings, OneFixerSettings)
         return DiTSizes(**settings.dit.model_dump()).parameters / 1e6
 
-    assert 2.5 < millions("onefixer-tiny") < 3
-    assert 20 < millions("onefixer-s") < 60
+    assert 2.5 < millions("onefixer-dit-tiny") < 3
+    assert 20 < millions("onefixer-dit-s") < 60
     big = fixer_settings("onefixer-2b")
     assert isinstance(big, OneFixerSettings)
     assert DiTSizes(**big.dit.model_dump()) == DiTSizes()
 
 
-def test_the_bare_name_is_the_cpu_size() -> None:
-    assert fixer_settings("onefixer") == fixer_settings("onefixer-tiny")
-
-
 def test_step_count_after_the_name() -> None:
-    four = fixer_settings("onefixer@4", ["window=8"])
+    four = fixer_settings("onefixer-dit-tiny@4", ["window=8"])
     assert isinstance(four, OneFixerSettings)
     assert four.steps == (1000, 750, 500, 250)
     assert four.window == 8
@@ -90,7 +86,7 @@ def test_a_bundle_and_parts_do_not_go_together() -> None:
 
 
 def test_paths_start_where_they_were_written() -> None:
-    settings = fixer_settings("onefixer", ["weights.dit=nets/a.safetensors", "weights.vae=/b.safetensors"])
+    settings = fixer_settings("onefixer-dit-tiny", ["weights.dit=nets/a.safetensors", "weights.vae=/b.safetensors"])
     assert isinstance(settings, OneFixerSettings)
     assert settings.weights.dit == str(Path.cwd() / "nets/a.safetensors")
     assert settings.weights.vae == "/b.safetensors"
@@ -98,7 +94,7 @@ def test_paths_start_where_they_were_written() -> None:
 
 def test_a_bundle_that_ships_steps_aside_for_parts_and_keeps_its_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = tmp_path / "shipped.yaml"
-    plain = Path(str(resources.files("configs.fixers"))) / "onefixer-tiny.yaml"
+    plain = Path(str(resources.files("configs.fixers"))) / "onefixer-dit-tiny.yaml"
     shipped.write_text(plain.read_text().partition("weights:")[0] + "weights: {bundle: here.safetensors}\n")
     monkeypatch.setattr("alpasim_plugin.fixers.settings.resources.files", lambda package: tmp_path)
 

@@ -194,9 +194,9 @@ def test_map_is_seen_only_where_the_settings_use_it(weights: Path) -> None:
 
 
 def test_an_untrained_fixer_says_so_and_hands_an_opaque_render_through() -> None:
-    session = make_fixer("onefixer", small_settings(), scene_id="scene")
+    session = make_fixer("onefixer-dit-tiny", small_settings(), scene_id="scene")
     assert not session.trained
-    assert session.label == "onefixer-tiny, untrained (identity)"
+    assert session.label == "onefixer-dit-tiny, untrained (identity)"
     frames = moving_picture(21, holes=False)
     out = pixels(run_blocks(session, frames, MAPS))
     assert np.array_equal(out, pixels(frames))
@@ -214,8 +214,8 @@ def test_an_untrained_fixer_is_the_autoencoders_round_trip() -> None:
 
 
 def test_steps_after_the_name_are_in_the_label() -> None:
-    session = make_fixer("onefixer@2", small_settings("steps=[1000,500]"), scene_id="scene")
-    assert session.label == "onefixer-tiny@2, untrained (identity)"
+    session = make_fixer("onefixer-dit-tiny@2", small_settings("steps=[1000,500]"), scene_id="scene")
+    assert session.label == "onefixer-dit-tiny@2, untrained (identity)"
 
 
 # --- blocks that are refused ----------------------------------------------------------------------------------------
@@ -265,4 +265,4 @@ def test_settings_of_another_fixer_are_refused() -> None:
     from alpasim_plugin.fixers import fixer_settings
 
     with pytest.raises(InputError, match="fixer_settings"):
-        make_fixer("onefixer", fixer_settings("identity"), scene_id="scene")
+        make_fixer("onefixer-dit-tiny", fixer_settings("identity"), scene_id="scene")

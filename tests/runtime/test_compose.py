@@ -28,7 +28,7 @@ from scenarios.suite import expand
         ("onefixer", "onefixer+3dgs"),
         ("onefixer@2", "onefixer@2+3dgs"),
         ("identity+clean", "identity+clean"),
-        ("onefixer-tiny@2+broken-black", "onefixer-tiny@2+broken-black"),
+        ("onefixer-dit-tiny@2+broken-black", "onefixer-dit-tiny@2+broken-black"),
     ],
 )
 def test_a_name_is_a_renderer_or_a_fixer_over_one(name: str, meant: str) -> None:
@@ -81,11 +81,11 @@ def keys(renderers: tuple[str, ...], fixer: tuple[str, ...] = ()) -> list[str]:
 
 
 def test_settings_of_a_fixer_enter_its_rollouts_key_and_no_other() -> None:
-    plain, fixed = keys(("3dgs", "onefixer"))
-    plain_too, changed = keys(("3dgs", "onefixer"), ("tolerance_m=0.5",))
+    plain, fixed = keys(("3dgs", "onefixer-dit-tiny"))
+    plain_too, changed = keys(("3dgs", "onefixer-dit-tiny"), ("tolerance_m=0.5",))
     assert plain == plain_too
     assert fixed != changed
-    assert keys(("onefixer",), ("tolerance_m=0.02", "tolerance_deg=0.1")) == [fixed]  # the defaults, said aloud
+    assert keys(("onefixer-dit-tiny",), ("tolerance_m=0.02", "tolerance_deg=0.1")) == [fixed]  # the defaults, said aloud
 
 
 def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,12 +101,12 @@ def test_the_code_of_a_renderer_enters_the_keys_of_its_rollouts_alone(monkeypatc
 def test_weights_enter_the_key_by_their_content_and_not_by_their_time(tmp_path: Path) -> None:
     path = tmp_path / "net.safetensors"
     path.write_bytes(b"one")
-    first = keys(("onefixer",), (f"weights.dit={path}",))
+    first = keys(("onefixer-dit-tiny",), (f"weights.dit={path}",))
     path.write_bytes(b"one")
-    assert keys(("onefixer",), (f"weights.dit={path}",)) == first
+    assert keys(("onefixer-dit-tiny",), (f"weights.dit={path}",)) == first
     path.write_bytes(b"two")
-    assert keys(("onefixer",), (f"weights.dit={path}",)) != first
-    fixer = resolve("fixer", "onefixer", (f"weights.dit={path}",))
+    assert keys(("onefixer-dit-tiny",), (f"weights.dit={path}",)) != first
+    fixer = resolve("fixer", "onefixer-dit-tiny", (f"weights.dit={path}",))
     assert dict(fixer.files) == {str(path): file_sha256(path)}
     json.dumps(fixer.as_dict())
 
@@ -127,7 +127,7 @@ def test_settings_for_a_fixer_that_is_not_there_are_refused() -> None:
 )
 def test_a_bad_setting_is_named_with_the_nearest(override: str, found: str, do: str) -> None:
     with pytest.raises(InputError) as caught:
-        plan(("onefixer",), (override,))
+        plan(("onefixer-dit-tiny",), (override,))
     assert found in str(caught.value)
     assert do in caught.value.do_this
     assert "--set fixer." in caught.value.with_what
@@ -135,4 +135,4 @@ def test_a_bad_setting_is_named_with_the_nearest(override: str, found: str, do: 
 
 def test_weights_that_are_not_there_are_refused_before_anything_runs() -> None:
     with pytest.raises(InputError, match="no such file"):
-        plan(("onefixer",), ("weights.dit=/nowhere/net.safetensors",))
+        plan(("onefixer-dit-tiny",), ("weights.dit=/nowhere/net.safetensors",))

@@ -120,7 +120,7 @@ def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road:
     small = ("weights.bundle=null", *sizes, "untrained=random", "uses_map=false")
 
     def network() -> Blend:
-        return make_fixer("onefixer", fixer_settings("onefixer", small), scene_id="straight-road", threads=1)  # type: ignore[return-value]
+        return make_fixer("onefixer-dit-tiny", fixer_settings("onefixer-dit-tiny", small), scene_id="straight-road", threads=1)  # type: ignore[return-value]
 
     scenario = replace(straight_road, end_us=2_000_000)
     run = drive(scenario, Zigzag, network, mode=mode, tolerance_m=0.01)

@@ -26,7 +26,7 @@ SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height
 
 def plan_of(fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
     refs = expand("smoke/straight", SCENE)
-    return make_plan(refs, ("clean", "onefixer+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer))
+    return make_plan(refs, ("clean", "onefixer-dit-tiny+clean"), ("lane-camera",), (0,), RunOptions(fixer=fixer))
 
 
 def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False) -> list[tuple[str, bool]]:
@@ -68,7 +68,7 @@ def test_the_same_command_continues_and_another_setting_does_not_reuse(finished:
     root = tmp_path / "run"
     shutil.copytree(finished, root)
     before = comparable(finished)
-    fixed = next(cell for cell in plan.cells if cell.renderer.name == "onefixer+clean")
+    fixed = next(cell for cell in plan.cells if cell.renderer.name == "onefixer-dit-tiny+clean")
     (root / fixed.folder / MANIFEST).unlink()
     assert sorted(run(plan, root)) == [("ok", False), ("ok", True)]
     assert comparable(root) == before
@@ -79,33 +79,33 @@ def test_the_same_command_continues_and_another_setting_does_not_reuse(finished:
 def test_an_untrained_fixer_is_called_so_everywhere(finished: Path) -> None:
     said = "untrained (random)"
     info = json.loads((finished / "run.json").read_text())
-    assert said in info["fixers"]["onefixer+clean"]["label"]
-    assert info["fixers"]["onefixer+clean"]["settings"]["dit"]["width"] == 32
+    assert said in info["fixers"]["onefixer-dit-tiny+clean"]["label"]
+    assert info["fixers"]["onefixer-dit-tiny+clean"]["settings"]["dit"]["width"] == 32
     assert info["config"]["fixer"] == list(SMALL_NET)
     assert info["weights"] == {}
     summary = json.loads((finished / "summary.json").read_text())
-    entry = summary["fixers"]["onefixer+clean"]
+    entry = summary["fixers"]["onefixer-dit-tiny+clean"]
     assert said in entry["label"]
     assert entry["trained"] is False
-    assert list(summary["fixers"]) == ["onefixer+clean"]
-    manifest = json.loads(next(finished.glob("rollouts/onefixer+clean/**/manifest.json")).read_text())
+    assert list(summary["fixers"]) == ["onefixer-dit-tiny+clean"]
+    manifest = json.loads(next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/manifest.json")).read_text())
     assert said in manifest["fixer"]["label"]
     assert said in (finished / "summary.md").read_text().replace("\\", "")
     page = (finished / "report.html").read_text()
-    assert '<div class="caution">onefixer+clean is' in page
+    assert '<div class="caution">onefixer-dit-tiny+clean is' in page
     assert 'id="table-fixers"' in page
-    log = read_asl(next(finished.glob("rollouts/onefixer+clean/**/rollout.asl")), images=False)
+    log = read_asl(next(finished.glob("rollouts/onefixer-dit-tiny+clean/**/rollout.asl")), images=False)
     assert said in log.info["versions"]["sensorsim"]
 
 
 def test_hits_and_pose_errors_are_in_the_tables(finished: Path) -> None:
     summary = json.loads((finished / "summary.json").read_text())
-    entry = summary["fixers"]["onefixer+clean"]
+    entry = summary["fixers"]["onefixer-dit-tiny+clean"]
     assert entry["frames"] == 15
     assert entry["predicted"] == 15 - 3
     assert 0 < entry["hits"] <= entry["predicted"]
     assert entry["hit_rate"] == pytest.approx(entry["hits"] / entry["predicted"], abs=1e-4)
-    stages = summary["speed"]["onefixer+clean"]["stages"]
+    stages = summary["speed"]["onefixer-dit-tiny+clean"]["stages"]
     assert {"render", "map", "fix", "fix: encode", "fix: dit", "fix: decode", "fix: cache write"} <= set(stages)
     assert sum(stage["share"] for stage in stages.values()) == pytest.approx(1.0, abs=0.001)
     steps = pq.read_table(finished / "steps.parquet").to_pylist()
@@ -139,7 +139,7 @@ def test_list_fixers_says_whose_weights_they_have(capsys: pytest.CaptureFixture[
     listed = json.loads(capsys.readouterr().out)
     assert "[no network]" in listed["identity"]
     assert "[weights missing]" in listed["onefixer-2b"]
-    assert set(listed) >= {"onefixer", "onefixer-tiny", "onefixer-s"}
+    assert set(listed) >= {"onefixer", "onefixer-dit-tiny", "onefixer-dit-s"}
 
 
 def test_time_is_counted_where_it_was_spent() -> None:

@@ -34,11 +34,11 @@ def test_other_weights_are_another_rollout_of_that_policy_alone(tmp_path: Path, 
 
 def fixed_key(*overrides: str) -> str:
     refs = expand("smoke/straight", ("timing.duration_us=1200000",))
-    return make_plan(refs, ("onefixer",), ("pure-pursuit",), (0,), RunOptions(images="none", fixer=overrides)).cells[0].rollout_key
+    return make_plan(refs, ("onefixer-dit-tiny",), ("pure-pursuit",), (0,), RunOptions(images="none", fixer=overrides)).cells[0].rollout_key
 
 
 def test_a_fixers_weights_count_by_their_bytes_and_not_by_their_place(tmp_path: Path) -> None:
-    shipped = fixer_settings("onefixer")
+    shipped = fixer_settings("onefixer-dit-tiny")
     assert isinstance(shipped, OneFixerSettings)
     assert shipped.weights.bundle is not None
     moved, other = tmp_path / "moved.safetensors", tmp_path / "other.safetensors"

@@ -1,0 +1,98 @@
+"""``simrun train per-frame``: train the per-frame generator from streams of pairs and video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+import typer
+
+from alpasim_plugin.cli import training_options as options
+from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.nets.precision import choose_precision
+from alpasim_plugin.training.pixel_rollout import PixelObjectives
+from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
+from alpasim_plugin.training.streams import StreamShares, TrainingStreams
+from alpasim_plugin.training.trainer import Schedule
+
+WITHOUT_VIDEO = StreamShares(pairs=0.93, identity=0.07, video=0.0, damaged_video=0.0)
+EPILOG = """
+Examples:
+
+- `simrun train per-frame data/pairs --video data/video --out runs/s --steps 20000 --decay-from 16000`
+
+- `simrun train per-frame data/pairs --out runs/s2 --init runs/s/state.safetensors --warmup 0`: further, on other data
+"""
+
+
+def per_frame(
+    data: options.Pairs,
+    out: options.RunFolder,
+    video: Annotated[Path | None, typer.Option("--video", help="Folder of driving video (docs/pairs.md).")] = None,
+    sequences: Annotated[int | None, typer.Option("--sequences", min=1, help="Only the first N sequences, in order of generation.")] = None,
+    steps: options.Steps = 20_000,
+    decay_from: Annotated[
+        int | None, typer.Option("--decay-from", min=1, help="Update at which the learning rate begins to fall; by default at 4/5.")
+    ] = None,
+    stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
+    lr: options.PeakLr = 1e-3,
+    warmup: Annotated[int, typer.Option("--warmup", min=0, help="Updates of rising learning rate; 0 where a run goes on.")] = 100,
+    ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.998,
+    streams: Annotated[int, typer.Option("--streams", min=1, help="Streams of frames in a batch.")] = 6,
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Frames of an update: k, that gradients pass through.")] = 4,
+    episode: Annotated[int, typer.Option("--episode", min=1, help="Updates that a stream stays with a sequence.")] = 12,
+    crop: Annotated[str, typer.Option("--crop", help="WIDTHxHEIGHT of a crop, multiples of 16.")] = "128x96",
+    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")] = 0.1,
+    temporal: Annotated[float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")] = 0.25,
+    flow: Annotated[float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")] = 0.25,
+    init: Annotated[Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")] = None,
+    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer",
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="A setting of that fixer: fixer.key=value.")] = None,
+    save_every: Annotated[int, typer.Option("--save-every", min=1, help="Updates between checkpoints.")] = 200,
+    keep_every: Annotated[int, typer.Option("--keep-every", min=0, help="Updates between bundles that are kept; 0: the last.")] = 1000,
+    precision: Annotated[
+        Literal["auto", "fp32", "bf16"], typer.Option("--precision", help="Of the forward passes; auto: what pays on this machine.")
+    ] = "auto",
+    threads: options.Threads = None,
+    seed: options.Seed = 0,
+    metric_weights: options.MetricWeights = None,
+    as_json: options.AsJson = False,
+    debug: options.Debug = False,
+) -> None:
+    """Train the per-frame generator; writes OUT/fixer.safetensors (averaged weights, float16) and its card.
+
+    The learning rate is constant until --decay-from; until then --steps and --decay-from may be changed, so that a run can be prolonged.
+    """
+    del debug
+    options.use_threads(threads)
+    progress = options.Progress(steps, every=25)
+    settings = fixer_settings(fixer, ["weights.bundle=null", *fixer_overrides(overrides or [])])
+    if not isinstance(settings, PixelFixerSettings):
+        do = "choose onefixer or onefixer-m; 'simrun train fixer' trains the block generators"
+        raise InputError("choosing a fixer to train", f"--fixer {fixer}", "it is no generator in pixels", do)
+    chosen = choose_precision(precision)
+    progress.console.print(f"precision: {chosen.name} ({chosen.why})", highlight=False)
+    width, height = _size(crop)
+    shares = StreamShares() if video is not None else WITHOUT_VIDEO
+    source = TrainingStreams(
+        data, video, seed=seed, batch=streams, frames=frames, crop=(height, width), episode=episode, shares=shares, count=sequences
+    )
+    schedule = Schedule(
+        steps, peak_lr=lr, warmup=warmup, clip=0.5, ema=ema, save_every=save_every, decay_from=decay_from or max(4 * steps // 5, 1)
+    )
+    objectives = PixelObjectives(perceptual, temporal, flow, horizon=frames)
+    distance = progress.perceptual_term(metric_weights) if perceptual else None
+    dtype = torch.bfloat16 if chosen.name == "bf16" else None
+    run = PixelRun(settings, source, objectives, schedule, init, seed, dtype, keep_every)
+    progress.wrote(train_per_frame(run, out, distance, progress.update, stop_at), as_json)
+
+
+def _size(text: str) -> tuple[int, int]:
+    sides = text.split("x")
+    if len(sides) != 2 or not all(side.isdecimal() and int(side) and int(side) % 16 == 0 for side in sides):
+        raise InputError("reading --crop", f"--crop {text}", "not two multiples of 16", "write WIDTHxHEIGHT, such as 128x96")
+    return int(sides[0]), int(sides[1])

@@ -1,0 +1,152 @@
+"""The generator in pixels as a streaming session: one frame in, one frame out, a history per camera, every frame guarded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers import guard
+from alpasim_plugin.fixers.pixel_noise import pixel_noise
+from alpasim_plugin.fixers.pixel_pipeline import PixelInputs, fix_frame, load_generator
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.fixers.views import DOING, HALF, Views, group_views
+from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
+from alpasim_plugin.nets.pixel_source import sparse_source
+from alpasim_plugin.types import F32, I64, U8, BlockRule, Fixer, Frame
+
+
+@dataclass(frozen=True)
+class CameraHistory:
+    """The past of one camera."""
+
+    state: PixelState  # of one view
+    frames: int  # fixed so far
+    t_us: int  # of the last
+    raw: U8  # (H, W, 3) the last render
+    fixed: U8  # (H, W, 3) the last output as generated, also if the guard returned the raw frame
+
+
+class PixelFixer(Fixer):
+    """Repair the frames of one rollout one by one. A step may hold other cameras than the step before; each has its own history.
+
+    Args:
+        settings: Weights, steps, precision, guard.
+        scene_id, seed: Key of the noise, with camera, frame and pixel.
+        device: ``cpu`` or ``cuda``.
+        threads: Torch threads of this process; None leaves their number.
+
+    Raises:
+        InputError: Settings of another fixer, or weights that are missing or do not fit.
+    """
+
+    blocks = BlockRule(1, 1)
+
+    def __init__(self, settings: FixerSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> None:
+        if not isinstance(settings, PixelFixerSettings):
+            found = f"settings of type {type(settings).__name__}"
+            raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
+        if threads is not None:
+            torch.set_num_threads(threads)
+        self.settings, self.scene_id = settings, scene_id
+        self.generator = load_generator(settings, device)
+        self.trained = self.generator.trained
+        at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
+        self.label = f"{settings.name}{at}, {self.generator.note}, {self.generator.precision.name}"
+        self.reset(seed)
+
+    def reset(self, seed: int) -> None:
+        """Drop the history of every camera and use the noise of another seed."""
+        self.seed = seed
+        self._history: dict[str, CameraHistory] = {}
+
+    def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
+        """Fix one frame of some cameras and add them to their histories.
+
+        Args:
+            block: One frame per camera.
+            maps: Semantic maps of the same frames, or empty: nothing is drawn; ignored unless the settings say ``uses_map``.
+
+        Returns:
+            As many frames, same order, times and cameras. Opacity and depth remain the render's.
+
+        Raises:
+            InputError: Frames that do not continue the rollout, or are none (see `views.group_views`).
+            RendererError: An opacity that is not a number or outside [0, 1].
+        """
+        views = group_views(block, maps if self.settings.uses_map else (), 1)
+        for view in views:
+            self._check(view)
+        out, after = list(block), dict(self._history)
+        for view in views:
+            for camera, index, made, event in self._fix(view):
+                i = index[0]
+                out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=made.fixed)
+                after[camera] = made
+        self._history = after
+        return tuple(out)
+
+    def _check(self, view: Views) -> None:
+        for camera, times in zip(view.cameras, view.t_us, strict=True):
+            past = self._history.get(camera)
+            if past is None:
+                continue
+            if past.raw.shape[:2] != view.shape:
+                found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
+                raise InputError(DOING, f"camera {camera!r}", found, "keep a camera's image size for the whole rollout, or reset")
+            if times[0] <= past.t_us:
+                found = f"a frame at {times[0]} us after one at {past.t_us} us"
+                raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
+
+    def _fix(self, view: Views) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
+        """Return per camera its name, the places of its frames in the block, its history after the frame, and the guard's event."""
+        net, device = self.generator.net, self.generator.device
+        inputs = to_inputs(view, device)
+        pasts = [self._history.get(camera) for camera in view.cameras]
+        states = [net.start(inputs.render[b : b + 1]) if past is None else past.state for b, past in enumerate(pasts)]
+        counts = [0 if past is None else past.frames for past in pasts]
+        height, width = view.shape
+
+        def source(draw: int) -> Tensor:
+            if view.alpha is None or self.settings.holes == "render":
+                return inputs.render
+
+            def noise(b: int, pixels: I64) -> F32:
+                return pixel_noise(self.scene_id, self.seed, view.cameras[b], draw, counts[b], pixels)
+
+            return sparse_source(inputs.render, inputs.opacity, noise)
+
+        joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True))) if len(states) > 1 else states[0]
+        video, after = fix_frame(self.generator, self.settings, inputs, joined, source)
+        images = after.output[:, :height, :width].add(1).mul_(HALF).round_().to(torch.uint8).cpu().numpy()
+        found = []
+        for b, (camera, past) in enumerate(zip(view.cameras, pasts, strict=True)):
+            before = None if past is None else (past.fixed, past.raw)
+            raw = view.rgb[b, 0]
+            event = guard.check_frames(video[b, :height, :width].permute(2, 0, 1)[:, None], images[b : b + 1], raw[None], before)[0]
+            state = PixelState(*(part[b : b + 1] for part in after))
+            if event == guard.NAN:  # it would stay in the state for ever
+                state = net.start(inputs.render[b : b + 1])
+            found.append((camera, view.index[b], CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]), event))
+        return found
+
+
+def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:
+    """Convert one frame of views to tensors: ``x / 127.5 - 1``, edges repeated up to multiples of 16."""
+    height, width = view.shape
+    right, below = -width % GRID_PX, -height % GRID_PX
+
+    def image(x: np.ndarray) -> Tensor:
+        if right or below:
+            x = np.pad(x, ((0, 0), (0, below), (0, right), (0, 0)), mode="edge")
+        return torch.from_numpy(x).to(device)
+
+    render = image(view.rgb[:, 0]).float().div_(HALF).sub_(1)
+    opacity = torch.ones_like(render[..., :1]) if view.alpha is None else image(view.alpha[:, 0, ..., None])
+    sdmap = torch.full_like(render, -1.0) if view.maps is None else image(view.maps[:, 0]).float().div_(HALF).sub_(1)
+    return PixelInputs(render, opacity, sdmap)

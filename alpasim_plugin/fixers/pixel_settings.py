@@ -1,0 +1,59 @@
+"""Settings of the per-frame generator in pixels."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from alpasim_plugin.fixers.settings import FixerSettings, Part, Positive, WeightsSettings, check_steps, counted_steps
+
+
+class PixelSizesSettings(Part):
+    """Sizes of a generator in pixels where they are not read off weights."""
+
+    widths: tuple[Positive, Positive, Positive] = Field(default=(48, 64, 160), description="Channels at 1/4, 1/8 and 1/16.")
+    blocks: tuple[int, int, int, int, int] = Field(
+        default=(0, 1, 1, 1, 1), description="Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4."
+    )
+    detail: Positive = Field(default=16, description="Channels of the detail path at 1/2.")
+    hidden: int = Field(default=16, ge=0, description="Recurrent channels at 1/4.")
+    memory: int = Field(default=0, ge=0, description="Past frames, every fourth, that are attended to at 1/16; 0: none.")
+
+
+class PixelFixerSettings(FixerSettings):
+    """A causal generator in pixels, one frame at a time."""
+
+    uses_map: bool = Field(default=True, description="Whether the semantic map is drawn and given to the fixer.")
+    generator: PixelSizesSettings = Field(default=PixelSizesSettings(), description="Sizes where no weights say them.")
+    weights: WeightsSettings = Field(default=WeightsSettings(), description="File with weights: `bundle` alone.")
+    untrained: Literal["identity", "random", "refuse"] = Field(
+        default="refuse", description="Initialisation without weights: returns the render (identity), random, or an error (refuse)."
+    )
+    steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
+    holes: Literal["noise", "render"] = Field(
+        default="noise", description="Source of a frame where the render is transparent: noise (Eq. 1), or the render."
+    )
+    keep_render: bool = Field(
+        default=True, description="Keep the render where it is opaque, the change is large, and neither map nor history supports it."
+    )
+    precision: Literal["auto", "fp32", "bf16"] = Field(
+        default="auto", description="Of the network. auto: bf16 where the machine has matrix instructions for it, else fp32."
+    )
+
+    @field_validator("steps", mode="before")
+    @classmethod
+    def _counted(cls, value: Any) -> Any:
+        return counted_steps(value)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> PixelFixerSettings:
+        check_steps(self.steps)
+        blocks = {key: FixerSettings.model_fields[key].default for key in ("block_latents", "mode", "tolerance_m", "tolerance_deg")}
+        for key, value in blocks.items():
+            if getattr(self, key) != value:
+                raise ValueError(f"{key} = {getattr(self, key)} | one frame at a time has no blocks: leave it out, or take a onefixer-dit")
+        parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self.weights, key) is not None]
+        if parts:
+            raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")
+        return self

@@ -1,0 +1,213 @@
+"""A causal generator in pixels, one frame at a time: a recurrent U-Net that predicts the clean frame from the render.
+
+    z_1 = m r + (1 - m) eps                          source (OneFixer, Eq. 1), m = 1 above half opacity
+    z_t = (1 - t) x_0 + t z_1                        interpolant; deployed at t = 1
+    x_0 = r + G(r, z_t - r, opacity, map, state)     prediction of the clean frame, from the render
+    v   = (z_t - x_0) / t                            velocity; the one step z_1 - v (Eq. 2) is x_0
+
+The state is what the generator itself made of the past: its last output, the render that this was made from, and recurrent channels at a
+quarter of the resolution. The network works at 1/4, 1/8 and 1/16; a detail path at 1/2 reads render, opacity and last output again and
+writes the result, so that fine texture does not pass through the U-Net.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+from torch.random import fork_rng
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.checkpoints import listed, weight
+from alpasim_plugin.nets.pixel_layers import Conv3, Downsample, ResidualBlock, Upsample, activation, cells, pixels, repeat_per_pixel, small
+from alpasim_plugin.nets.pixel_memory import FrameMemory, MemoryState
+
+GRID_PX = 16  # sides are multiples of it
+CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
+IMAGES = 16  # render 3, opacity 1, map 3, last output 3, last render 3, source minus render 3
+DETAIL_IMAGES = 7  # render 3, opacity 1, last output 3
+DOING = "building a generator in pixels"
+
+
+@dataclass(frozen=True)
+class PixelSizes:
+    """Sizes of the network.
+
+    Args:
+        widths: Channels at 1/4, 1/8 and 1/16.
+        blocks: Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4.
+        detail: Channels of the detail path at 1/2.
+        hidden: Recurrent channels at 1/4; 0: none.
+        memory: Past frames that are attended to at 1/16 (`nets.pixel_memory`); 0: none.
+    """
+
+    widths: tuple[int, int, int] = (48, 80, 160)
+    blocks: tuple[int, int, int, int, int] = (0, 1, 1, 1, 1)
+    detail: int = 16
+    hidden: int = 16
+    memory: int = 0
+
+
+class PixelState(NamedTuple):
+    """What the generator knows of the past."""
+
+    output: Tensor  # (B, H, W, 3) its last output, in [-1, 1]
+    render: Tensor  # (B, H, W, 3) what that was made from
+    hidden: Tensor  # (B, H / 4, W / 4, hidden) in (-1, 1)
+    kept: Tensor  # (B, memory, cells at 1/16, channels) keys and values of past frames
+    frames: Tensor  # (B, 1, 1, 1) how many came so far
+
+    def detached(self) -> PixelState:
+        """Return the same values, cut off from the graph that made them."""
+        return PixelState(*(part.detach() for part in self))
+
+    def restarted(self, fresh: Tensor, start: PixelState) -> PixelState:
+        """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
+        at = fresh[:, None, None, None]
+        return PixelState(*(torch.where(at, new, old) for new, old in zip(start, self, strict=True)))
+
+
+class PixelGenerator(nn.Module):
+    """The network.
+
+    Args:
+        sizes: Widths and depths.
+
+    Example:
+        >>> net = PixelGenerator(PixelSizes((8, 8, 8)))
+        >>> r = torch.zeros(1, 32, 48, 3)
+        >>> out, state = net(r, r[..., :1] + 1, r, net.start(r))
+        >>> out.shape, state.hidden.shape
+        (torch.Size([1, 32, 48, 3]), torch.Size([1, 8, 12, 16]))
+    """
+
+    def __init__(self, sizes: PixelSizes = PixelSizes()) -> None:
+        super().__init__()
+        self.sizes = sizes
+        at4, at8, at16 = sizes.widths
+        depth = sizes.blocks
+        self.stem = nn.Linear(CELL**2 * IMAGES + sizes.hidden, at4)
+        self.mix = Conv3(at4, at4)
+        self.encode4 = _blocks(at4, depth[0])
+        self.down8 = Downsample(at4, at8)
+        self.time = nn.Linear(2, at8, bias=False)
+        self.encode8 = _blocks(at8, depth[1])
+        self.down16 = Downsample(at8, at16)
+        self.middle = _blocks(at16, depth[2])
+        self.memory = FrameMemory(at16, sizes.memory) if sizes.memory else None
+        self.up8 = Upsample(at16, at8)
+        self.decode8 = _blocks(at8, depth[3])
+        self.up4 = Upsample(at8, at4)
+        self.decode4 = _blocks(at4, depth[4])
+        self.remember = nn.Linear(at4, sizes.hidden) if sizes.hidden else None
+        self.up2 = Upsample(at4, sizes.detail)
+        self.read = nn.Linear(DETAIL**2 * DETAIL_IMAGES, sizes.detail)
+        self.refine = Conv3(sizes.detail, sizes.detail)
+        self.write = small(Conv3(sizes.detail, DETAIL**2 * 3))
+        repeat_per_pixel(self.write, DETAIL)
+        nn.init.zeros_(self.time.weight)
+
+    @classmethod
+    def random(cls, sizes: PixelSizes, seed: int) -> Self:
+        """Return an untrained network: its weights are a function of the seed, and torch's own random state stays as it was."""
+        with fork_rng(devices=[]):
+            torch.manual_seed(seed % 2**63)
+            return cls(sizes)
+
+    def start(self, render: Tensor) -> PixelState:
+        """Return the state before a rollout: the first render stands for the past.
+
+        Args:
+            render: ``(B, H, W, 3)`` the first frame.
+        """
+        b, h, w, _ = render.shape
+        hidden = render.new_zeros(b, h // CELL, w // CELL, self.sizes.hidden)
+        at16 = (h // GRID_PX) * (w // GRID_PX)
+        empty = MemoryState(render.new_zeros(b, 0, at16, 0), render.new_zeros(b, 1, 1, 1))
+        return PixelState(render, render, hidden, *(empty if self.memory is None else self.memory.start(render, at16)))
+
+    def forward(
+        self, render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None, t: Tensor | None = None
+    ) -> tuple[Tensor, PixelState]:
+        """Predict the clean frame.
+
+        Args:
+            render: ``(B, H, W, 3)`` in [-1, 1]; sides are multiples of 16.
+            opacity: ``(B, H, W, 1)``, 0 to 1.
+            sdmap: ``(B, H, W, 3)`` in [-1, 1]; black (-1) where there is no map.
+            state: From `start` or the last call.
+            source: ``(B, H, W, 3)`` z_t; None is the render, which is z_1 where nothing is transparent.
+            t: ``(B,)`` flow time; None is 1, the deployed step.
+
+        Returns:
+            ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
+        """
+        dtype = self.stem.weight.dtype
+        cover = 2 * opacity - 1
+        noise = torch.zeros_like(render) if source is None else source - render
+        parts = [cells(image.to(dtype), CELL) for image in (render, cover, sdmap, state.output, state.render, noise)]
+        if self.remember is not None:
+            parts.append(state.hidden.to(dtype))
+        x4 = self.encode4(self.mix(activation(self.stem(torch.cat(parts, dim=-1)), inplace=True)))
+        x8 = self.down8(activation(x4))
+        if t is not None:
+            x8 = x8 + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
+        x8 = self.encode8(x8)
+        y = self.middle(self.down16(activation(x8)))
+        kept, frames = state.kept, state.frames
+        if self.memory is not None:
+            y, (kept, frames) = self.memory(y, MemoryState(kept, frames))
+        y = self.decode8(self.up8(y).add_(x8))
+        y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
+        hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
+        fine = torch.cat([cells(image.to(dtype), DETAIL) for image in (render, cover, state.output)], dim=-1)
+        fine = activation(self.read(fine).add_(self.up2(y)), inplace=True)
+        fine = activation(self.refine(fine), inplace=True)
+        out = pixels(self.write(fine), DETAIL).float() + render
+        return out, PixelState(out.clamp(-1, 1), render, hidden, kept, frames)
+
+    @classmethod
+    def from_state_dict(cls, tensors: Mapping[str, Tensor], source: str = "weights") -> Self:
+        """Build the network that a state dict fits; sizes are read off the tensors.
+
+        Raises:
+            InputError: Tensors that are missing, unknown, of another shape or not finite.
+        """
+        net = cls(_sizes_of(tensors, source))
+        mine = net.state_dict()
+        missing, unknown = sorted(mine.keys() - tensors.keys()), sorted(tensors.keys() - mine.keys())
+        wrong = [f"{key} {list(tensors[key].shape)} for {list(mine[key].shape)}" for key in mine.keys() & tensors.keys()
+                 if tensors[key].shape != mine[key].shape]  # fmt: skip
+        found = "; ".join(filter(None, (listed("missing", missing), listed("unknown", unknown), listed("shape", sorted(wrong)))))
+        if found:
+            raise InputError(DOING, source, found, "give the weights of one generator in pixels, all of them")
+        net.load_state_dict({key: weight(key, value, torch.float32, source) for key, value in tensors.items()})
+        return net
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Sizes as plain values."""
+        return asdict(self.sizes)
+
+
+def _blocks(channels: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*(ResidualBlock(channels) for _ in range(count)))
+
+
+def _sizes_of(tensors: Mapping[str, Tensor], source: str) -> PixelSizes:
+    def width(key: str) -> int:
+        if key not in tensors or tensors[key].ndim < 2:
+            raise InputError(DOING, source, f"no kernel {key}", "give the weights of a generator in pixels")
+        return int(tensors[key].shape[0])
+
+    def depth(stage: str) -> int:
+        return len({key.split(".")[1] for key in tensors if key.startswith(f"{stage}.")})
+
+    hidden = width("remember.weight") if "remember.weight" in tensors else 0
+    widths = (width("stem.weight"), width("down8.weight"), width("down16.weight"))
+    blocks = (depth("encode4"), depth("encode8"), depth("middle"), depth("decode8"), depth("decode4"))
+    memory = width("memory.age") if "memory.age" in tensors else 0
+    return PixelSizes(widths, blocks, width("refine.weight"), hidden, memory)

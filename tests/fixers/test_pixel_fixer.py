@@ -1,0 +1,221 @@
+"""The per-frame session: streaming equals the training's rollout, cameras are independent, and no fault stays in the history."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.fixers import guard, make_fixer
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle, save_bundle
+from alpasim_plugin.fixers.keep_render import render_share
+from alpasim_plugin.fixers.pixel_fixer import PixelFixer
+from alpasim_plugin.fixers.pixel_noise import pixel_noise
+from alpasim_plugin.fixers.pixel_pipeline import load_generator
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
+from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
+from alpasim_plugin.types import U8, BlockRule, Frame
+from tests.fixers.fixer_cases import SIZE, maps_of, moving_picture, pixels, small_settings
+
+FRAMES = moving_picture(12)  # the last ones through a recording of the network
+MAPS = maps_of(FRAMES)
+SIZES = PixelSizes((8, 12, 16), (0, 1, 1, 1, 1), 8, 4)
+
+
+def generator() -> PixelGenerator:
+    """Return a network that changes frames and depends on its past."""
+    torch.manual_seed(5)
+    net = PixelGenerator(SIZES)
+    with torch.no_grad():
+        net.write.weight.mul_(6)
+    return net
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pixel") / "small.safetensors"
+    settings = fixer_settings("onefixer", ["weights.bundle=null"])
+    assert isinstance(settings, PixelFixerSettings)
+    save_bundle(path, {"generator": generator().state_dict()}, settings, trained=True, note="9 updates")
+    return path
+
+
+def at(bundle: Path, *overrides: str) -> PixelFixerSettings:
+    settings = fixer_settings("onefixer", [f"weights.bundle={bundle}", "precision=fp32", *overrides])
+    assert isinstance(settings, PixelFixerSettings)
+    return settings
+
+
+def session(bundle: Path, *overrides: str, seed: int = 0) -> PixelFixer:
+    return PixelFixer(at(bundle, *overrides), "scene", seed)
+
+
+def run(fixer: PixelFixer, frames: Sequence[Frame], maps: Sequence[U8] = ()) -> list[Frame]:
+    return [out for i, frame in enumerate(frames) for out in fixer.step([frame], maps[i : i + 1])]
+
+
+def scaled(images: np.ndarray) -> Tensor:
+    return torch.from_numpy(images).float() / 127.5 - 1
+
+
+def test_streaming_equals_the_rollout_of_the_training(bundle: Path) -> None:
+    streamed = pixels(run(session(bundle, "keep_render=false"), FRAMES, MAPS))
+    render, sdmap = scaled(pixels(FRAMES))[None], scaled(np.stack(MAPS))[None]
+    opacity = torch.from_numpy(np.stack([f.alpha for f in FRAMES if f.alpha is not None]))[None, ..., None]
+    everywhere = np.arange(SIZE[0] * SIZE[1])
+    eps = np.stack([pixel_noise("scene", 0, "front", 0, i, everywhere).reshape(*SIZE, 3) for i in range(len(FRAMES))])
+    sample = PixelSample(render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, ())
+    net = generator().requires_grad_(False)
+    with torch.no_grad():
+        whole = pixel_losses(net, sample, net.start(render[:, 0]), PixelObjectives(0, 0, 0, horizon=99), None).predictions[0]
+    expected = whole.clamp(-1, 1).add(1).mul(127.5).round().to(torch.uint8).numpy()
+    assert load_generator(at(bundle)).step.recorded  # the last frames went through a recording
+    assert np.abs(streamed.astype(int) - pixels(FRAMES)).mean() > 2  # these weights do something
+    assert np.abs(streamed.astype(int) - expected).max() <= 1
+
+
+def test_one_frame_in_one_frame_out_and_the_label_says_the_precision(bundle: Path) -> None:
+    fixer = session(bundle)
+    assert fixer.blocks == BlockRule(1, 1)
+    assert fixer.trained
+    assert fixer.label == "onefixer, 9 updates, fp32"
+    (out,) = fixer.step(FRAMES[:1], MAPS[:1])
+    assert (out.t_us, out.camera, out.rgb.dtype, out.rgb.shape) == (0, "front", np.uint8, (*SIZE, 3))
+    assert out.alpha is FRAMES[0].alpha
+
+
+def test_cameras_are_alike_alone_together_and_at_different_rates(bundle: Path) -> None:
+    left = moving_picture(8, key="left", camera="left")
+    right = moving_picture(8, key="right", camera="right")
+    small = moving_picture(8, (16, 32), key="small", camera="small")
+    alone = {name: pixels(run(session(bundle), clip)) for name, clip in (("left", left), ("small", small))}
+    slow = pixels(run(session(bundle), right[::2]))
+    fixer = session(bundle)
+    out: dict[str, list[Frame]] = {"left": [], "right": [], "small": []}
+    for i in range(8):
+        frames = [small[i], left[i], *([right[i]] if i % 2 == 0 else [])]
+        for frame in fixer.step(frames, ()):
+            out[frame.camera].append(frame)
+    for name, expected in (*alone.items(), ("right", slow)):
+        assert np.abs(pixels(out[name]).astype(int) - expected).max() <= 1, name
+
+
+def test_a_reset_session_starts_anew_and_noise_follows_the_seed(bundle: Path) -> None:
+    fixer = session(bundle)
+    first = pixels(run(fixer, FRAMES))
+    fixer.reset(0)
+    assert np.array_equal(pixels(run(fixer, FRAMES)), first)
+    other = pixels(run(session(bundle, seed=1), FRAMES))
+    assert not np.array_equal(other, first)
+    assert not np.array_equal(pixels(run(session(bundle, "holes=render"), FRAMES)), first)
+    opaque = [replace(frame, alpha=None) for frame in FRAMES]
+    assert np.array_equal(pixels(run(session(bundle), opaque)), pixels(run(session(bundle, seed=1), opaque)))
+
+
+@pytest.mark.parametrize("size", [(17, 33), (30, 50), (16, 16)])
+def test_odd_sizes_are_padded_and_cropped(bundle: Path, size: tuple[int, int]) -> None:
+    out = run(session(bundle), moving_picture(3, size), maps_of(moving_picture(3, size)))
+    assert [frame.rgb.shape for frame in out] == [(*size, 3)] * 3
+    assert not any(frame.events for frame in out)
+
+
+def test_a_missing_map_is_a_black_one(bundle: Path) -> None:
+    black = [np.zeros((*SIZE, 3), np.uint8)] * len(FRAMES)
+    without = pixels(run(session(bundle), FRAMES))
+    assert np.array_equal(pixels(run(session(bundle), FRAMES, black)), without)
+    assert np.array_equal(pixels(run(session(bundle, "uses_map=false"), FRAMES, MAPS)), without)
+    assert not np.array_equal(pixels(run(session(bundle), FRAMES, MAPS)), without)
+
+
+def test_more_steps_sample_from_noisier_sources(bundle: Path) -> None:
+    two = make_fixer("onefixer@2", at(bundle, "steps=[1000,500]"), scene_id="scene")
+    assert two.label == "onefixer@2, 9 updates, steps [1000.0, 500.0] instead of [1000.0], fp32"
+    assert not np.array_equal(pixels(list(two.step(FRAMES[:1], ()))), pixels(run(session(bundle), FRAMES[:1])))
+
+
+def test_a_refused_step_leaves_the_history(bundle: Path) -> None:
+    expected = run(session(bundle), FRAMES[:3])
+    fixer = session(bundle)
+    run(fixer, FRAMES[:2])
+    holes = np.ones(SIZE, np.float32)
+    holes[3, 4] = np.nan
+    with pytest.raises(RendererError, match="NaN"):
+        fixer.step([replace(FRAMES[2], alpha=holes)], ())
+    with pytest.raises(InputError, match="after one at 100000 us"):
+        fixer.step(FRAMES[1:2], ())
+    with pytest.raises(InputError, match="keep a camera's image size"):
+        fixer.step([replace(moving_picture(3, (16, 32))[2], t_us=FRAMES[2].t_us)], ())
+    with pytest.raises(InputError, match="at most 1"):
+        fixer.step(FRAMES[2:4], ())
+    assert np.array_equal(fixer.step(FRAMES[2:3], ())[0].rgb, expected[2].rgb)
+
+
+def test_a_frame_that_is_not_finite_is_passed_raw_and_forgotten(bundle: Path) -> None:
+    fixer = session(bundle)
+    run(fixer, FRAMES[:2])
+    past = fixer._history["front"]
+    broken = past.state._replace(hidden=torch.full_like(past.state.hidden, float("nan")))
+    fixer._history["front"] = replace(past, state=broken)
+    out = run(fixer, FRAMES[2:])
+    assert out[0].events == (guard.NAN,)
+    assert np.array_equal(out[0].rgb, FRAMES[2].rgb)
+    assert not any(frame.events for frame in out[1:])
+
+
+def test_bundles_of_the_two_kinds_are_told_apart(bundle: Path, weights: Path) -> None:
+    assert bundle_fixer(bundle)[0] == "onefixer"
+    with pytest.raises(InputError, match="a bundle of the kind 'per-frame', not 'block'"):
+        read_bundle(bundle, small_settings())
+    with pytest.raises(InputError, match=r"no generator\.\*"):
+        save_bundle(weights / "none.safetensors", {}, at(bundle), trained=False)
+    with pytest.raises(InputError, match="one frame at a time has no blocks"):
+        at(bundle, "mode=chunk")
+    with pytest.raises(InputError, match=r"give weights\.bundle"):
+        fixer_settings("onefixer", ["weights.bundle=null", "weights.dit=a"])
+
+
+def test_an_untrained_generator_returns_the_render(bundle: Path) -> None:
+    settings = fixer_settings("onefixer", ["weights.bundle=null", "generator.widths=[8,8,8]", "untrained=identity"])
+    fixer = make_fixer("onefixer", settings, scene_id="scene")
+    assert not fixer.trained
+    assert np.array_equal(pixels([fixer.step(FRAMES[:1], ())[0]]), pixels(FRAMES[:1]))
+    with pytest.raises(InputError, match="untrained is 'refuse'"):
+        make_fixer("onefixer", fixer_settings("onefixer", ["weights.bundle=null", "untrained=refuse"]), scene_id="scene")
+
+
+# --- the harmlessness guard -------------------------------------------------------------------------------------------
+
+
+def share(out: Tensor, opacity: float = 1.0, sdmap: float = -1.0, before: Tensor | None = None) -> Tensor:
+    road = torch.full((1, 64, 64, 3), -0.2)
+    before = road if before is None else before
+    found = render_share(out, road, torch.full((1, 64, 64, 1), opacity), torch.full_like(road, sdmap), before)
+    return torch.zeros(1, 64, 64, 1) if found is None else found
+
+
+def invented(level: float = 0.9) -> Tensor:
+    """Return a road with a bright thing on it."""
+    out = torch.full((1, 64, 64, 3), -0.2)
+    out[:, 24:40, 24:40] = level
+    return out
+
+
+def test_an_invention_on_an_opaque_road_is_taken_back() -> None:
+    kept = share(invented())
+    assert float(kept[0, 32, 32]) > 0.9
+    assert float(kept[0, :8].max()) == 0
+
+
+def test_a_change_with_support_stays() -> None:
+    assert not share(invented(), opacity=0.4).any()  # the render is a hole
+    assert not share(invented(), sdmap=0.5).any()  # the map shows something there
+    assert not share(invented(), before=invented().roll(8, 2)).any()  # it was there before, nearby
+    assert not share(invented(level=0.1)).any()  # it is a repair, not an invention

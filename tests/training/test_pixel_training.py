@@ -1,0 +1,161 @@
+"""The per-frame generator's training: objectives against their definition, gradients through k frames, resumed runs are equal."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import parts_of
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
+from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
+from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
+from alpasim_plugin.training.trainer import STATE_FILE, Schedule
+
+SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
+FRAMES = 3
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Like `training.streams.StreamBatch`."""
+
+    render: Tensor
+    opacity: Tensor
+    map: Tensor
+    target: Tensor
+    fresh: Tensor
+
+
+class Streams:
+    """Two streams whose renders are darker than the truth; one starts anew at every third update."""
+
+    def update(self, i: int) -> Batch:
+        source = torch.Generator().manual_seed(i)
+        target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
+        opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
+        return Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]))
+
+    def facts(self) -> dict[str, Any]:
+        return {"streams": "dark"}
+
+
+def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
+    got = Streams().update(seed)
+    render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity))
+    torch.manual_seed(seed)
+    return PixelSample(
+        render, truth, sdmap, opacity, torch.randn_like(render), torch.randn_like(render[:, 0]), torch.full((2,), t), 1, (0, 2)
+    )
+
+
+def generator() -> PixelGenerator:
+    torch.manual_seed(3)
+    return PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=4))
+
+
+def test_terms_are_what_they_are_called() -> None:
+    net, s = generator(), sample()
+    found = pixel_losses(net, s, net.start(s.render[:, 0]), PixelObjectives(), lambda a, b: (a - b).abs().amax((1, 2, 3)))
+    state, made = net.start(s.render[:, 0]), []
+    for i in range(FRAMES):
+        if i == 1:  # the flow term: the velocity of the interpolant, on the rollout's history
+            z_1 = pixel_source(s.render[:, 1], s.opacity[:, 1], s.eps_flow)
+            z_t = 0.6 * s.truth[:, 1] + 0.4 * z_1
+            guess, _ = net(s.render[:, 1], s.opacity[:, 1], s.sdmap[:, 1], state, z_t, s.t)
+            velocity = (z_t - guess) / 0.4
+            torch.testing.assert_close(found.flow, (velocity - (z_1 - s.truth[:, 1])).abs().mean(), atol=1e-5, rtol=0)
+        out, state = net(s.render[:, i], s.opacity[:, i], s.sdmap[:, i], state, pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i]))
+        made.append(out)
+    torch.testing.assert_close(found.predictions, torch.stack(made, 1))
+    error = found.predictions - s.truth
+    torch.testing.assert_close(found.picture, error.abs().mean())
+    torch.testing.assert_close(found.temporal, (error[:, 1:] - error[:, :-1]).abs().mean())
+    torch.testing.assert_close(found.perceptual, error[:, [0, 2]].abs().amax((2, 3, 4)).mean())
+    total = found.picture + 0.1 * found.perceptual + 0.25 * found.temporal + 0.25 * found.flow
+    torch.testing.assert_close(found.total, total)
+    assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
+
+
+@pytest.mark.parametrize(("horizon", "reaches"), [(1, 0), (2, 0), (3, 2), (4, 2)])
+def test_gradients_pass_through_the_last_k_frames(horizon: int, reaches: int) -> None:
+    net, s = generator(), sample()
+    eps = s.eps.clone().requires_grad_()
+    found = pixel_losses(net, replace(s, eps=eps), net.start(s.render[:, 0]), PixelObjectives(0, 0, 0, horizon=horizon), None)
+    (gradient,) = torch.autograd.grad(found.predictions[:, 2].square().mean(), eps)
+    reached = [i for i in range(FRAMES) if bool(gradient[:, i].any())]
+    assert len(reached) - 1 == reaches
+    assert not found.state.hidden.requires_grad
+
+
+def test_switches_of_the_ablation() -> None:
+    net, s = generator(), sample()
+    start = net.start(s.render[:, 0])
+
+    def made(**changes: Any) -> Tensor:
+        return pixel_losses(net, s, start, PixelObjectives(perceptual=0, **changes), None).predictions
+
+    own = made()
+    assert torch.equal(made(clean_history=True)[:, 0], own[:, 0])
+    assert not torch.allclose(made(clean_history=True)[:, 1], own[:, 1])
+    assert not torch.allclose(made(use_map=False), own)
+    assert not torch.allclose(made(mixed=False), own)
+    assert float(pixel_losses(net, s, start, PixelObjectives(flow=0, temporal=0), None).flow) == 0
+
+
+def run_of(steps: int = 4, decay_from: int = 3, **changes: Any) -> PixelRun:
+    settings = fixer_settings("onefixer", SMALL)
+    assert isinstance(settings, PixelFixerSettings)
+    schedule = Schedule(steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from)
+    return PixelRun(settings, Streams(), PixelObjectives(perceptual=0), schedule, **changes)
+
+
+def weights(path: Path) -> dict[str, Tensor]:
+    return load_weights(path / STATE_FILE)
+
+
+def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path: Path) -> None:
+    train_per_frame(run_of(), tmp_path / "whole", None)
+    train_per_frame(run_of(), tmp_path / "cut", None, stop_at=2)
+    bundle = train_per_frame(run_of(), tmp_path / "cut", None)
+    one, other = weights(tmp_path / "whole"), weights(tmp_path / "cut")
+    assert any(key.startswith("carried.") for key in one)
+    assert one.keys() == other.keys()
+    assert all(torch.equal(value, other[key]) for key, value in one.items())
+    saved = parts_of(load_weights(bundle))["generator"]
+    assert torch.equal(saved["mix.weight"], one["average.mix.weight"].half())
+
+
+def test_a_run_may_be_prolonged_until_its_decay_begins(tmp_path: Path) -> None:
+    train_per_frame(run_of(20, 12), tmp_path / "long", None, stop_at=3)
+    train_per_frame(run_of(6, 4), tmp_path / "run", None, stop_at=2)
+    train_per_frame(run_of(20, 12), tmp_path / "run", None, stop_at=3)
+    assert all(torch.equal(value, weights(tmp_path / "run")[key]) for key, value in weights(tmp_path / "long").items())
+    train_per_frame(run_of(5, 3), tmp_path / "run", None)
+    with pytest.raises(InputError, match="its decay from 3 to 5 has begun"):
+        train_per_frame(run_of(20, 12), tmp_path / "run", None)
+
+
+def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path: Path) -> None:
+    train_per_frame(run_of(), tmp_path / "first", None)
+    begin = tmp_path / "first" / STATE_FILE
+    train_per_frame(run_of(init=begin, keep_every=1), tmp_path / "next", None, stop_at=1)
+    assert float(weights(tmp_path / "next")["moment.step.mix.weight"]) == 5  # its moments go on
+    assert (tmp_path / "next" / "fixer-000001.safetensors").is_file()
+    wide = fixer_settings("onefixer", (*SMALL, "generator.detail=12"))
+    assert isinstance(wide, PixelFixerSettings)
+    with pytest.raises(InputError, match="another shape of: read"):
+        train_per_frame(replace(run_of(init=begin), settings=wide), tmp_path / "wide", None)
+
+
+def test_it_learns(tmp_path: Path) -> None:
+    seen: list[float] = []
+    train_per_frame(run_of(24, 20), tmp_path, None, lambda step, numbers: seen.append(numbers["picture"]))
+    assert sum(seen[-4:]) < 0.7 * sum(seen[:4])
