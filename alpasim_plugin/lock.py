@@ -39,7 +39,9 @@ class Held:
 
 
 @contextmanager
-def one_writer(path: Path, doing: str, what: str, wait: bool = False, waiting: Callable[[str], None] = print) -> Iterator[Held]:
+def one_writer(
+    path: Path, doing: str, what: str, wait: bool = False, waiting: Callable[[str], None] = print, do_this: str | None = None
+) -> Iterator[Held]:
     """Hold a lock file during the block.
 
     Args:
@@ -48,6 +50,7 @@ def one_writer(path: Path, doing: str, what: str, wait: bool = False, waiting: C
         what: What is written under the lock, for errors.
         wait: Wait until it is free; otherwise refuse.
         waiting: Called once with a line that says who is waited for.
+        do_this: Advice where the folder cannot be written; None: one that follows from the cause.
 
     Raises:
         InfrastructureError: Another process holds it, or the folder cannot be written.
@@ -58,7 +61,7 @@ def one_writer(path: Path, doing: str, what: str, wait: bool = False, waiting: C
             path.parent.mkdir(parents=True, exist_ok=True)
             taken, owner = _take(path)
         except OSError as error:
-            raise disk_error(path, error, doing) from error
+            raise disk_error(path, error, doing, do_this) from error
         if taken is not None:
             break
         if not wait:

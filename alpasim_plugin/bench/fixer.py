@@ -33,6 +33,7 @@ from alpasim_plugin.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.refine import Difference
 from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.processes import end_with_parent
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.types import U8
 
@@ -347,7 +348,7 @@ def measured(options: BenchOptions, settings: OneFixerSettings, clip: Clip, own_
     arguments = (settings, clip, SCENE, options.seed, options.device, options.threads, options.passes)
     if not own_process:
         return measure(*arguments)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
         try:
             return pool.submit(measure, *arguments).result()
         except BrokenProcessPool as error:

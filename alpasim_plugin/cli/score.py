@@ -72,7 +72,16 @@ def score(
             print(f"[{done}/{len(found)}] {manifest['rollout']}: {describe(manifest, reused=False)}", file=sys.stderr, flush=True)
 
     result = execute_score(
-        found, KnownScenes(scene, rails), chosen, own, resolve_evaluators(evaluators or ()), out, ["simrun", *sys.argv[1:]], on_done, report, wait
+        found,
+        KnownScenes(scene, rails),
+        chosen,
+        own,
+        resolve_evaluators(evaluators or ()),
+        out,
+        ["simrun", *sys.argv[1:]],
+        on_done,
+        report,
+        wait,
     )
     _print(result, as_json)
     raise typer.Exit(result.exit_code)

@@ -89,7 +89,9 @@ def remake_tables(found: Inspection) -> None:
         },
         "determinism": {"status": "skipped", "reason": "the run was stopped before it repeated a rollout"},
     }
-    finish_run(found.root, manifests, lost | {key: found.info[key] for key in KEPT if key in found.info}, (found.root / REPORTS[0]).exists())
+    finish_run(
+        found.root, manifests, lost | {key: found.info[key] for key in KEPT if key in found.info}, (found.root / REPORTS[0]).exists()
+    )
 
 
 def repair_run(found: Inspection, workers: int | None, progress: Progress, wait: bool = False) -> None:
