@@ -103,7 +103,7 @@ class Campaign:
     def finish(self, root: Path, label: str) -> None:
         """Give the command once more and compare the folder with the undisturbed run."""
         kept = finished(root)
-        driver = self._run(root, scene)
+        driver = self._run(root, replace(self.scene, workers=1))
         code = driver.wait()
         found = (
             [f"exit code {code}: {driver.said[-300:]}"]
