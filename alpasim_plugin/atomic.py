@@ -89,6 +89,24 @@ def atomic_folder(folder: Path, doing: str = DOING, do_this: str | None = None) 
         shutil.rmtree(old, ignore_errors=True)
 
 
+@contextmanager
+def scratch_folder(path: Path, doing: str = DOING) -> Iterator[Path]:
+    """Yield a new empty folder with a temporary name beside ``path``; it is removed when the block ends.
+
+    Raises:
+        InfrastructureError: The disk refuses to make it.
+    """
+    scratch = temporary_path(path)
+    try:
+        scratch.mkdir(parents=True)
+    except OSError as error:
+        raise disk_error(scratch, error, doing) from error
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
 def write_bytes(path: Path, data: bytes, doing: str = DOING) -> None:
     """Write a file atomically; its folder is made if it does not exist.
 

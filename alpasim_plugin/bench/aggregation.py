@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import evaluators.video.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
+from alpasim_plugin.processes import end_with_parent
 from evaluators.aggregate.summary import aggregate
 from evaluators.metrics import METRICS
 
@@ -44,7 +45,7 @@ def bench_table(rollouts: int = 100_000, scenes: int = 1_000) -> TableRow:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rollouts.parquet"
         write_random_table(path, rollouts, scenes)
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
+        with multiprocessing.get_context("spawn").Pool(1, end_with_parent) as pool:
             read_s, aggregate_s, peak_mb, found = pool.apply(_measured, (path,))
         mean_error, count_errors = compared(found, path)
     return TableRow(rollouts, scenes, len(METRICS), read_s, aggregate_s, peak_mb, mean_error, count_errors)

@@ -14,6 +14,7 @@ import numpy as np
 from alpasim_plugin.bench.fixer_speed import Timing
 from alpasim_plugin.errors import FixerError
 from alpasim_plugin.fixers.refine import Difference
+from alpasim_plugin.processes import end_with_parent
 from alpasim_plugin.types import U8
 
 Weights = Literal["stand-in", "identity", "random"]
@@ -144,7 +145,7 @@ def in_own_process(name: str, run: Callable[..., Timing], *arguments: object) ->
     Raises:
         FixerError: The process ended early.
     """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
         try:
             return pool.submit(run, *arguments).result()
         except BrokenProcessPool as error:

@@ -14,6 +14,7 @@ from torch import Tensor
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
 from alpasim_plugin.nets.init import initial_weights
+from alpasim_plugin.processes import end_with_parent
 from alpasim_plugin.training.shared_rollout import Objectives, Sample, losses
 
 MIB = 1024.0  # ru_maxrss counts KiB
@@ -49,7 +50,7 @@ def measure_memory(
     cells = []
     for n in latents:
         for k in (k for k in horizons if k <= n):
-            with context.Pool(1) as pool:  # the peak of a process never falls, so every cell has its own
+            with context.Pool(1, end_with_parent) as pool:  # the peak of a process never falls, so every cell has its own
                 cells.append(pool.apply(_measure, (DiTSizes(**settings.dit.model_dump()), n, k, clips, rows, columns, settings.window)))
     return cells
 

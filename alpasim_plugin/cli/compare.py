@@ -9,7 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
+from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.repair import use_run
 from evaluators.gate.across import Comparison, compare_runs, compare_within
 from evaluators.gate.spec import load_gate
 from evaluators.report.metric_info import HEADLINE, in_percent
@@ -45,6 +47,8 @@ def compare(
     margins: dict[str, float] = {}
     if gate is not None:
         margins = {name: rule.margin for name, rule in load_gate(gate)[0].metrics.items() if rule.margin is not None}
+    for run in runs:
+        use_run(run, warn)
     found = [read_run(run) for run in runs]
     result = (
         compare_within(found[0], baseline, margins, EVERY_MISSING)

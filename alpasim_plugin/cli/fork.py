@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import resolve, resolve_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
@@ -17,6 +18,7 @@ from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.probe import probe_rollout
 from alpasim_plugin.runtime.probe_files import PROBE_JSON
 from alpasim_plugin.runtime.probe_write import write_probe
+from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.store import read_json
 
 FORK_EPILOG = """
@@ -54,6 +56,7 @@ def fork(
     """
     del debug
     _check_names([renderer] if renderer else [], policy)
+    use_run(run, warn)
     past = find_rollout(run, cell, scenario)
     change = Change(round(at * 1e6), renderer, policy, seed)
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
@@ -90,6 +93,7 @@ def probe(
     del debug
     names = tuple(name.strip() for name in renderers.split(",") if name.strip())
     _check_names(names, None)
+    use_run(run, warn)
     past = find_rollout(run, cell, scenario)
     folder = write_probe(probe_rollout(past, names), past, names, out)
     found = read_json(folder / PROBE_JSON)

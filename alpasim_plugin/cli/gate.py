@@ -10,8 +10,9 @@ from typing import Annotated
 
 import typer
 
-from alpasim_plugin.cli.progress import make_progress
+from alpasim_plugin.cli.progress import make_progress, warn
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
 from evaluators.gate import GateVerdict, check_matches, judge, load_gate, read_baseline, rows_of_run, write_baseline
 from evaluators.report.gate import write_gate_files
@@ -49,6 +50,7 @@ def gate(
         raise typer.Exit(_self_test(gate_file, out, workers, as_json))
     if run is None:
         raise InputError("judging a run", "simrun gate", "no run folder is named", "name one, or use --self-test")
+    use_run(run, warn)
     found = read_run(run)
     if approve is not None:
         write_baseline(found, approve)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import TypeVar
 
-from alpasim_plugin.runtime.execute import ignore_interrupts, thread_environment
+from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.runtime.workers import Lost, in_workers
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -22,22 +21,15 @@ def parallel_map(work: Callable[[A], R], items: Sequence[A], jobs: int) -> Itera
         jobs: Processes, one thread each.
 
     Raises:
+        InfrastructureError: A process ended without a result.
         The first exception of ``work``; queued items are cancelled.
     """
     if jobs <= 1:
         for item in items:
             yield item, work(item)
         return
-    with thread_environment(1):
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(jobs, len(items) or 1), context, ignore_interrupts)
-        try:
-            futures = {pool.submit(work, item): item for item in items}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            for process in list((pool._processes or {}).values()):
-                process.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-        pool.shutdown()
+    for item, got in in_workers(work, items, jobs, threads=1):
+        if isinstance(got, Lost):
+            do_this = "look for the out-of-memory killer in the system log, or use --jobs 1"
+            raise InfrastructureError("working in several processes", str(item), got.found, do_this)
+        yield item, got

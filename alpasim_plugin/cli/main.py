@@ -1,4 +1,7 @@
-"""Entry point of ``simrun``: verbs, the default verb ``run``, and the mapping of errors to exit codes."""
+"""Entry point of ``simrun``: verbs, the default verb ``run``, and the mapping of errors and signals to exit codes.
+
+Only light modules are imported here: until a verb's own are loaded, a signal ends the process without a traceback.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,13 @@ import sys
 import traceback
 from importlib import import_module
 from pathlib import Path
-
-import typer
+from typing import TYPE_CHECKING
 
 from alpasim_plugin.errors import InputError, SimrunError
+from alpasim_plugin.stopping import Stopped, leave_at_once, stoppable
+
+if TYPE_CHECKING:
+    import typer
 
 # Verb -> module of this package, its command or group, its epilog, and the first line of its help. Only the verb that was typed is
 # imported: some need torch, which takes seconds to load.
@@ -27,6 +33,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are listed.",
     ),
     "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
+    "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
     "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),
     "list": (
         "listing", "list_parts", "EPILOG",
@@ -72,6 +79,8 @@ def with_verb(args: list[str]) -> list[str]:
 
 def make_app(verb: str | None) -> typer.Typer:
     """Return the command line with one verb, or with all verbs for the help page."""
+    import typer
+
     app = typer.Typer(
         no_args_is_help=True,
         rich_markup_mode="markdown",
@@ -79,7 +88,7 @@ def make_app(verb: str | None) -> typer.Typer:
         help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
         "The default verb is `run`: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
         "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, "
-        "5 evaluator failure, 130 interrupted.",
+        "5 evaluator failure, 130, 143 or 129 stopped by SIGINT, SIGTERM or SIGHUP.",
     )
     app.callback()(lambda: None)  # without it, an app of one command has no verbs
     if verb in VERBS:
@@ -100,7 +109,15 @@ def run_command(args: list[str]) -> int:
     try:
         args = with_verb(args)
         completing = os.environ.get("COMP_WORDS", "").split()[1:2]  # set by the shell while it completes a word
-        make_app(next(iter([*args, *completing]), None))(args=args, prog_name="simrun")
+        app = make_app(next(iter([*args, *completing]), None))
+        with stoppable():
+            app(args=args, prog_name="simrun")
+    except Stopped as stop:
+        if "--json" in args:
+            print(json.dumps({"error": stop.as_dict(), "exit_code": stop.exit_code}))
+        else:
+            print(stop, file=sys.stderr)
+        return stop.exit_code
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 0 if leaving.code is None else 2
     except SimrunError as error:
@@ -119,6 +136,7 @@ def main() -> None:
 
     The working directory is searched for ``--policy package.module:Class`` last, after everything that is installed.
     """
+    leave_at_once()
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     sys.exit(run_command(sys.argv[1:]))

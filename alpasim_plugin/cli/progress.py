@@ -23,6 +23,10 @@ class Silent:
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
         """Ignore."""
 
+    def noticed(self, text: str) -> None:
+        """Print it: what was damaged is told even where nothing else is."""
+        print(f"warning: {text}", file=sys.stderr, flush=True)
+
 
 class Lines:
     """One line per finished rollout on stderr, for pipes and CI logs."""
@@ -39,6 +43,10 @@ class Lines:
         """Print one rollout's result."""
         self._done += 1
         print(f"[{self._done}/{self._total}] {describe(manifest, reused)}", file=sys.stderr, flush=True)
+
+    def noticed(self, text: str) -> None:
+        """Print it."""
+        print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
 class Bar:
@@ -69,6 +77,15 @@ class Bar:
         self._progress.update(self._task, advance=1, description=f"{manifest['renderer']} {manifest['scene']}")
         if self._progress.finished:
             self._progress.stop()
+
+    def noticed(self, text: str) -> None:
+        """Print it above the bar."""
+        self._progress.console.print(f"warning: {text}", highlight=False, markup=False)
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def make_progress(quiet: bool) -> Silent | Lines | Bar:

@@ -18,9 +18,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_video
+from alpasim_plugin.stopping import Stopped
 from alpasim_plugin.types import Fixer
 
-INTERRUPTED = 130
 LINE_EVERY_S = 10.0
 SCENE = "video"  # key of the noise, the same for every file: a renamed video gives the same result
 PREFIX = "fixer."
@@ -70,9 +70,9 @@ def refine(
     try:
         with frame_progress(quiet or as_json) as show:
             summary = refine_video(files, session, show)
-    except KeyboardInterrupt:
-        print("interrupted; nothing was written; the same command starts again", file=sys.stderr)
-        raise typer.Exit(INTERRUPTED) from None
+    except Stopped as stop:
+        stop.kept = "nothing was written; the same command starts again"
+        raise
     if as_json:
         print(json.dumps({"input": str(source), "output": str(out), "compare": compare and str(compare), **asdict(summary)}))
     else:

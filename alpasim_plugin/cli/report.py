@@ -10,6 +10,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.runtime.contents import SUMMARY, read_run_json
+from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.store import read_json
 from evaluators.report import render_table
@@ -30,8 +33,9 @@ def report(
 ) -> None:
     """Write report.html, summary.md and junit.xml of a run again and print its table."""
     del debug
-    summary = read_json(run / "summary.json")
-    page = write_reports(run)
+    use_run(run, warn)
+    summary = read_json(run / SUMMARY)
+    page = write_reports(run, flips=read_run_json(run).get("kind") != "score")
     if as_json:
         print(json.dumps({"report": str(page), "summary": summary}))
     else:

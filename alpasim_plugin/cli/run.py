@@ -18,11 +18,11 @@ from alpasim_plugin.runtime.certificate import Certify, certificate_line
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
+from alpasim_plugin.stopping import Stopped
 from evaluators import PRESETS
 from evaluators.report import fixer_lines, render_table
 from scenarios.suite import expand
 
-INTERRUPTED = 130
 FIXER_PREFIX = "fixer."
 MAX_SEED = 2**63 - 1  # int64 in the tables
 
@@ -71,6 +71,10 @@ def run(
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Write report.html now; `simrun report RUN` writes it later.")
     ] = True,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait for a process that writes the run folder; otherwise refuse.")] = False,
+    time_limit: Annotated[
+        float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a rollout may take; one that hangs is ended and reported.")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Resolve and print the plan, run nothing.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
@@ -96,11 +100,12 @@ def run(
     if dry_run:
         _print_plan(plan, root, workers, as_json)
         return
+    progress, command = make_progress(quiet or as_json), ["simrun", *sys.argv[1:]]
     try:
-        result = execute_run(plan, root, workers, ["simrun", *sys.argv[1:]], make_progress(quiet or as_json), resume, certify, report)
-    except KeyboardInterrupt:
-        print(f"interrupted; finished rollouts are in {root}; the same command continues", file=sys.stderr)
-        raise typer.Exit(INTERRUPTED) from None
+        result = execute_run(plan, root, workers, command, progress, resume, certify, report, wait=wait, limit_s=time_limit)
+    except Stopped as stop:
+        stop.kept = f"finished rollouts are kept in {root}; the same command continues"
+        raise
     _print_result(result, as_json)
     if plan.undigested and not as_json:
         print(f"not reused by the next command: {', '.join(plan.undigested)} has no digest (--resume reuses its rollouts)")

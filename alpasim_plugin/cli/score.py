@@ -47,6 +47,7 @@ def score(
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Write report.html now; `simrun report RUN` writes it later.")
     ] = True,
+    wait: Annotated[bool, typer.Option("--wait", help="Wait for a process that writes the run folder; otherwise refuse.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
@@ -71,7 +72,16 @@ def score(
             print(f"[{done}/{len(found)}] {manifest['rollout']}: {describe(manifest, reused=False)}", file=sys.stderr, flush=True)
 
     result = execute_score(
-        found, KnownScenes(scene, rails), chosen, own, resolve_evaluators(evaluators or ()), out, ["simrun", *sys.argv[1:]], on_done, report
+        found,
+        KnownScenes(scene, rails),
+        chosen,
+        own,
+        resolve_evaluators(evaluators or ()),
+        out,
+        ["simrun", *sys.argv[1:]],
+        on_done,
+        report,
+        wait,
     )
     _print(result, as_json)
     raise typer.Exit(result.exit_code)

@@ -6,17 +6,17 @@ $SIMRUN_CACHE or ~/.cache/simrun / KIND / KEY/        what was made
 
 from __future__ import annotations
 
-import fcntl
 import os
+import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from alpasim_plugin.atomic import atomic_folder, disk_error
+from alpasim_plugin.atomic import atomic_folder
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.lock import one_writer
 
 T = TypeVar("T")
 DOING, DO_THIS = "writing to the cache", "free disk space, or name a writable folder in SIMRUN_CACHE"
@@ -50,7 +50,10 @@ def cached(kind: str, key: str, make: Callable[[Path], None], read: Callable[[Pa
         found = _readable(folder, read, what)
         if found is not None:
             return found
-    with _locked(folder.with_name(f"{key}.lock")):
+    lock = folder.with_name(f"{key}.lock")
+    with one_writer(lock, DOING, what, wait=True, waiting=lambda text: print(text, file=sys.stderr, flush=True), do_this=DO_THIS):
+        for left_over in folder.parent.glob(f".{key}.*.tmp"):  # of a process that was killed while it made this entry
+            shutil.rmtree(left_over)
         found = None if again or not folder.exists() else _readable(folder, read, what, warn=False)
         if found is None:
             _make(folder, make, what)
@@ -73,16 +76,3 @@ def _make(folder: Path, make: Callable[[Path], None], what: str) -> None:
     with atomic_folder(folder, DOING, DO_THIS) as partial:
         make(partial)
     print(f"{what}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold a lock that the system releases when its process ends, however it ends."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a")
-    except OSError as error:
-        raise disk_error(path, error, DOING, DO_THIS) from error
-    with file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield

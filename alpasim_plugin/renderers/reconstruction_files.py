@@ -7,8 +7,6 @@ hashes.json         file name to SHA-256; written last
 
 from __future__ import annotations
 
-import hashlib
-import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,8 +19,11 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.scene.sky_mask import SkyView
+from alpasim_plugin.reading import read_json_as
+from alpasim_plugin.vouched import sha256_of
 
 HASHES, SKY_VIEWS = "hashes.json", "sky_views.npz"
+DOING, DO_THIS = "reading a reconstruction", "remove its folder; it is made again when it is needed"
 
 
 def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView], facts: Mapping[str, Any]) -> None:
@@ -40,27 +41,27 @@ def write_model(folder: Path, model: Reconstruction, sky_views: Sequence[SkyView
         T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
         sky=np.concatenate(bits) if bits else np.zeros(0, np.uint8),
     )
-    files = sorted(p for p in folder.rglob("*") if p.is_file())
-    hashes = {p.relative_to(folder).as_posix(): _hash(p) for p in files}
-    write_json(folder / HASHES, hashes)
+    write_json(folder / HASHES, {name: sha256_of(folder / name) for name in _files(folder)})
 
 
 def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
-    """Read what `write_model` wrote; every file must have the hash it was written with.
+    """Read what `write_model` wrote: exactly the files that it lists, each with the hash it was written with.
 
     Raises:
         InputError: A file is missing or is another one than was written.
     """
-    try:
-        hashes = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
-        raise _damaged(folder / HASHES, str(error)) from error
+    hashes = read_json_as(dict[str, str], folder / HASHES, DOING, do_this=DO_THIS)
+    there = set(_files(folder)) - {HASHES}
+    odd = sorted(there ^ set(hashes))
+    if odd or not hashes:  # a list that names other files than are there checks nothing
+        found = f"{odd[0]} is {'not listed' if odd[0] in there else 'missing'}" if odd else "it lists no file"
+        raise _damaged(folder / HASHES, found)
     for name, expected in hashes.items():
         try:
-            found = _hash(folder / name)
+            content = sha256_of(folder / name)
         except OSError as error:
             raise _damaged(folder / name, error.strerror or str(error)) from error
-        if found != expected:
+        if content != expected:
             raise _damaged(folder / name, "not the content that was written")
     return Reconstruction.load(folder), _read_sky_views(folder / SKY_VIEWS)
 
@@ -80,10 +81,9 @@ def _read_sky_views(path: Path) -> list[SkyView]:
     return views
 
 
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _files(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
 def _damaged(path: Path, found: str) -> InputError:
-    return InputError("reading a reconstruction", str(path), found, "remove its folder; it is made again when it is needed")
+    return InputError(DOING, str(path), found, DO_THIS)

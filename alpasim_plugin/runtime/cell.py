@@ -12,22 +12,21 @@ from typing import Any
 
 import cv2
 
-from alpasim_plugin.atomic import disk_error, write_json
+from alpasim_plugin.atomic import disk_error
 from alpasim_plugin.control import Controller
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.parts import build, complete
 from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, STEPS_NAME, Remedy, RolloutState, inspect_rollout, write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
-from alpasim_plugin.runtime.store import STEPS_SCHEMA, read_json, write_table
+from alpasim_plugin.runtime.store import STEPS_SCHEMA, write_table
 from alpasim_plugin.stdout import parts_print_to_stderr
 from alpasim_plugin.types import Policy, Renderer, Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
-
-MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,8 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / MANIFEST).unlink(missing_ok=True)
+        for name in (MANIFEST, *DRIVEN, *DERIVED):  # the manifest first: without it nothing is trusted
+            (folder / name).unlink(missing_ok=True)
         scenario = _scenario(cell.ref)
         with parts_print_to_stderr():
             parts = builder(cell, options, scenario, threads)
@@ -97,37 +97,41 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
     except Exception as error:
         manifest |= {"status": "failed", "error": _unexpected(error), "traceback": traceback.format_exc()}
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
-    write_json(folder / MANIFEST, manifest)
+    write_manifest(folder, manifest)
     return manifest
 
 
-def rescore_cell(cell: Cell, options: RunOptions, root: Path) -> dict[str, Any]:
-    """Score a finished rollout again from its log, with another preset or changed evaluators."""
+def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    """Score a finished rollout again from its log: another preset, changed evaluators, or a damaged table; return the new manifest."""
     folder = root / cell.folder
-    manifest: dict[str, Any] = read_json(folder / MANIFEST)
-    manifest |= _score(folder, cell, options, _scenario(cell.ref))
+    manifest = manifest | _score(folder, cell, options, _scenario(cell.ref))
     manifest |= {"score_key": cell.score_key, "preset": options.preset}
-    write_json(folder / MANIFEST, manifest)
+    write_manifest(folder, manifest)
     return manifest
 
 
-def finished(cell: Cell, root: Path, reuse_undigested: bool = False) -> dict[str, Any] | None:
-    """Return the manifest of a finished rollout with the same content key; None if there is none.
+def find_rollout_state(
+    cell: Cell, root: Path, reuse_undigested: bool = False, full: bool = False, known: bool = False
+) -> tuple[Remedy, RolloutState]:
+    """Return what a cell needs, and the rollout as it is found on disk.
 
-    Failed rollouts are not finished: they run again. So do rollouts with a part that has no digest, unless ``reuse_undigested`` is set.
+    A rollout with another content key is driven again; so are failed ones, and those with a part that has no digest unless
+    ``reuse_undigested`` is set. See `alpasim_plugin.runtime.manifests.inspect_rollout` for ``full`` and ``known``.
     """
+    state = inspect_rollout(root, cell.folder.as_posix(), full, known)
+    manifest = state.manifest
+    if manifest is None or manifest.get("rollout_key") != cell.rollout_key or manifest["status"] != "ok":
+        return "drive", state
     if cell.undigested and not reuse_undigested:
-        return None
-    path = root / cell.folder / MANIFEST
-    if not path.exists():
-        return None
-    manifest: dict[str, Any] = read_json(path)
-    return manifest if manifest.get("rollout_key") == cell.rollout_key and manifest.get("status") == "ok" else None
+        return "drive", state
+    if state.remedy == "none" and manifest.get("score_key") != cell.score_key:
+        return "score", state
+    return state.remedy, state
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
     scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators)
-    write_table(folder / "steps.parquet", [cell.names | row for row in scored.steps], STEPS_SCHEMA)
+    write_table(folder / STEPS_NAME, [cell.names | row for row in scored.steps], STEPS_SCHEMA)
     return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any, Literal
 
 import pyarrow.parquet as pq
 
+from alpasim_plugin.atomic import scratch_folder
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Key, digests, first_difference, sha256, trace_log
 from alpasim_plugin.runtime.cell import run_cell
@@ -82,8 +82,9 @@ def certificate_line(certificate: Mapping[str, Any]) -> str:
 
 def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], threads: int, log_sha256: str) -> dict[str, Any]:
     began = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="simrun-repeat-") as name:
-        again = run_cell(cell, plan.options, Path(name), threads)
+    # In the run folder, under a name that the next run removes if this process is killed.
+    with scratch_folder(root / "repeat", "repeating a rollout") as scratch:
+        again = run_cell(cell, plan.options, scratch, threads)
         if again["status"] != "ok":
             found = f"the repeat failed: {again['error']['found']}"
             verdict: dict[str, Any] = {
@@ -92,8 +93,8 @@ def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], 
                 "first_difference": {"component": "run", "t_us": None, "step": None, "what": found},
             }
             return verdict | {"digests": {}, "wall_s": round(time.perf_counter() - began, 3)}
-        one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(Path(name) / cell.folder, again)
-        same_bytes = sha256((Path(name) / cell.folder / LOG_NAME).read_bytes()) == log_sha256
+        one, other = rollout_trace(root / cell.folder, manifest), rollout_trace(scratch / cell.folder, again)
+        same_bytes = sha256((scratch / cell.folder / LOG_NAME).read_bytes()) == log_sha256
     scenario = plan.scenarios[cell.scene]
     difference = first_difference(one, other, scenario.start_us, scenario.rates.control_us)
     first = None if difference is None else difference.as_dict()

@@ -15,21 +15,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log.trace import Difference, Trace, first_difference
 from alpasim_plugin.parts import digest, resolve, resolve_renderer
-from alpasim_plugin.runtime.cell import MANIFEST, RolloutParts, build_parts, run_cell
+from alpasim_plugin.runtime.cell import RolloutParts, build_parts, run_cell
 from alpasim_plugin.runtime.certificate import log_trace
+from alpasim_plugin.runtime.contents import read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
+from alpasim_plugin.runtime.manifests import MANIFEST, write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runtime.recorder import LOG_NAME
-from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.runtime.run import RunResult, write_run_info
-from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.runtime.run import RunResult, finish_run, write_run_info
 from alpasim_plugin.runtime.switch import SwitchedController, SwitchedPolicy, SwitchedRenderer
-from alpasim_plugin.runtime.tables import write_tables
+from alpasim_plugin.runtime.tables import pool_of
+from alpasim_plugin.runtime.writing import writing
 from alpasim_plugin.types import Scenario
 
 DOING = "continuing a logged rollout"
@@ -78,6 +78,12 @@ def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal
         InfrastructureError: The replay is not equal to the log up to the instant, or a part failed.
     """
     _check(past, change, root)
+    with writing(root):
+        return _fork(past, change, root, video, command)
+
+
+def _fork(past: LoggedRollout, change: Change, root: Path, video: Literal["none", "all"], command: Sequence[str]) -> RunResult:
+    _check(past, change, root)  # once more: another process may have been first
     began = time.perf_counter()
     options = replace(past.options, video=video, baseline=past.cell.renderer.name)
     then = change.apply(past.cell, options.fixer)
@@ -90,13 +96,13 @@ def fork_rollout(past: LoggedRollout, change: Change, root: Path, video: Literal
     manifest = run_cell(fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change))
     if manifest["status"] == "ok":
         manifest["fork"] = asdict(change) | {"of": past.name} | _compare_with_log(past, change, at_us, root / fork.folder)
-        write_json(root / fork.folder / MANIFEST, manifest)
+        write_manifest(root / fork.folder, manifest)
     cells, renderers = (past.cell, fork), (past.cell.renderer, fork.renderer)
     plan = RunPlan(cells, {past.cell.scene: past.scenario}, renderers, (past.cell.policy,), (past.cell.seed,), options)
     write_run_info(root, plan, command, threads)
-    write_json(root / "run.json", read_json(root / "run.json") | {"fork": manifest.get("fork")})
-    summary = write_tables(root, [original, manifest], options.preset, past.cell.renderer.name, threads, time.perf_counter() - began)
-    write_reports(root)
+    write_run_json(root, read_run_json(root) | {"kind": "fork", "fork": manifest.get("fork")})
+    pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
+    summary = finish_run(root, [original, manifest], {"pool": pool})
     return RunResult(root, summary, 2, summary["failures"]["n_failed"])
 
 
@@ -116,7 +122,7 @@ def _copied(past: LoggedRollout, root: Path) -> dict[str, Any]:
     folder = root / past.cell.folder
     shutil.copytree(past.folder, folder, dirs_exist_ok=True)
     manifest = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
-    write_json(folder / MANIFEST, manifest)
+    write_manifest(folder, manifest)
     return manifest
 
 

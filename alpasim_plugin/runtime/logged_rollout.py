@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,8 +13,9 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import resolve_renderer
+from alpasim_plugin.runtime.contents import read_run_json
+from alpasim_plugin.runtime.manifests import inspect_rollout
 from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan
-from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
 
@@ -71,8 +73,12 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
         InputError: No such rollout, it did not finish, or its scenario or its parts have changed.
     """
     row = _row(root, name)
-    info = read_json(root / "run.json")
-    manifest = read_json(root / row["path"] / "manifest.json")
+    info = read_run_json(root)
+    state = inspect_rollout(root, row["path"], full=True, known=True)
+    if state.damage or state.manifest is None:
+        do_this = f"simrun check {shlex.quote(str(root))} --repair runs it again"
+        raise InputError(DOING, name, "; ".join(f"{one.file}: {one.problem}" for one in state.damage), do_this)
+    manifest = state.manifest
     if manifest.get("fork"):
         raise InputError(DOING, name, "it is the continuation of another rollout", f"name that rollout: {manifest['fork']['of']}")
     stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}

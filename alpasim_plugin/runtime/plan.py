@@ -52,7 +52,7 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Give the rollout's folder below the run folder."""
-        return Path("rollouts", slug(self.renderer.name), slug(self.policy.name), slug(self.scene), str(self.seed))
+        return rollout_folder(self.renderer.name, self.policy.name, self.scene, self.seed)
 
     @property
     def names(self) -> dict[str, str | int]:
@@ -172,6 +172,11 @@ def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]
     """Return the content key of a rollout's scores; it changes with the preset and the code of the evaluators and of the reduction."""
     own = own_code_digest("alpasim_plugin.runtime.scoring")
     return digest([rollout_key, preset(preset_name).as_dict(), own, [(spec.name, spec.digest) for spec in evaluators]])
+
+
+def rollout_folder(renderer: str, policy: str, scene: str, seed: int) -> Path:
+    """Return a rollout's folder below the run folder."""
+    return Path("rollouts", slug(renderer), slug(policy), slug(scene), str(seed))
 
 
 def slug(name: str) -> str:

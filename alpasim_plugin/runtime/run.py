@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.atomic import write_json
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.renderers.reconstruction_key import model_key
+from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.certificate import Certify, certify
-from alpasim_plugin.runtime.execute import Threads, execute, thread_budget
+from alpasim_plugin.runtime.contents import (
+    CONTENTS,
+    RUN_INFO,
+    SCENES,
+    SUMMARY,
+    TABLES,
+    Contents,
+    damaged_files,
+    find_contents,
+    read_run_json,
+    write_contents,
+    write_run_json,
+)
+from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import RunPlan, slug
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.store import read_json
-from alpasim_plugin.runtime.tables import write_tables
+from alpasim_plugin.runtime.tables import pool_of, write_tables
+from alpasim_plugin.runtime.writing import writing
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import declared
 
@@ -35,6 +52,10 @@ class Progress(Protocol):
 
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
         """Announce one rollout."""
+        ...
+
+    def noticed(self, text: str) -> None:
+        """Say in one line what was found damaged and what is done about it, or who is waited for."""
         ...
 
 
@@ -74,62 +95,142 @@ def execute_run(
     resume: bool = False,
     certificate: Certify = "one",
     report: bool = True,
+    *,
+    wait: bool = False,
+    full: bool = False,
+    limit_s: float | None = None,
 ) -> RunResult:
     """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
 
-    Without ``report`` there is no ``report.html``; `write_reports` makes it later.
+    Args:
+        plan: The run.
+        root: Its folder; one process writes it at a time.
+        workers: Worker processes; None is one per core.
+        command: The command line, for ``run.json``.
+        progress: Shows the run.
+        resume: Continue in the folder of another command.
+        certificate: Whether to repeat a rollout.
+        report: Write ``report.html``; otherwise `write_reports` makes it later.
+        wait: Wait for a process that writes the folder; otherwise refuse.
+        full: Read every file of a finished rollout before it is reused, even if size and time are as written.
+        limit_s: Seconds that one rollout may take.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
+        InfrastructureError: Another process writes the folder, or it is read-only and the run is not finished.
     """
     threads = thread_budget(workers, len(plan.cells))
-    _claim(root, plan, command, threads, resume)
-    progress.started(plan, root, threads)
-    manifests: list[dict[str, Any]] = []
-    began = time.perf_counter()
+    if root.exists() and not os.access(root, os.W_OK):
+        return _finished_already(plan, root)
+    with writing(root, wait, progress.noticed):
+        contents = find_contents(root)
+        held = _claim(root, plan, command, threads, resume, contents, progress.noticed)
+        progress.started(plan, root, threads)
+        began = time.perf_counter()
 
-    def on_done(manifest: dict[str, Any], reused: bool) -> None:
-        manifest["reused"] = reused
-        progress.rollout_done(manifest, reused)
+        def on_done(manifest: dict[str, Any], reused: bool) -> None:
+            manifest["reused"] = reused
+            progress.rollout_done(manifest, reused)
 
-    manifests = execute(plan, root, threads, on_done, resume)
-    wall_s = time.perf_counter() - began
-    tables = root / "summary.json"
-    held = read_json(tables).get("determinism") if tables.exists() else None
-    summary = write_tables(root, manifests, plan.options.preset, plan.options.baseline, threads, wall_s)
-    determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held)
-    summary["determinism"] = determinism
-    write_json(tables, summary)
-    write_json(root / "run.json", read_json(root / "run.json") | {"determinism": determinism})
-    write_reports(root, page=report)
+        how = HowToRun(threads, resume, full, limit_s)
+        manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
+        pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
+        determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+        summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 
-def _claim(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads, resume: bool) -> None:
-    """Write run.json, or check that the folder holds this run; changed parts are written again."""
-    path = root / "run.json"
-    if path.exists():
-        held = read_json(path)
-        if held.get("key") != plan.command_key and not resume:
+def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[str, Any], report: bool = True) -> dict[str, Any]:
+    """Write the tables, the reports and the contents of a run whose rollouts are done; return the summary.
+
+    Args:
+        root: The run folder.
+        manifests: One per rollout, in the order of the tables.
+        more: What the rollouts do not tell; kept in ``run.json``, so that the tables can be made again.
+        report: Write ``report.html``.
+    """
+    info = read_run_json(root)
+    write_run_json(root, info | dict(more))
+    summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more)
+    write_reports(root, flips=info.get("kind") != "score", page=report)
+    write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
+    return summary
+
+
+def _finished_already(plan: RunPlan, root: Path) -> RunResult:
+    """Return the result of a finished run in a read-only folder.
+
+    Raises:
+        InfrastructureError: It is not finished, or damaged.
+    """
+    contents = find_contents(root)
+    left = [cell for cell in plan.cells if find_rollout_state(cell, root, reuse_undigested=True)[0] != "none"]
+    problems = [f"{len(left)} of {len(plan.cells)} rollouts are missing or out of date"] if left else []
+    if contents is None or contents.run.get("content") != plan.content or damaged_files(root, contents):
+        problems.append("its tables are missing or those of another run")
+    if problems:
+        found = f"it is read-only, and {' and '.join(problems)}"
+        do_this = "name another --out, or copy the folder to where it can be written"
+        raise InfrastructureError("starting a run", f"folder {root}", found, do_this)
+    summary = read_json(root / SUMMARY)
+    return RunResult(root, summary, len(plan.cells), summary["failures"]["n_failed"])
+
+
+def _claim(
+    root: Path,
+    plan: RunPlan,
+    command: Sequence[str],
+    threads: Threads,
+    resume: bool,
+    contents: Contents | None,
+    noticed: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write run.json and the scene files, or check that the folder holds this run; changed parts are written again.
+
+    Returns:
+        What ``run.json`` said before; empty for a new folder.
+    """
+    held: dict[str, Any] = {}
+    lost = False
+    if (root / RUN_INFO).exists() or contents is not None:
+        try:
+            held = read_run_json(root)
+        except InputError as error:
+            lost, held = True, {} if contents is None else dict(contents.run)
+            noticed(f"damaged: {RUN_INFO}: {error.found}; writing it again")
+        if held and held.get("key") != plan.command_key and not resume:
             raise InputError(
                 "starting a run",
                 f"folder {root}",
                 f"it holds another run (key {held.get('key')}; this command has {plan.command_key})",
                 "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
             )
-        if held.get("content") == plan.content:
-            return
-    write_run_info(root, plan, command, threads)
+    damage = [] if contents is None else damaged_files(root, contents)
+    for one in damage:
+        noticed(f"damaged: {one}; writing it again")
+    (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
+    if held.get("content") != plan.content:
+        write_run_info(root, plan, command, threads)
+        return held
+    if lost:
+        write_run_json(root, held)
+    if contents is None or any(one.file not in TABLES for one in damage):
+        _write_scenes(root, plan)
+    return held
+
+
+def _write_scenes(root: Path, plan: RunPlan) -> None:
+    for scene_id, scenario in plan.scenarios.items():
+        write_json(root / SCENES / f"{slug(scene_id)}.json", scene_as_json(scenario))
 
 
 def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads) -> None:
     """Write ``run.json`` and the scene files of the report."""
-    for scene_id, scenario in plan.scenarios.items():
-        write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scenario))
+    _write_scenes(root, plan)
     refs = {cell.scene: cell.ref for cell in plan.cells}
     parts = plan.parts
-    write_json(
-        root / "run.json",
+    write_run_json(
+        root,
         {
             "schema_version": SCHEMA_VERSION,
             "key": plan.command_key,

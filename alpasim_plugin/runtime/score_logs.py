@@ -9,16 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.atomic import write_json
 from alpasim_plugin.config import load_yaml
 from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.parts import PartSpec
+from alpasim_plugin.runtime.contents import RUN_INFO
 from alpasim_plugin.runtime.known_scenes import KnownScenes
+from alpasim_plugin.runtime.manifests import MANIFEST, STEPS_NAME, read_manifest
 from alpasim_plugin.runtime.plan import slug
+from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.scoring import contacts_of, tabulate
 from alpasim_plugin.runtime.store import steps_schema, write_table
 from alpasim_plugin.types import RolloutLog
+from alpasim_plugin.vouched import problem_of
 from evaluators import reduce_rollout, score
 from evaluators.alpasim import ScoredRollout
 from evaluators.presets import Preset
@@ -65,7 +68,7 @@ def score_logs(
     root: Path,
     on_done: Callable[[dict[str, Any]], None],
 ) -> list[LogScore]:
-    """Score every log against its scene and write its steps and manifest.
+    """Score every log against its scene and write its steps.
 
     A log that cannot be read, is incomplete or cannot be scored becomes a failed row; the others are still scored.
 
@@ -78,7 +81,6 @@ def score_logs(
         began = time.perf_counter()
         one = _score(log, scenes, preset, evaluators, root, taken)
         one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
-        write_json(root / one.manifest["path"] / "manifest.json", one.manifest)
         out.append(one)
         on_done(one.manifest)
     return out
@@ -91,6 +93,7 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
         "reused": True,  # nothing was rendered, so these rows have no speed
     }  # fmt: skip
     try:
+        check_vouched(log)
         rollout = read_asl(log)
     except InputError as error:
         return _failed(manifest, error, root, taken)
@@ -115,9 +118,28 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
     manifest |= {"status": "ok", "metrics": one.metrics, "events": one.events, "censored": one.censored}
     manifest |= {"contacts": one.contacts, "path": _folder(manifest, taken)}
     keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
-    write_table(root / manifest["path"] / "steps.parquet", [keys | row for row in one.steps], steps_schema(of_logs=True))
+    write_table(root / manifest["path"] / STEPS_NAME, [keys | row for row in one.steps], steps_schema(of_logs=True))
     run_uuid, run_name = run_names(log)
     return LogScore(manifest, ScoredRollout(rollout.scene_id, name, series, run_uuid, run_name))
+
+
+def check_vouched(log: Path) -> None:
+    """Refuse a log of a run folder that is not the one its manifest vouches for; logs without a manifest beside them pass.
+
+    Raises:
+        InputError: The log is damaged, or another one.
+    """
+    if log.name != LOG_NAME or not (log.parent / MANIFEST).exists():
+        return
+    try:
+        facts = read_manifest(log.parent)[0]["files"].get(LOG_NAME)
+        problem = None if facts is None else problem_of(log, facts, full=True)
+    except InputError as error:
+        problem = f"its {MANIFEST} is damaged: {error.found}"
+    if problem is not None:
+        run = next((folder for folder in log.resolve().parents if (folder / RUN_INFO).exists()), None)
+        do_this = "run the rollout again" if run is None else f"simrun check {run} --repair runs it again"
+        raise InputError("reading a rollout log", str(log), problem, do_this)
 
 
 def check_complete(log: Path, rollout: RolloutLog) -> None:

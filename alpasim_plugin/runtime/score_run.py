@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,16 +14,18 @@ from typing import Any
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.parts import PartSpec, digest
+from alpasim_plugin.runtime.contents import AGGREGATE, CONTENTS, SCENES, find_contents, read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes
+from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.provenance import hardware, versions
-from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.runtime.run import SCHEMA_VERSION
+from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
-from alpasim_plugin.runtime.store import read_json, write_parquet
-from alpasim_plugin.runtime.tables import write_tables
+from alpasim_plugin.runtime.store import write_parquet
+from alpasim_plugin.runtime.tables import pool_of
+from alpasim_plugin.runtime.writing import writing
 from evaluators.aggregate.reduce import RolloutValue
 from evaluators.alpasim import (
     EvalSettings,
@@ -36,8 +39,6 @@ from evaluators.alpasim import (
 )
 from evaluators.metrics import declared, info
 from evaluators.presets import Preset
-
-AGGREGATE = "aggregate"
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ def execute_score(
     command: Sequence[str],
     on_done: Callable[[dict[str, Any]], None],
     report: bool = True,
+    wait: bool = False,
 ) -> ScoreResult:
     """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its aggregation.
 
@@ -72,29 +74,42 @@ def execute_score(
         command: The command line, for run.json.
         on_done: Called with each log's manifest.
         report: Write ``report.html``.
+        wait: Wait for a process that writes the folder; otherwise refuse.
 
     Raises:
         InputError: The folder holds other results, or a log's scene is not among ``scenes``.
+        InfrastructureError: Another process writes the folder.
     """
     began = time.perf_counter()
     key = digest({"logs": sorted(_hash(log) for log in logs), "scenes": scenes.places, "preset": preset.as_dict()})[:12]
     root = root or Path("runs", f"score-{slug(logs[0].resolve().parent.parent.name)}-{key}")
-    held = read_json(root / "run.json").get("key") if (root / "run.json").exists() else None
-    if held not in (None, key):
-        raise InputError("scoring logs", f"folder {root}", f"it holds other results (key {held})", "choose another --out")
-    scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
-    aggregation: dict[str, Any] | None = None
-    error: EvaluatorError | None = None
-    if settings is not None:
-        aggregation, error = _aggregate(scores, preset, settings, root)
-    manifests = [one.manifest for one in scores]
-    _write_info(root, key, scores, scenes, preset, settings, command)
-    summary = write_tables(root, manifests, preset.name, None, Threads(1, 1), time.perf_counter() - began)
-    code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
-    summary |= {"exit_code": code} | ({} if aggregation is None else {"alpasim": aggregation})
-    write_json(root / "summary.json", summary)
-    write_reports(root, flips=False, page=report)
+    with writing(root, wait, lambda text: print(text, file=sys.stderr, flush=True)):
+        held = _held_key(root)
+        if held not in (None, key):
+            raise InputError("scoring logs", f"folder {root}", f"it holds other results (key {held})", "choose another --out")
+        (root / CONTENTS).unlink(missing_ok=True)  # from here on the folder is unfinished
+        scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
+        aggregation: dict[str, Any] | None = None
+        error: EvaluatorError | None = None
+        if settings is not None:
+            aggregation, error = _aggregate(scores, preset, settings, root)
+        manifests = [one.manifest for one in scores]
+        for manifest in manifests:
+            write_manifest(root / manifest["path"], manifest)
+        _write_info(root, key, scores, scenes, preset, settings, command)
+        code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
+        more = {"pool": pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None), "exit_code": code}
+        summary = finish_run(root, manifests, more | ({} if aggregation is None else {"alpasim": aggregation}), report)
     return ScoreResult(root, summary, code)
+
+
+def _held_key(root: Path) -> str | None:
+    """Return the key of the results that a folder holds; None for a new one, or where ``run.json`` is damaged: it is written again."""
+    contents = find_contents(root)
+    try:
+        return str(read_run_json(root)["key"])
+    except InputError:
+        return None if contents is None else str(contents.run.get("key"))
 
 
 def _aggregate(
@@ -155,13 +170,13 @@ def _write_info(
 ) -> None:
     used = {one.manifest["scene"]: scenes.of(one.manifest["scene"]) for one in scores if one.scored is not None}
     for scene_id, scene in used.items():
-        write_json(root / "scenes" / f"{slug(scene_id)}.json", scene_as_json(scene))
+        write_json(root / SCENES / f"{slug(scene_id)}.json", scene_as_json(scene))
 
     def names(column: str) -> list[Any]:
         return list(dict.fromkeys(one.manifest[column] for one in scores))
 
-    write_json(
-        root / "run.json",
+    write_run_json(
+        root,
         {
             "schema_version": SCHEMA_VERSION,
             "kind": "score",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.atomic import write_json
+from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
-from alpasim_plugin.runtime.store import read_json, rollouts_schema, steps_schema, write_parquet, write_table
+from alpasim_plugin.runtime.manifests import STEPS_NAME
+from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 
@@ -39,15 +41,23 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_tables(
-    root: Path, manifests: Sequence[dict[str, Any]], preset: str, baseline: str | None, threads: Threads, wall_s: float
+    root: Path, manifests: Sequence[dict[str, Any]], preset: str, baseline: str | None, more: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Write rollouts.parquet, steps.parquet and summary.json and return the summary."""
+    """Write rollouts.parquet, steps.parquet and summary.json and return the summary.
+
+    Args:
+        root: The run folder; the manifests' rollouts are below it.
+        manifests: One per rollout, in the order of the tables.
+        preset: Evaluator preset of the scores.
+        baseline: Renderer that the others are compared with; None is the first.
+        more: What the manifests do not tell, for the summary.
+    """
     rows = rollout_rows(manifests)
     metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
     of_logs = any("rollout" in row for row in rows)
-    write_table(root / "rollouts.parquet", rows, rollouts_schema(metrics, of_logs))
-    parts = [pq.read_table(root / m["path"] / "steps.parquet") for m in manifests if m["status"] == "ok"]
-    write_parquet(root / "steps.parquet", pa.concat_tables(parts) if parts else steps_schema(of_logs).empty_table())
+    write_table(root / ROLLOUTS, rows, rollouts_schema(metrics, of_logs))
+    parts = [pq.read_table(root / m["path"] / STEPS_NAME) for m in manifests if m["status"] == "ok"]
+    write_parquet(root / STEPS, pa.concat_tables(parts) if parts else steps_schema(of_logs).empty_table())
     summary = {
         "preset": preset,
         "metrics": _by_policy(rows, aggregate),
@@ -56,9 +66,9 @@ def write_tables(
         "failures": _failures(manifests),
         "fixers": _by_policy([m for m in manifests if m["status"] == "ok"], fixers),
         "speed": _by_policy([m for m in manifests if m["status"] == "ok" and m.get("stage_ms")], _speeds),
-        "pool": _pool(root, manifests, threads, wall_s),
+        **more,
     }
-    write_json(root / "summary.json", summary)
+    write_json(root / SUMMARY, summary)
     return summary
 
 
@@ -136,13 +146,11 @@ def resample_durations(durations: Sequence[float], frames: int) -> F64:
     return np.diff(np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done))
 
 
-def _pool(root: Path, manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float) -> dict[str, Any]:
+def pool_of(manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
     """Return the throughput of all workers together, start-up included; a run that only reused rollouts keeps its earlier figures."""
     fresh = [m for m in manifests if not m.get("reused")]
-    before = root / "summary.json"
-    if not fresh and before.exists():
-        kept: dict[str, Any] = read_json(before).get("pool", {})
-        return kept
+    if not fresh and before:
+        return before
     frames = sum(int(m.get("frames") or 0) for m in fresh)
     return {
         "workers": threads.workers,

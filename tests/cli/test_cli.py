@@ -159,7 +159,7 @@ def test_policy_of_the_working_directory_is_found(
 
 def test_report_of_a_folder_that_is_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["report", str(tmp_path)]) == 2
-    assert "name a folder written by simrun" in four_parts(capsys.readouterr().err)["do"]
+    assert "give a folder written by simrun" in four_parts(capsys.readouterr().err)["do"]
 
 
 @pytest.mark.parametrize("kind", ["renderers", "policies", "scenarios", "metrics"])

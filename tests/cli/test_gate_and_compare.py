@@ -10,6 +10,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from tests.report.make_run import Plan, make_run
+from tests.vouching import vouch_for
 
 SCENES = tuple(f"scene-{i:02d}" for i in range(8))
 EASY = """version: 1
@@ -37,11 +38,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "unscored": plan(fail=[("onefixer", SCENES[3], 1)]),
         "few": plan(scenes=SCENES[:3]),
     }
-    made = {name: make_run(folder / name, one) for name, one in plans.items()}
+    made = {name: vouch_for(make_run(folder / name, one)) for name, one in plans.items()}
     for rollout in ("failed", "unscored"):
         summary = json.loads((made[rollout] / "summary.json").read_text())
         assert summary["failures"]["n_failed"] == 1
     _set_failure_class(made["unscored"], "evaluator")
+    vouch_for(made["unscored"])
     return made
 
 
@@ -209,8 +211,8 @@ def test_compare_prints_verdicts_and_cells_without_a_pair(runs, gate_file, capsy
 
 def test_two_policies_are_compared_where_each_run_has_one(tmp_path, capsys):
     small = {"renderers": ("clean",), "scenes": SCENES[:4], "seeds": (0,)}
-    first = make_run(tmp_path / "a", plan(**small))
-    second = make_run(tmp_path / "b", plan(**small, policies=("pure-pursuit",)))
+    first = vouch_for(make_run(tmp_path / "a", plan(**small)))
+    second = vouch_for(make_run(tmp_path / "b", plan(**small, policies=("pure-pursuit",))))
     assert run_command(["compare", str(first), str(second), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["notes"] == ["policy pure-pursuit is compared with policy lane-camera"]
@@ -222,9 +224,11 @@ def test_runs_of_another_preset_or_scene_content_are_not_compared(runs, tmp_path
     info = json.loads((other / "run.json").read_text())
     info["scenes"][SCENES[2]]["content_hash"] = "changed"
     (other / "run.json").write_text(json.dumps(info))
+    vouch_for(other)
     assert run_command(["compare", str(runs["good"]), str(other)]) == 2
     assert f"scenes with another content: {SCENES[2]}" in capsys.readouterr().err
     summary = json.loads((other / "summary.json").read_text()) | {"preset": "strict"}
     (other / "summary.json").write_text(json.dumps(summary))
+    vouch_for(other)
     assert run_command(["compare", str(runs["good"]), str(other)]) == 2
     assert "presets 'paper' and 'strict'" in capsys.readouterr().err

@@ -10,7 +10,8 @@ import pytest
 
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
-from alpasim_plugin.runtime.execute import Threads, execute
+from alpasim_plugin.runtime.execute import HowToRun, Threads, execute
+from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.types import Frame, RenderRequest, Scenario, SensorSpec
@@ -30,7 +31,8 @@ def plan_of(renderer: str = "clean", policy: str = "lane-camera", overrides: tup
 
 def certificate(plan: RunPlan, root: Path, before: dict | None = None, wanted: Certify = "one") -> dict:
     """Run a plan without its tables and return the certificate."""
-    return certify(plan, root, execute(plan, root, Threads(1, 1), lambda manifest, reused: None), 1, wanted, before)
+    manifests = execute(plan, root, HowToRun(Threads(1, 1)), lambda manifest, reused: None, print)
+    return certify(plan, root, manifests, 1, wanted, before)
 
 
 def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Path) -> None:
@@ -88,7 +90,9 @@ def test_the_same_command_again_keeps_the_certificate_until_the_log_is_another(t
     at = data.rindex(b"\xff\xd9") - 40  # inside the last camera image, before its end mark
     data[at] ^= 1
     log.write_bytes(bytes(data))
-    found = certificate(plan_of(images="jpeg"), tmp_path, first)
+    plan = plan_of(images="jpeg")  # a run would drive the damaged rollout again before it is repeated
+    manifests = [read_manifest(tmp_path / cell.folder)[0] for cell in plan.cells]
+    found = certify(plan, tmp_path, manifests, 1, "one", first)
     assert found["status"] == "different"
     assert found["first_difference"]["component"] == "frames"
     assert found["first_difference"]["step"] == 7

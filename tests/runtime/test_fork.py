@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.runtime.certificate import rollout_trace
+from alpasim_plugin.runtime.contents import write_run_json
 from alpasim_plugin.runtime.flips import write_flips
 from alpasim_plugin.runtime.fork import Change, fork_rollout
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout, find_rollout
@@ -24,6 +25,7 @@ from alpasim_plugin.runtime.run import RunResult, execute_run
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.switch import merge_sensors
 from alpasim_plugin.types import SensorSpec
+from alpasim_plugin.vouched import SEAL
 from scenarios.suite import expand
 from tests.examples import first_of
 from tests.runtime.test_certificate import BARE
@@ -148,10 +150,11 @@ def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root: P
 def test_a_scenario_that_has_changed_is_refused(root: Path, past: LoggedRollout, tmp_path: Path) -> None:
     info = read_json(root / "run.json")
     info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
-    for name in ("rollouts.parquet", str(past.manifest["path"]) + "/manifest.json"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_bytes((root / name).read_bytes())
-    (tmp_path / "run.json").write_text(json.dumps(info))
+    for name in ("rollouts.parquet", str(past.manifest["path"])):
+        copy = shutil.copytree if (root / name).is_dir() else shutil.copy2
+        copy(root / name, tmp_path / name)
+    del info[SEAL]
+    write_run_json(tmp_path, info)
     with pytest.raises(InputError, match="has changed since the log was written"):
         find_rollout(tmp_path, CELL)
 

@@ -29,12 +29,16 @@ class Heard:
 
     def __init__(self) -> None:
         self.fates: list[tuple[str, bool]] = []
+        self.notices: list[str] = []
 
     def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
         self.threads = threads
 
     def rollout_done(self, manifest: dict, reused: bool) -> None:
         self.fates.append((manifest["status"], reused))
+
+    def noticed(self, text: str) -> None:
+        self.notices.append(text)
 
 
 def plan_of(policies: tuple[str, ...] = ("lane-camera",), scenes: tuple[str, ...] = ("smoke/straight",)) -> RunPlan:

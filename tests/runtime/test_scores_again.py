@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.atomic import write_json
 from alpasim_plugin.runtime import plan
-from alpasim_plugin.runtime.cell import MANIFEST
+from alpasim_plugin.runtime.manifests import MANIFEST, write_manifest
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.vouched import SEAL
 from scenarios.suite import expand
 from tests.runtime.test_runs import Heard
 
@@ -35,7 +35,8 @@ def test_rollouts_are_scored_again_when_the_evaluators_changed_and_only_then(tmp
     scored = read_json(folder / MANIFEST)
     driven = (folder / LOG_NAME).stat().st_mtime_ns
     older = scored["metrics"] | {"progress": scored["metrics"]["progress"] | {"value": -7.0}}  # as if other evaluators had made it
-    write_json(folder / MANIFEST, scored | {"metrics": older})
+    del scored[SEAL]
+    write_manifest(folder, scored | {"metrics": older})
 
     assert run(one_rollout(), tmp_path) == [("ok", True)]
     assert read_json(folder / MANIFEST)["metrics"] == older

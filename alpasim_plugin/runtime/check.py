@@ -1,0 +1,116 @@
+"""Compare a run folder with what it says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.contents import AGAIN, CONTENTS, DOING, RUN_INFO, Contents, damaged_files, read_contents, read_run_json
+from alpasim_plugin.runtime.manifests import MANIFEST, Damage, inspect_rollout
+from alpasim_plugin.runtime.plan import rollout_folder
+
+NOT_FINISHED = "missing: the run is not finished, or an older version wrote it"
+NEWER = "newer than the tables"
+ROLLOUTS_FOLDER = "rollouts"
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in a run folder.
+
+    Attributes:
+        root: The folder.
+        info: ``run.json``, or its copy in ``contents.json`` where it is damaged.
+        contents: None where they are missing or damaged.
+        cells: Folders of all rollouts of the run, in the order of the tables.
+        damage: Damaged or missing files, those of the run itself first.
+        unfinished: Folders of rollouts that were never finished.
+        tables_only: The folder was copied without its rollouts.
+    """
+
+    root: Path
+    info: Mapping[str, Any]
+    contents: Contents | None
+    cells: tuple[str, ...]
+    damage: tuple[Damage, ...]
+    unfinished: tuple[str, ...]
+    tables_only: bool = False
+
+    @property
+    def whole(self) -> bool:
+        """Tell whether the run is finished and nothing is damaged."""
+        return not self.damage and not self.unfinished
+
+    @property
+    def of_run(self) -> list[Damage]:
+        """List what is damaged outside the rollouts, or no longer fits them."""
+        return [one for one in self.damage if not one.cell or one.problem == NEWER]
+
+    @property
+    def of_rollouts(self) -> list[Damage]:
+        """List what is damaged in the rollouts."""
+        return [one for one in self.damage if one.cell and one.problem != NEWER]
+
+
+def inspect_run(root: Path, full: bool = False, on_cell: Callable[[int, int], None] | None = None) -> Inspection:
+    """Compare a run folder with its manifests and its contents.
+
+    Args:
+        root: The run folder.
+        full: Read every file, whatever its size and time.
+        on_cell: Called with the number of rollouts that were compared, and of all.
+
+    Raises:
+        InputError: The folder holds no run, or nothing is left that says what it should hold.
+    """
+    if not (root / RUN_INFO).exists() and not (root / CONTENTS).exists():
+        raise InputError(DOING, str(root / RUN_INFO), "no such file", "give a folder written by simrun run or simrun score")
+    info, contents, damage = _descriptions(root)
+    if contents is not None:
+        damage += damaged_files(root, contents, full)
+    cells = tuple(contents.rollouts) if contents else planned_cells(info)
+    if contents is not None and cells and not (root / ROLLOUTS_FOLDER).exists():
+        return Inspection(root, info, contents, cells, tuple(damage), (), tables_only=True)
+    unfinished = []
+    for done, cell in enumerate(cells, 1):
+        state = inspect_rollout(root, cell, full, known=contents is not None)
+        damage += state.damage
+        if state.manifest is None and not state.damage:
+            unfinished.append(cell)
+        elif contents is not None and state.manifest is not None and state.seal != contents.rollouts[cell]:
+            damage.append(Damage(cell, MANIFEST, NEWER))
+        if on_cell is not None:
+            on_cell(done, len(cells))
+    return Inspection(root, info, contents, cells, tuple(damage), tuple(unfinished))
+
+
+def _descriptions(root: Path) -> tuple[Mapping[str, Any], Contents | None, list[Damage]]:
+    """Read the two files that describe a run; each can stand in for the other."""
+    damage, errors = [], []
+    info: Mapping[str, Any] | None = None
+    contents: Contents | None = None
+    try:
+        info = read_run_json(root)
+    except InputError as error:
+        errors.append(error)
+        damage.append(Damage("", RUN_INFO, error.found))
+    try:
+        contents = read_contents(root)
+    except InputError as error:
+        errors.append(error)
+        damage.append(Damage("", CONTENTS, error.found if (root / CONTENTS).exists() else NOT_FINISHED))
+    if info is None and contents is None:
+        raise InputError(DOING, str(root), f"{RUN_INFO}: {errors[0].found}; {CONTENTS}: {errors[1].found}", f"{AGAIN} (with --out {root})")
+    return info or (contents.run if contents else {}), contents, damage
+
+
+def planned_cells(info: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the folders of the rollouts that ``run.json`` plans, in the order of the tables; of scored logs it names none."""
+    if info.get("kind") == "score":
+        return ()
+    axes: Sequence[Sequence[Any]] = (list(info["scenes"]), info["renderers"], info["policies"], info["seeds"])
+    return tuple(rollout_folder(renderer, policy, scene, seed).as_posix() for scene, renderer, policy, seed in product(*axes))
