@@ -22,7 +22,7 @@ from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.reading import parse_json
-from alpasim_plugin.reading.json_files import kind_of
+from alpasim_plugin.reading.json_files import as_shape
 
 BundleSettings = OneFixerSettings | PixelFixerSettings
 FORMAT = "simrun-fixer-1"
@@ -141,9 +141,7 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
         InputError: Not a bundle.
     """
     _, trained_with = _header(path)
-    name = trained_with.pop("name")
-    if not isinstance(name, str):
-        raise InputError(DOING, f"{path}, settings in its header", f"name: {kind_of(name)}", "give a file that save_bundle wrote")
+    name = as_shape(str, trained_with.pop("name"), f"{path}, name in its settings", DOING)
     return RENAMED.get(name, name), (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from tests.report.make_run import Plan, make_run
 from tests.scenarios import make_argoverse, make_commonroad, make_usdz
+from tests.vouching import vouch_for
 
 LIMIT_S, LIMIT_BYTES = 60.0, 6 << 30
 DRY = ["--dry-run", "--renderer", "clean", "--policy", "log-replay"]
@@ -114,7 +115,7 @@ def arguments(*args: str) -> Make:
 
 def run_file(name: str, text: str, verb: str, more: tuple[str, ...] = ()) -> Make:
     def make(folder: Path) -> list[str]:
-        run = make_run(folder / "run", Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False))
+        run = vouch_for(make_run(folder / "run", Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False)))
         path = next(run.rglob(name)) if "/" not in name else run / name
         if path.name == "summary.json" and text.startswith("metrics="):
             content = json.loads(path.read_text())
@@ -129,7 +130,7 @@ def run_file(name: str, text: str, verb: str, more: tuple[str, ...] = ()) -> Mak
 
 def gate_files(**files: str) -> Make:
     def make(folder: Path) -> list[str]:
-        run = make_run(folder / "run", Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False))
+        run = vouch_for(make_run(folder / "run", Plan(scenes=("plain",), seeds=(0, 1), steps=30, pictures=False, clips=False)))
         args = ["gate", str(run)]
         for option, text in files.items():
             path = folder / f"{option}.{'yaml' if option == 'gate' else 'json'}"
