@@ -19,8 +19,6 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from tests.report.make_run import Plan, make_run
 from tests.scenarios import make_argoverse, make_commonroad, make_usdz
 from tests.vouching import vouch_for
@@ -141,17 +139,6 @@ def gate_files(**files: str) -> Make:
     return make
 
 
-def bundle(header: bytes) -> Make:
-    def make(folder: Path) -> list[str]:
-        from safetensors.numpy import save
-
-        path = folder / "weights.safetensors"
-        path.write_bytes(save({"dit.a": np.zeros(1, np.float32)}, {"format": "simrun-fixer-1", "settings": header.decode()}))
-        return [*DRY[:1], "--renderer", "onefixer", "--policy", "log-replay", "--set", f"fixer.weights.bundle={path}", "smoke/straight"]
-
-    return make
-
-
 def raw_header(data: bytes) -> Make:
     def make(folder: Path) -> list[str]:
         path = folder / "weights.safetensors"
@@ -244,8 +231,6 @@ SEEN: dict[str, Make] = {
     "200 IDM actors": followers(200),
     "1e12 seeds": arguments(*DRY, "--seeds", "1000000000000", "smoke/straight"),
     "4 MB of '- a'": yaml("- a\n" * 1_000_000),
-    "bundle settings {": bundle(b"{"),
-    "bundle settings deep": bundle(b"[" * 100_000),
     "bundle header deep": raw_header(b'{"a":' + b"[" * 100_000),
     "baseline rows of numbers": gate_files(baseline_file=json.dumps(
         {"preset": "paper", "scenes": {}, "weights": {}, "rows": 5, "made_with": {}, "schema_version": 1})),
