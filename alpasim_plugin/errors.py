@@ -8,9 +8,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from alpasim_plugin.escape import shorten, terminal
+
 
 class SimrunError(Exception):
     """State what was attempted, with which object, what was found, and what the user can do.
+
+    A part is at most `alpasim_plugin.escape.MAX_PART` characters long, and nothing in it can act on a terminal.
 
     Args:
         doing: The attempted action, as a verb phrase ("reading a scenario").
@@ -23,6 +27,7 @@ class SimrunError(Exception):
     failure_class: ClassVar[str] = "input"
 
     def __init__(self, doing: str, with_what: str, found: str, do_this: str) -> None:
+        doing, with_what, found, do_this = (shorten(terminal(str(part))) for part in (doing, with_what, found, do_this))
         super().__init__(doing, with_what, found, do_this)
         self.doing, self.with_what, self.found, self.do_this = doing, with_what, found, do_this
 

@@ -1,0 +1,82 @@
+"""Text from scenes, logs and parts made harmless for the place where it is shown: terminal, Markdown, XML, CSV.
+
+HTML is escaped by the report's template engine. None of these functions changes plain words.
+"""
+
+from __future__ import annotations
+
+import re
+
+MAX_PART = 300  # characters of one part of an error
+
+# What a terminal acts upon: C0 and C1 controls, and the marks that turn the direction of text.
+_CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]|[\ud800-\udfff]")
+# What XML 1.0 has no way to write (section 2.2, production Char).
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_MARKDOWN = re.compile(r"([\\`*\[\]<>|~#!]|(?<![^\W_])_|_(?![^\W_]))")  # an underscore inside a word means nothing
+_FORMULA = ("=", "+", "-", "@")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?%?")
+
+
+def shorten(text: str, most: int = MAX_PART) -> str:
+    """Return text of at most ``most`` characters: the beginning and the end, where the facts are, with how much lies between.
+
+    Example:
+        >>> shorten("a" * 50 + "b" * 50, 40)
+        'aaaaaaaaaa ... (80 more) ... bbbbbbbbbb'
+    """
+    if len(text) <= most:
+        return text
+    mark = f" ... ({len(text)} more) ... "
+    head = (most - len(mark)) // 2
+    return f"{text[:head]} ... ({len(text) - 2 * head} more) ... {text[-head:]}"
+
+
+def terminal(text: str) -> str:
+    r"""Return text on one line in which nothing makes a terminal act: line ends become spaces, other control characters escapes.
+
+    Example:
+        >>> terminal("red\x1b[31m")
+        'red\\x1b[31m'
+    """
+    return _CONTROLS.sub(lambda found: " " if found[0] in "\t\n\v\f\r\u2028\u2029" else _written(found[0]), text)
+
+
+def markdown(text: str) -> str:
+    r"""Return text for a cell of a Markdown table: one line, with every character that Markdown or HTML reads escaped.
+
+    Example:
+        >>> markdown("a|b <i>")
+        'a\\|b \\<i\\>'
+    """
+    return _MARKDOWN.sub(r"\\\1", terminal(text)).replace("&", "&amp;")
+
+
+def xml(text: str) -> str:
+    r"""Return text that an XML 1.0 document can hold, before the writer escapes its markup: other characters are written as escapes.
+
+    Example:
+        >>> xml("a\x00b")
+        'a\\x00b'
+    """
+    return _NOT_XML.sub(lambda found: _written(found[0]), text)
+
+
+def csv(text: str, separator: str = ",") -> str:
+    """Return text for a cell of a CSV file that a spreadsheet opens: no formula, quoted where the format needs it.
+
+    A cell that begins as a formula does gets an apostrophe before it, unless it is a number.
+
+    Example:
+        >>> csv("=1+1"), csv("-1.5"), csv("a,b")
+        ("'=1+1", '-1.5', '"a,b"')
+    """
+    text = terminal(text)
+    if text.lstrip().startswith(_FORMULA) and not _NUMBER.fullmatch(text.strip()):
+        text = f"'{text}"
+    return '"' + text.replace('"', '""') + '"' if any(c in text for c in (separator, '"')) else text
+
+
+def _written(character: str) -> str:
+    code = ord(character)
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"

@@ -1,0 +1,114 @@
+"""Bytes of a file: a regular file, capped in size, or a four-part error."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from alpasim_plugin.bounds import FILE_BYTES, Bound
+from alpasim_plugin.errors import InputError, SimrunError
+
+FETCH_AGAIN = "fetch or write the file again; it may be damaged"
+_KINDS = (
+    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)  # fmt: skip
+
+
+@contextmanager
+def open_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> Iterator[BinaryIO]:
+    """Open a regular file for reading, after checking its kind and size on the open file itself.
+
+    A pipe, socket or device is refused without waiting for its other end.
+
+    Args:
+        path: File.
+        doing: What the caller is doing, for messages.
+        bound: Greatest size.
+        do_this: Last part of the errors; None: one that follows from the cause.
+
+    Raises:
+        InputError: Missing, unreadable, not a regular file, or larger than the bound.
+    """
+    try:
+        # Without O_NONBLOCK the open of a pipe waits for a writer, for ever.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0))
+    except FileNotFoundError as error:
+        raise InputError(doing, str(path), "no such file", do_this or "check the path") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise InputError(doing, str(path), f"it cannot be opened: {reason}", do_this or "check the path and its permissions") from error
+    facts = os.fstat(handle)
+    if not stat.S_ISREG(facts.st_mode):
+        os.close(handle)
+        kind = next((name for test, name in _KINDS if test(facts.st_mode)), "no regular file")
+        raise InputError(doing, str(path), f"{kind}, not a file", do_this or "give a regular file")
+    with os.fdopen(handle, "rb") as stream:
+        if facts.st_size > bound.high:
+            found = f"{facts.st_size} bytes, more than {bound.high:.0f} ({bound.name})"
+            raise InputError(doing, str(path), found, "give a smaller file")
+        try:
+            yield stream
+        except OSError as error:
+            raise InputError(doing, str(path), f"it cannot be read: {error.strerror or error}", do_this or FETCH_AGAIN) from error
+
+
+def read_bytes(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> bytes:
+    """Return a file's bytes; see `open_regular`.
+
+    Raises:
+        InputError: As there, or the file grew beyond the bound while it was read.
+    """
+    with open_regular(path, doing, bound, do_this) as stream:
+        data = stream.read(int(bound.high) + 1)
+    if len(data) > bound.high:
+        raise InputError(doing, str(path), f"more than {bound.high:.0f} bytes ({bound.name})", "give a smaller file")
+    return data
+
+
+def read_text(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> str:
+    """Return a file's text, UTF-8; see `read_bytes`.
+
+    Raises:
+        InputError: As there, or bytes that are not UTF-8.
+    """
+    data = read_bytes(path, doing, bound, do_this)
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(doing, str(path), f"byte {error.start} is not UTF-8", do_this or "save the file as UTF-8 text") from error
+
+
+def check_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> int:
+    """Check a file that a library will open by its path; return its size in bytes. See `open_regular`."""
+    with open_regular(path, doing, bound, do_this) as stream:
+        return os.fstat(stream.fileno()).st_size
+
+
+@contextmanager
+def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str = "") -> Iterator[None]:
+    """Turn whatever a parser raises into the four-part error of the file that it parses.
+
+    The original stays the cause, so ``--debug`` shows where it was raised.
+
+    Args:
+        doing: First part.
+        where: The file, or the member of a file.
+        do_this: Last part.
+        what: What the file should be ("a parquet table"), for the third part.
+
+    Raises:
+        InputError: The block raised anything but a `SimrunError`.
+    """
+    try:
+        yield
+    except SimrunError:
+        raise
+    except Exception as error:
+        lines = str(error).strip().splitlines()
+        reason = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+        raise InputError(doing, str(where), f"not {what}: {reason}" if what else f"it cannot be used: {reason}", do_this) from error
