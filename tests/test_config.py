@@ -116,7 +116,7 @@ def test_deep_nesting_is_stopped(tmp_path: Path) -> None:
 
 
 def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         load_yaml(tmp_path / "none.yaml")
     with pytest.raises(InputError, match="directory"):
         load_yaml(tmp_path)
