@@ -65,14 +65,22 @@ KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 # Files
 FILE_BYTES = Bound("file size", "bytes", 0, 2 * GIB, "no scene, log or table that this machine could use is larger")
 SOURCE_BYTES = Bound("size of a source file", "bytes", 0, 256 * MIB, "maps, tracks and tables of recorded scenes are a few MiB")
-JSON_BYTES = Bound("JSON size", "bytes", 0, 256 * MIB, "parsed JSON takes about ten times its size in memory")
+ARCHIVE_BYTES = Bound("size of a scene archive", "bytes", 0, 64 * GIB, "scenes carry checkpoints of several GB, which are not read")
+JSON_BYTES = Bound("JSON size", "bytes", 0, 64 * MIB, "parsed JSON takes about ten times its size in memory")
 YAML_BYTES = Bound("YAML size", "bytes", 0, MIB, "a scenario takes a few KiB")
-XML_BYTES = Bound("XML size", "bytes", 0, 256 * MIB, "maps of towns take a few MiB")
+XML_ELEMENTS = Bound("elements of an XML document", "", 1, 2_000_000, "maps of towns have some 100,000")
 HEADER_BYTES = Bound("header size", "bytes", 0, 16 * MIB, "headers name tensors and settings, nothing more")
 DEPTH = Bound("depth of nesting", "levels", 0, 64, "no format here nests deeper than a dozen levels")
 MEMBERS = Bound("members of an archive", "", 0, 100_000, "scenes hold a few hundred")
 UNPACKED_BYTES = Bound("unpacked size", "bytes", 0, 2 * GIB, "what is packed may not fill the memory")
+TABLE_ROWS = Bound("rows of a table", "", 0, 100_000_000, "a thousand rollouts have some millions of steps")
+TABLE_COLUMNS = Bound("columns of a table", "", 0, 4_096, "each metric has two")
+TABLE_BYTES = Bound("unpacked size of a table", "bytes", 0, 4 * GIB, "it must fit into the memory")
+LOG_BYTES = Bound("size of a rollout log", "bytes", 0, 64 * GIB, "it is read one entry at a time")
 ENTRY_BYTES = Bound("log entry", "bytes", 1, GIB, "a session request with whole maps takes megabytes")
+
+WEIGHT_BYTES = Bound("size of network weights", "bytes", 0, 32 * GIB, "a network of 14 billion weights in two bytes each")
+GAUSSIANS = Bound("Gaussians of a file", "", 0, 20_000_000, "each takes some 250 bytes while it is read")
 
 # Images
 IMAGE_SIDE_PX = Bound("image side", "px", 8, 8192, "no camera of a car is larger")

@@ -20,6 +20,8 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.reading import parse_json
+from alpasim_plugin.reading.json_files import kind_of
 
 FORMAT = "simrun-fixer-1"
 PARTS = ("dit", "vae", "decoder", "prompt")
@@ -90,7 +92,9 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
         InputError: Not a bundle.
     """
     _, trained_with = _header(path)
-    name = str(trained_with.pop("name"))
+    name = trained_with.pop("name")
+    if not isinstance(name, str):
+        raise InputError(DOING, f"{path}, settings in its header", f"name: {kind_of(name)}", "give a file that save_bundle wrote")
     return name, (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
 
 
@@ -120,7 +124,7 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
         InputError: Not a bundle.
     """
     header = read_metadata(path)
-    settings = json.loads(header.get("settings", "{}"))
+    settings = parse_json(header.get("settings", "{}"), f"{path}, settings in its header", DOING)
     if header.get("format") != FORMAT or not isinstance(settings, dict) or "name" not in settings:
         found = f"format {header.get('format')!r} in its header"
         do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
