@@ -97,6 +97,7 @@ MAP_CURVATURE_PER_M = Bound("curvature in a map", "1/m", -2, 2, "corners of junc
 ASIDE_M = Bound("distance beside a reference line", "m", -1000, 1000, "no lane lies farther beside its road")
 HEIGHT_M = Bound("height", "m", -20_000, 20_000, "no road is higher above or below its map's origin")
 BODY_M = Bound("side of a body", "m", 0.01, 200, "trains and buildings beside the road included")
+SIGN_M = Bound("side of a sign", "m", 0, 100, "gantries across a road")
 VEHICLE_M = Bound("side of the ego", "m", 0.3, 30, "from a wheelbarrow to a road train")
 AXLE_M = Bound("axle distance", "m", -30, 30, "axles lie inside the body")
 OFFSET_M = Bound("offset beside a lane", "m", -100, 100, "farther aside is no lane any more")
@@ -129,6 +130,7 @@ SHUTTER_US = Bound("exposure", "us", 0, 1_000_000, "a second")
 TIME_STEP_S = Bound("time step", "s", 1e-4, 10, "recordings have 1 to 100 states a second")
 
 # Counts
+STEP = Bound("time step of a recording", "", 0, 1_000_000, "a day at ten a second")
 SEED = Bound("seed", "", 0, 2**63 - 1, "int64 in the tables")
 SEEDS = Bound("number of seeds", "", 1, 10_000, "each seed is a rollout of every scene")
 ROLLOUTS = Bound("rollouts of a run", "", 1, 1_000_000, "each is a row and a folder")

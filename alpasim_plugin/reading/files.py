@@ -57,6 +57,15 @@ def open_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_thi
             raise InputError(doing, str(path), f"it cannot be read: {error.strerror or error}", do_this or FETCH_AGAIN) from error
 
 
+def exists(path: Path | str) -> bool:
+    """Return whether something is at a path; a name that no file can have (too long, a null character) is at none."""
+    try:
+        os.stat(path)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def read_bytes(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> bytes:
     """Return a file's bytes; see `open_regular`.
 
