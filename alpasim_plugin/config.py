@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.bounds import YAML_BYTES
 from alpasim_plugin.config_validate import validate
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import read_bytes
 from alpasim_plugin.yaml_marks import Document, Key, Mark, parse
 
 __all__ = ["Document", "Mark", "apply_overrides", "load_yaml", "parse_scalar", "validate"]
-
-MAX_BYTES = 16 * 1024 * 1024
 
 
 def load_yaml(path: str | Path, doing: str = "reading a configuration") -> Document:
@@ -54,9 +54,9 @@ def apply_overrides(document: Document, overrides: Sequence[str], doing: str = "
         if not equals or not key.strip():
             raise InputError(doing, where, "no KEY=VALUE", "write for example --set road.lane_width_m=3.2")
         value = parse_scalar(value_text, doing, where)
-        loc = _assign(data, key.strip(), value, where, doing)
-        for old in [k for k in marks if k[: len(loc)] == loc]:
-            del marks[old]
+        loc, before = _assign(data, key.strip(), value, where, doing)
+        for old in _paths(before, loc):
+            marks.pop(old, None)
         marks[loc] = Mark(where, 0, 0)
     return Document(data, marks, document.path, document.sources, (*document.overrides, *overrides))
 
@@ -65,8 +65,12 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...]) -> Document:
     resolved = path.resolve()
     if resolved in chain:
         raise InputError(doing, str(path), f"extends itself through {' -> '.join(str(p) for p in chain)}", "break the cycle of extends")
-    raw = _read(path, doing)
-    data, marks = parse(raw.decode("utf-8"), str(path), doing)
+    raw = read_bytes(path, doing, YAML_BYTES)
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError as e:
+        raise InputError(doing, str(path), f"byte {e.start} is not UTF-8", "save the file as UTF-8 text") from e
+    data, marks = parse(text, str(path), doing)
     sources: list[tuple[str, str]] = []
     if isinstance(data, dict) and "extends" in data:
         at = marks.get(("extends",), Mark(str(path), 1, 1))
@@ -82,42 +86,27 @@ def _load(path: Path, doing: str, chain: tuple[Path, ...]) -> Document:
             if not base_path.is_file():
                 raise InputError(doing, str(at), f"extends {name!r}, but {base_path} does not exist", "correct the path")
             base = _load(base_path, doing, (*chain, resolved))
-            merged, merged_marks = _merge(merged, merged_marks, base.data, base.marks, ())
+            merged, merged_marks = _merged(merged, merged_marks, base.data, base.marks)
             sources.extend(base.sources)
-        data, marks = _merge(merged, merged_marks, data, marks, ())
+        data, marks = _merged(merged, merged_marks, data, marks)
     sources.append((str(path), hashlib.sha256(raw).hexdigest()))
     return Document(data, marks, str(path), tuple(sources))
 
 
-def _read(path: Path, doing: str) -> bytes:
-    try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(doing, str(path), f"{size} bytes, more than {MAX_BYTES}", "split the file or use a data file")
-        raw = path.read_bytes()
-        raw.decode("utf-8")
-    except UnicodeDecodeError as e:
-        raise InputError(doing, str(path), f"byte {e.start} is not UTF-8", "save the file as UTF-8 text") from e
-    except OSError as e:
-        raise InputError(doing, str(path), f"{e.strerror or e}", "check the path and its permissions") from e
-    return raw
+def _merged(a: Any, a_marks: Mapping[Key, Mark], b: Any, b_marks: Mapping[Key, Mark]) -> tuple[Any, dict[Key, Mark]]:
+    """Merge b over a, with the positions of what is left of both."""
+    replaced: set[Key] = set()
+    data = _merge(a, b, (), replaced)
+    kept = {key: mark for key, mark in a_marks.items() if not any(key[:n] in replaced for n in range(len(key) + 1))}
+    return data, {**kept, **b_marks}
 
 
-def _merge(a: Any, a_marks: Mapping[Key, Mark], b: Any, b_marks: Mapping[Key, Mark], loc: Key) -> tuple[Any, dict[Key, Mark]]:
-    """Merge b over a: mappings key by key, all else replaced."""
+def _merge(a: Any, b: Any, loc: Key, replaced: set[Key]) -> Any:
+    """Merge b over a: mappings key by key, all else replaced; notes the paths that were."""
     if not (isinstance(a, dict) and isinstance(b, dict)):
-        kept = {k: m for k, m in a_marks.items() if k[: len(loc)] != loc}
-        return b, {**kept, **{k: m for k, m in b_marks.items() if k[: len(loc)] == loc}}
-    out, marks = dict(a), dict(a_marks)
-    if loc in b_marks:
-        marks[loc] = b_marks[loc]
-    for key, value in b.items():
-        if key in out:
-            out[key], marks = _merge(out[key], marks, value, b_marks, (*loc, key))
-        else:
-            out[key] = value
-            marks.update({k: m for k, m in b_marks.items() if k[: len(loc) + 1] == (*loc, key)})
-    return out, marks
+        replaced.add(loc)
+        return b
+    return a | {key: _merge(a[key], value, (*loc, key), replaced) if key in a else value for key, value in b.items()}
 
 
 def _copy(data: Any) -> Any:
@@ -126,11 +115,11 @@ def _copy(data: Any) -> Any:
     return [_copy(v) for v in data] if isinstance(data, list) else data
 
 
-def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> Key:
-    """Set a dotted key in place and return its path."""
+def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> tuple[Key, Any]:
+    """Set a dotted key in place; return its path and what stood there, None if nothing did."""
     parts = key.split(".")
     loc: list[str | int] = []
-    node = data
+    node, before = data, None
     for n, part in enumerate(parts):
         last = n == len(parts) - 1
         if isinstance(node, dict):
@@ -143,10 +132,19 @@ def _assign(data: Any, key: str, value: Any, where: str, doing: str) -> Key:
             raise InputError(doing, where, f"{'.'.join(map(str, loc)) or 'the file'} holds a value, not keys", "shorten the path")
         loc.append(step)
         if last:
+            before = node.get(step) if isinstance(node, dict) else node[int(step)]
             node[step] = value
         else:
             node = node[step]
-    return tuple(loc)
+    return tuple(loc), before
+
+
+def _paths(value: Any, loc: Key) -> Iterator[Key]:
+    """Yield the path of a value and of everything in it."""
+    yield loc
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in inside:
+        yield from _paths(child, (*loc, key))
 
 
 def _item(items: list[Any], part: str, where: str, doing: str) -> int:

@@ -12,8 +12,10 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.escape import shorten
 from alpasim_plugin.yaml_marks import Document, Key
 
+EXAMINED, EXPLAINED = 200, 4  # problems of one file: those put in order, and those put into words
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -51,22 +53,20 @@ def dotted(loc: Sequence[str | int]) -> str:
 
 
 def _as_input_error(model: type[BaseModel], document: Document, error: ValidationError, doing: str) -> InputError:
-    problems = []
-    items = error.errors(include_url=False)
+    items = error.errors(include_url=False)[:EXAMINED]
+    placed = []
     for item in items:
         loc = tuple(item["loc"])
-        if _follows_from_another(item, items):
-            continue
-        known = _in_document(document.data, loc)
-        mark = document.mark(known)
-        found, hint = _explain(model, document, item, loc, known)
-        problems.append((mark, found, hint))
+        if not _follows_from_another(item, items):
+            known = _in_document(document.data, loc)
+            placed.append((document.mark(known), item, loc, known))
     # File order, so that the first problem shown is the first that a reader of the file meets.
-    problems.sort(key=lambda p: (p[0].file, p[0].line, p[0].column))
-    mark, found, hint = problems[0]
-    if len(problems) > 1:
-        rest = "; ".join(f"{m}: {f}" for m, f, _ in problems[1:])
-        found += f" (and {len(problems) - 1} more: {rest})"
+    placed.sort(key=lambda p: (p[0].file, p[0].line, p[0].column))
+    texts = [(mark, *_explain(model, document, item, loc, known)) for mark, item, loc, known in placed[:EXPLAINED]]
+    mark, found, hint = texts[0]
+    if len(placed) > 1:
+        rest = "; ".join(f"{m}: {f}" for m, f, _ in texts[1:])
+        found = f"{shorten(found, 180)} (and {error.error_count() - len(items) + len(placed) - 1} more: {rest})"
     return InputError(doing, str(mark), found, hint)
 
 
@@ -124,11 +124,18 @@ def _explain(model: type[BaseModel], document: Document, item: Any, loc: Key, kn
         found, _, hint = text.partition(" | ")
         return f"{name}: {found}", hint or "correct the value"
     if kind.endswith("_type") or kind.endswith("_parsing"):
-        return f"{name} = {value!r} ({_kind_of(value)})", f"{item['msg'].replace('Input should be', 'give')}"
+        return f"{name} = {_short(value)} ({_kind_of(value)})", f"{item['msg'].replace('Input should be', 'give')}"
     if kind in ("too_short", "too_long"):
         bound = f"at least {ctx['min_length']}" if kind == "too_short" else f"at most {ctx['max_length']}"
-        return f"{name} = {value!r}", f"give {bound} item{'s' if bound[-2:] != ' 1' else ''}"
-    return f"{name} = {value!r}", item["msg"].replace("Input should be", "give a value").replace("Input should", "the value should")
+        return f"{name} = {_short(value)}", f"give {bound} item{'s' if bound[-2:] != ' 1' else ''}"
+    return f"{name} = {_short(value)}", item["msg"].replace("Input should be", "give a value").replace("Input should", "the value should")
+
+
+def _short(value: Any) -> str:
+    """Write a value of a file; only the beginning of a long list or object."""
+    if isinstance(value, list | dict) and len(value) > 8:
+        return f"{'list' if isinstance(value, list) else 'keys'} of {len(value)}"
+    return shorten(repr(value), 80)
 
 
 def _kind_of(value: Any) -> str:

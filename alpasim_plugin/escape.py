@@ -1,4 +1,4 @@
-"""Text from scenes, logs and parts made harmless for the place where it is shown: terminal, Markdown, XML, CSV.
+"""Text from scenes, logs and parts made harmless for the place where it is shown: terminal, Markdown, XML.
 
 HTML is escaped by the report's template engine. None of these functions changes plain words.
 """
@@ -14,8 +14,6 @@ _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-
 # What XML 1.0 has no way to write (section 2.2, production Char).
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _MARKDOWN = re.compile(r"([\\`*\[\]<>|~#!]|(?<![^\W_])_|_(?![^\W_]))")  # an underscore inside a word means nothing
-_FORMULA = ("=", "+", "-", "@")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?%?")
 
 
 def shorten(text: str, most: int = MAX_PART) -> str:
@@ -60,21 +58,6 @@ def xml(text: str) -> str:
         'a\\x00b'
     """
     return _NOT_XML.sub(lambda found: _written(found[0]), text)
-
-
-def csv(text: str, separator: str = ",") -> str:
-    """Return text for a cell of a CSV file that a spreadsheet opens: no formula, quoted where the format needs it.
-
-    A cell that begins as a formula does gets an apostrophe before it, unless it is a number.
-
-    Example:
-        >>> csv("=1+1"), csv("-1.5"), csv("a,b")
-        ("'=1+1", '-1.5', '"a,b"')
-    """
-    text = terminal(text)
-    if text.lstrip().startswith(_FORMULA) and not _NUMBER.fullmatch(text.strip()):
-        text = f"'{text}"
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in (separator, '"')) else text
 
 
 def _written(character: str) -> str:

@@ -1,8 +1,9 @@
 """YAML text to plain data in which every key remembers its file, line and column.
 
-Scalars follow the YAML 1.2 core schema (``no`` is a word, ``1e-3`` a number, ``12:30`` a string), with ``_`` allowed inside integers.
-Duplicate keys, merge keys and recursive aliases are refused; depth and the number of nodes after alias expansion are bounded, so
-that a small hostile file cannot fill the memory.
+The compiled parser reads the text, in linear time; its events are counted before a node is built, so that a small hostile file can fill
+neither the memory nor the stack. Scalars follow the YAML 1.2 core schema (``no`` is a word, ``1e-3`` a number, ``12:30`` a string), with
+``_`` allowed inside integers.
+Duplicate keys, merge keys and recursive aliases are refused; depth and the number of nodes after alias expansion are bounded.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from typing import Any
 
 import yaml
 
+from alpasim_plugin.bounds import YAML_VALUES
 from alpasim_plugin.errors import InputError
 
-MAX_NODES = 200_000
+MAX_NODES = int(YAML_VALUES.high)
 MAX_DEPTH = 40
 
 Key = tuple[str | int, ...]
@@ -63,8 +65,8 @@ class Document:
         return Path(mark.file).resolve().parent if mark.line else Path.cwd()
 
 
-class _CoreLoader(yaml.SafeLoader):
-    """SafeLoader with YAML 1.2 core scalars."""
+class _CoreLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # a base chosen at run time
+    """Safe loader with YAML 1.2 core scalars; compiled where PyYAML comes with it, as its wheels do."""
 
 
 _CoreLoader.yaml_implicit_resolvers = {}
@@ -94,6 +96,7 @@ def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[
         InputError: Not valid YAML, or outside the bounds.
     """
     try:
+        _check_events(text, file, doing)
         loader = _CoreLoader(text)
         node = loader.get_single_node()
         builder = _Builder(file, doing)
@@ -107,9 +110,23 @@ def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[
         line = text.count("\n", 0, e.position) + 1
         at = file if override else f"{file}:{line}:{e.position - text.rfind(chr(10), 0, e.position)}"
         raise InputError(doing, at, f"not valid YAML: the control character {e.character!r}", "save the file as plain UTF-8 text") from e
-    except RecursionError as e:
-        raise InputError(doing, file, f"nested deeper than {MAX_DEPTH} levels", "flatten the file") from e
     return data, builder.marks
+
+
+def _check_events(text: str, file: str, doing: str) -> None:
+    """Refuse too many or too deeply nested values before nodes are built, which takes stack and memory."""
+    values = depth = 0
+    for event in yaml.parse(text, Loader=_CoreLoader):
+        if isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+            continue
+        values += isinstance(event, yaml.NodeEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        if depth > MAX_DEPTH + 1 or values > 2 * MAX_NODES:  # keys are events too
+            found = f"nested deeper than {MAX_DEPTH} levels" if depth > MAX_DEPTH + 1 else f"more than {MAX_NODES} values"
+            mark = event.start_mark
+            at = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark is not None else file
+            raise InputError(doing, at, found, "flatten the file" if depth > MAX_DEPTH + 1 else "split the file or use a data file")
 
 
 class _Builder:

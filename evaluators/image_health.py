@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.pixels import is_black
 from alpasim_plugin.types import U8, LoggedImage, MetricSeries, RolloutLog, Scene
 from evaluators.base import series, with_preset
@@ -22,20 +21,12 @@ def decode(image: LoggedImage) -> U8:
     """Decode a logged PNG or JPEG to ``(H, W, 3)`` BGR.
 
     Raises:
-        EvaluatorError: The bytes are no image.
+        InputError: The bytes are no image, or one larger than the bounds.
     """
-    import cv2  # only rollouts that carry images need it
+    from alpasim_plugin.reading.images import decode_image
 
-    raw = np.frombuffer(image.data, dtype=np.uint8)
-    pixels = cv2.imdecode(raw, cv2.IMREAD_COLOR) if raw.size else None
-    if pixels is None:
-        raise EvaluatorError(
-            "decoding a logged image",
-            f"camera {image.camera!r} at {image.end_us} us",
-            f"{raw.size} bytes that are no image",
-            "log PNG or JPEG",
-        )
-    return np.asarray(pixels, dtype=np.uint8)
+    where = f"camera {image.camera!r} at {image.end_us} us"
+    return np.asarray(decode_image(image.data, where, "decoding a logged image", "log PNG or JPEG"), dtype=np.uint8)
 
 
 def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:

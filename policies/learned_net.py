@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import check_regular, parsing
 from alpasim_plugin.types import F64
 from policies.learned_command import COMMANDS
 from policies.learned_view import CHANNELS, HEIGHT, WIDTH
@@ -115,14 +115,11 @@ def load_net(path: Path) -> LearnedNet:
         InputError: No such file, or not weights of this network.
     """
     doing = "loading the learned policy"
-    if not path.is_file():
-        raise InputError(doing, str(path), "no such file", "give weights that 'simrun train policy' wrote")
+    check_regular(path, doing, do_this="give weights that 'simrun train policy' wrote")
     net = LearnedNet()
     wanted = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    try:
+    with parsing(doing, path, "copy or train it again", "not a complete safetensors file"):
         state = load_file(str(path))
-    except (SafetensorError, ValueError) as error:
-        raise InputError(doing, str(path), f"not a complete safetensors file: {error}", "copy or train it again") from error
     found = {name: tuple(value.shape) for name, value in state.items()}
     if found != wanted:
         odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))

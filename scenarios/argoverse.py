@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.reading.tables import Kind
 from alpasim_plugin.types import F64, I64, Actor, Box, CameraSpec, Trajectory, Vehicle
 from scenarios.argoverse_map import read_ground, read_map
 from scenarios.reading import SourceFiles
@@ -28,6 +29,7 @@ VEHICLE = Vehicle(box=Box(4.877, 2.0, 1.473), rear_axle_to_centre_m=1.422, wheel
 # height is 0.324, 0.324 and 0.321 m.
 WHEEL_RADIUS_M = 0.33
 POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_NUMBERS: dict[str, Kind] = dict.fromkeys(POSE, "number")
 _CATEGORIES = {
     "car": "REGULAR_VEHICLE",
     "truck": "LARGE_VEHICLE BOX_TRUCK TRUCK TRUCK_CAB VEHICULAR_TRAILER",
@@ -98,8 +100,8 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
     Raises:
         InputError: Fewer than two poses, times that do not increase, values that are not finite, quaternions that are not unit.
     """
-    table = files.read_feather(path, ("timestamp_ns", *POSE))
-    t_ns = _times(files, path, table["timestamp_ns"])
+    table = files.read_feather(path, {"timestamp_ns": "integer", **_NUMBERS})
+    t_ns = table["timestamp_ns"].astype(np.int64)
     xyz, quat = _columns(table, POSE[4:]), _columns(table, POSE[:4])
     checked = checked_trajectory(files, path, t_ns, xyz, quat, least=2)
     return EgoPoses(checked.t_us, checked.xyz, checked.quat)
@@ -121,8 +123,9 @@ def read_actors(files: SourceFiles, path: Path, poses: EgoPoses, origin: F64) ->
         InputError: No cuboid, a sweep without an ego pose at its time, a bad size, or a track whose times do not increase.
     """
     sizes = ("length_m", "width_m", "height_m")
-    table = files.read_feather(path, ("timestamp_ns", "track_uuid", "category", *sizes, *POSE))
-    t_ns = _times(files, path, table["timestamp_ns"])
+    numbers: dict[str, Kind] = dict.fromkeys((*sizes, *POSE), "number")
+    table = files.read_feather(path, {"timestamp_ns": "integer", "track_uuid": "text", "category": "text", **numbers})
+    t_ns = table["timestamp_ns"].astype(np.int64)
     uuid, category = table["track_uuid"].astype(str), table["category"].astype(str)
     others = np.nonzero(category != EGO_CATEGORY)[0]
     if len(others) == 0:
@@ -180,8 +183,9 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
     files = SourceFiles("reading an Argoverse 2 calibration")
     inner_path = files.only(folder, ("intrinsics.feather",), "the intrinsics")
     outer_path = files.only(folder, ("egovehicle_SE3_sensor.feather",), "the sensor poses")
-    inner = files.read_feather(inner_path, ("sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px"))
-    outer = files.read_feather(outer_path, ("sensor_name", *POSE))
+    lens: dict[str, Kind] = dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px"), "number")
+    inner = files.read_feather(inner_path, {"sensor_name": "text", **lens})
+    outer = files.read_feather(outer_path, {"sensor_name": "text", **_NUMBERS})
     mounts = dict(zip(outer["sensor_name"].astype(str), se3(_columns(outer, POSE[4:]), _columns(outer, POSE[:4])), strict=True))
     cameras: list[CameraSpec] = []
     for i, name in enumerate(inner["sensor_name"].astype(str)):
@@ -193,12 +197,6 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         cameras.append(CameraSpec(str(name), int(inner["width_px"][i]), int(inner["height_px"][i]), K, T_rig_camera))
     return tuple(cameras)
-
-
-def _times(files: SourceFiles, path: Path, column: npt.NDArray[Any]) -> I64:
-    if column.dtype.kind not in "iu":
-        raise files.fail(path, f"timestamp_ns of type {column.dtype}", "give integer nanoseconds")
-    return column.astype(np.int64)
 
 
 def _columns(table: dict[str, npt.NDArray[Any]], names: tuple[str, ...]) -> F64:

@@ -113,7 +113,7 @@ def read_ground(files: SourceFiles, folder: Path, lane_map: LaneMap, wheels: F64
     known = np.isfinite(heights)
     grid = files.near(raster_path, np.column_stack([city[known], heights[known]]) - origin)
     edges = [e for lane in lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None]
-    return from_points(np.concatenate([grid, *edges, *lane_map.drivable_areas, wheels]), GROUND_CELL_M)
+    return from_points(np.concatenate([grid, *edges, *lane_map.drivable_areas, wheels]), GROUND_CELL_M, wheels)
 
 
 def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:

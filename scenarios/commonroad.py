@@ -13,6 +13,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
+from alpasim_plugin.bounds import TIME_STEP_S
 from alpasim_plugin.geometry import offset_trajectory, rectangle_corners
 from alpasim_plugin.geometry_lanes import lane_polygon
 from alpasim_plugin.types import F64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
@@ -78,7 +79,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         scene_id=f"commonroad-{root.get('benchmarkID') or file.stem}",
         source="commonroad",
         lane_map=lane_map,
-        ground=_ground(lane_map),
+        ground=_ground(lane_map, chosen.centre),
         ego_log=offset_trajectory(centre_log, T_centre_rig),
         vehicle=vehicle,
         actors=tuple(actors),
@@ -94,8 +95,7 @@ def _time_step(files: SourceFiles, path: Path, root: Element) -> float:
         dt_s = float(str(root.get("timeStepSize")))
     except ValueError as error:
         raise files.fail(path, f"timeStepSize = {root.get('timeStepSize')!r}", "give the time step in seconds") from error
-    if not 0 < dt_s < 10:
-        raise files.fail(path, f"timeStepSize = {dt_s}", "give a time step between 0 and 10 s")
+    TIME_STEP_S.check(dt_s, files.doing, path, "timeStepSize")
     return dt_s
 
 
@@ -202,7 +202,7 @@ def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) ->
     return False
 
 
-def _ground(lane_map: LaneMap) -> HeightField:
+def _ground(lane_map: LaneMap, drive: F64) -> HeightField:
     """Return a level ground for planar files, a fitted one where points have heights."""
     points = np.concatenate([e for lane in lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None])
-    return flat(0.0) if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0 else from_points(points)
+    return flat(0.0) if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0 else from_points(points, drive=drive)

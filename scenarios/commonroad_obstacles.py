@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.bounds import STEP
 from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.types import F64, I64, Box, Trajectory
 from scenarios.commonroad_map import number, point
@@ -76,7 +77,10 @@ def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -
         centre = np.array([point(files, where, _must(s.find("position/point"))) for s in states]) - origin
         c, s = np.cos(yaw), np.sin(yaw)
         centre[:, :2] += np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]], axis=1)
-        steps = np.array([round(number(files, where, s.find("time/exact"), "time")) for s in states], dtype=np.int64)
+        times = [number(files, where, s.find("time/exact"), "time") for s in states]
+        for time in times:
+            STEP.check(time, files.doing, where, "time step")
+        steps = np.array([round(time) for time in times], dtype=np.int64)
         speeds = [s.find("velocity/exact") for s in states]
         speed = np.array([np.nan if v is None else number(files, where, v, "velocity") for v in speeds])
         box = Box(size[0], size[1], HEIGHTS_M[label])

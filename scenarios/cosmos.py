@@ -61,7 +61,7 @@ def read_cosmos(path: str | Path) -> RecordedLog:
     if FRONT_WIDE not in lenses:
         raise files.fail(folder / "ftheta_intrinsic", f"no lens {FRONT_WIDE}", "use a clip with the front wide camera")
     surface = [e for lane in lanes.values() for e in (lane.left, lane.right) if e is not None]
-    ground = from_points(np.concatenate([*surface, *lane_map.road_edges, ego_log.xyz]), GROUND_CELL_M)
+    ground = from_points(np.concatenate([*surface, *lane_map.road_edges, ego_log.xyz]), GROUND_CELL_M, ego_log.xyz)
     notes = (
         "no actor tracks in this copy: the road is empty",
         "no camera extrinsics in this copy: the front wide camera is mounted as on another car of the fleet",

@@ -11,8 +11,8 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import arc_lengths
 from alpasim_plugin.types import F64
 from alpasim_plugin.world.curves import smoothstep
-from alpasim_plugin.world.path import Path, polyline_path, smooth_path
-from alpasim_plugin.world.roads import Road, polyline
+from alpasim_plugin.world.path import Path, smooth_path
+from alpasim_plugin.world.roads import Road
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,10 @@ def _shift(line: F64, s: F64, shift: LateralShift) -> F64:
     return out
 
 
-def lane_path(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> Path:
-    """Return the line of a lane of the main road that is present where the ego's line is at ``at_s_m``, or of a lane given by its id.
+def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> tuple[str, ...]:
+    """Return the lanes that a car drives along, one after the other.
+
+    They are those of a lane of the main road that is present where the ego's line is at ``at_s_m``, or of a lane given by its id.
 
     A forward lane (``>= 0``) is followed back to where it begins and on to where it ends; an oncoming lane (``< 0``, -1 is next to
     the centre line) runs in its own driving direction; a lane id is followed along its first successors.
@@ -128,7 +130,7 @@ def lane_path(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> 
         InputError: No such lane there.
     """
     if isinstance(lane, str):
-        return polyline_path(polyline(road.lane_map, _follow(road, lane)))
+        return tuple(_follow(road, lane))
     i = int(np.clip(np.searchsorted(ego_path.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
     stretch = road.stretches[i]
     ids: list[str] = []
@@ -141,7 +143,7 @@ def lane_path(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) -> 
         raise InputError(
             "placing an actor", f"lane {lane}", f"{n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m", "choose one that exists"
         )
-    return polyline_path(polyline(road.lane_map, ids))
+    return tuple(ids)
 
 
 def _back(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:

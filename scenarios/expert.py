@@ -13,8 +13,9 @@ import numpy as np
 
 from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.types import F64, I64, Box, Trajectory, Vehicle
-from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, nearest_ahead, spans
+from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, Spans, find_leader, idm_acceleration, nearest_ahead, spans
 from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.queue import find_leaders
 from alpasim_plugin.world.scripted import track_on_path
 from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
 from scenarios.lookahead import TIMES_S, PredictedBodies, ScriptedTrack, ScriptedTracks, yielding_acceleration
@@ -80,16 +81,21 @@ def drive(
     """
     table = ScriptedTracks(scripts, end_us, DECISION_US)
     expert = _Expert(path, s0_m, vehicle, style, table)
-    cars = [_Car(f, table.standing) for f in followers]
+    standing = {id(f.path): spans(f.path, 0.0, table.standing, f.path.length_m + 100.0, window=False) for f in followers}
+    cars = [_Car(f, standing[id(f.path)]) for f in followers]
     log_s, log_t = [expert.s], [0]
     sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
-        bodies = [c.bodies() for c in cars]
-        moving = table.moving(t)
-        wanted = expert.decide(concatenate([moving, *bodies]), cars, t)
-        ego = expert.bodies()
-        for i, car in enumerate(cars):
-            car.decide(concatenate([ego, moving, *bodies[:i], *bodies[i + 1 :]]))
+        driving = [car for car in cars if car.s <= car.f.path.length_m]
+        moving = concatenate([table.moving(t), _bodies(driving)])
+        wanted = expert.decide(moving, cars, t)
+        everybody = concatenate([expert.bodies(), moving])
+        own_row = {id(car): row for row, car in enumerate(driving, start=len(everybody.xy) - len(driving))}
+        for path_of, group in _by_path(cars):
+            fronts, halves = np.array([cars[i].front_s for i in group]), np.array([cars[i].f.box.width_m / 2 for i in group])
+            rows = np.array([own_row.get(id(cars[i]), -1) for i in group])
+            for i, leader in zip(group, find_leaders(path_of, fronts, halves, everybody, rows), strict=True):
+                cars[i].decide(leader)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
             log_s.append(expert.s)
@@ -165,22 +171,18 @@ class _Expert:
 class _Car:
     """A follower while it drives."""
 
-    def __init__(self, f: Follower, standing: Bodies) -> None:
+    def __init__(self, f: Follower, standing: Spans | None) -> None:
         self.f, self.s, self.v, self.a = f, f.s_m, f.speed_mps, 0.0
         self.log_s = [self.s]
-        self.standing = spans(f.path, 0.0, standing, f.path.length_m + 100.0, window=False)
+        self.standing = standing  # places of the standing bodies on its line
 
-    def bodies(self) -> Bodies:
-        if self.s > self.f.path.length_m:
-            return NO_BODIES
-        xyz, yaw = self.f.path.at(self.s, self.f.offset_m)
-        direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
-        return bodies_from(xyz[:2], yaw, [self.f.box], self.v * direction)
+    @property
+    def front_s(self) -> float:
+        return self.s + self.f.box.length_m / 2
 
-    def decide(self, others: Bodies) -> None:
-        front, half = self.s + self.f.box.length_m / 2, self.f.box.width_m / 2
+    def decide(self, moving: Leader) -> None:
         a = idm_acceleration(self.v, np.inf, 0.0, self.f.params)
-        for leader in (find_leader(self.f.path, front, half, others), nearest_ahead(self.standing, front, half)):
+        for leader in (moving, nearest_ahead(self.standing, self.front_s, self.f.box.width_m / 2)):
             if leader.index >= 0:
                 a = min(a, idm_acceleration(self.v, leader.gap_m, self.v - leader.speed_mps, self.f.params))
         self.a = a
@@ -195,19 +197,41 @@ class _Car:
         return track_on_path(self.f.path, times, np.array(self.log_s[: len(times)]), self.f.box, self.f.offset_m)
 
 
+def _bodies(cars: Sequence[_Car]) -> Bodies:
+    """Return where reactive cars are, in their order; cars on one line are placed together."""
+    if not cars:
+        return NO_BODIES
+    xy, yaw = np.empty((len(cars), 2)), np.empty(len(cars))
+    for path, rows in _by_path(cars):
+        xyz, yaw[rows] = path.at(np.array([cars[i].s for i in rows]), np.array([cars[i].f.offset_m for i in rows]))
+        xy[rows] = xyz[:, :2]
+    velocity = np.array([car.v for car in cars])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    return bodies_from(xy, yaw, [car.f.box for car in cars], velocity)
+
+
+def _by_path(cars: Sequence[_Car]) -> list[tuple[Path, list[int]]]:
+    """Group the indices of cars by the line that they drive on."""
+    groups: dict[int, tuple[Path, list[int]]] = {}
+    for i, car in enumerate(cars):
+        groups.setdefault(id(car.f.path), (car.f.path, []))[1].append(i)
+    return list(groups.values())
+
+
 def _predicted(table: ScriptedTracks, cars: Sequence[_Car], t_us: int) -> PredictedBodies:
     """Return scripted tracks as they are written, and reactive cars at their present speed on their own lines."""
     rows = table.rows(t_us)
     xy, yaw = [table.xy[rows]], [table.yaw[rows]]
     velocity, present = [table.velocity[rows]], [table.present[rows]]
-    for car in cars:
-        s = car.s + car.v * TIMES_S
-        xyz, heading = car.f.path.at(s, car.f.offset_m)
-        xy.append(xyz[:, None, :2])
-        yaw.append(heading[:, None])
-        velocity.append(car.v * np.stack([np.cos(heading), np.sin(heading)], axis=-1)[:, None])
-        present.append((s <= car.f.path.length_m)[:, None])
+    order = [i for _, rows_of in _by_path(cars) for i in rows_of]
+    for path, group in _by_path(cars):
+        v = np.array([cars[i].v for i in group])
+        s = np.array([cars[i].s for i in group]) + v * TIMES_S[:, None]  # (1 + n, K)
+        xyz, heading = path.at(s, np.array([cars[i].f.offset_m for i in group]))
+        xy.append(xyz[..., :2])
+        yaw.append(heading)
+        velocity.append(v[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1))
+        present.append(s <= path.length_m)
     return PredictedBodies(
         np.concatenate(xy, axis=1), np.concatenate(yaw, axis=1), np.concatenate(velocity, axis=1), np.concatenate(present, axis=1),
-        (*table.boxes, *(car.f.box for car in cars)), np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
+        (*table.boxes, *(cars[i].f.box for i in order)), np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
     )  # fmt: skip

@@ -17,6 +17,7 @@ from alpasim_plugin.config import Document, apply_overrides, load_yaml, validate
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts.source import own_code_digest
 from alpasim_plugin.parts.spec import digest
+from alpasim_plugin.reading import check_regular, exists, parsing
 from alpasim_plugin.types import (
     BackgroundFile,
     Behaviour,
@@ -30,6 +31,7 @@ from alpasim_plugin.types import (
     Vehicle,
 )  # fmt: skip
 from alpasim_plugin.world.ground import flat
+from scenarios.budget import check_record, check_scenario, check_specification
 from scenarios.build import build, last_us
 from scenarios.cameras import camera_spec
 from scenarios.library import shipped_names
@@ -75,6 +77,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     scenario = _from_log(document, spec, scene_id) if spec.log is not None else _from_road(document, spec, scene_id)
     if spec.seed != own_seed:
         scenario = replace(scenario, scene_id=f"{scenario.scene_id}-seed{spec.seed}")
+    check_scenario(scenario, document.path)
     return _timed(document, spec, scenario)
 
 
@@ -85,7 +88,7 @@ def find(path_or_name: str | Path) -> Path:
         InputError: Neither exists; the nearest shipped names are given.
     """
     path = Path(path_or_name)
-    if path.exists():
+    if exists(path):
         return path
     shipped = shipped_names()
     name = str(path_or_name).removesuffix(".yaml")
@@ -137,6 +140,7 @@ def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenari
     def fail(loc: tuple[str | int, ...], e: InputError) -> InputError:
         return InputError(e.doing, f"{document.mark(loc)} ({e.with_what})", e.found, e.do_this)
 
+    check_specification(spec, lambda loc, found, do_this: document.error(DOING, loc, found, do_this))
     built = build(spec, vehicle, fail)
     start = spec.timing.start_us
     cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else (camera_spec(),)
@@ -155,7 +159,9 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
     path = document.folder_of(("log", key)) / text if document.marks else Path(text)
     if not path.exists():
         raise document.error(DOING, ("log", key), f"{path} does not exist", "correct the path; it is relative to the scenario file")
-    record = read_log(kind, path, spec.log.ego)
+    with parsing(DOING, path, "repair this log, or use another one"):
+        record = read_log(kind, path, spec.log.ego)
+        check_record(record, str(path))
     behaviour = Behaviour("idm") if spec.log.actors == "idm" else Behaviour("replay")
     actors = () if spec.log.actors == "none" else tuple(
         a if a.is_static or behaviour.kind == "replay" else replace(a, behaviour=_idm(a)) for a in record.actors
@@ -264,7 +270,9 @@ def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: st
     digest = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
     if spec.background is not None:
         file = document.folder_of(("background", "file")) / spec.background.file
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
+        check_regular(file, DOING)
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
 
 

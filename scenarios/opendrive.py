@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.bounds import ASIDE_M
 from alpasim_plugin.geometry import transform_points
 from alpasim_plugin.geometry_lanes import densify, lane_polygon
 from alpasim_plugin.types import F64, Lane, LaneMap, Paint
@@ -21,7 +22,7 @@ from scenarios.road_edges import border_lines, merge_areas
 
 STEP_M = 0.5  # stations on bends and where widths change
 STRAIGHT_STEP_M = 2.0
-MAX_ASIDE_M = 1000.0  # no lane is farther beside its reference line
+MAX_ASIDE_M = ASIDE_M.high
 MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
 KINDS = {
     **dict.fromkeys(("driving", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane", "bidirectional"), "vehicle"),

@@ -9,10 +9,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.bounds import MAP_CURVATURE_PER_M, MAP_ROAD_M
 from scenarios.opendrive_geometry import KINDS, Cubic, Geometry
 from scenarios.reading import SourceFiles
 
-MAX_ROAD_M = 200_000.0  # a longer one is a broken number, not a road
+MAX_ROAD_M = MAP_ROAD_M.high
 _ABCD = ("a", "b", "c", "d")
 _PARAMETERS = {
     "line": (),
@@ -140,14 +141,21 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
         records = [Cubic(start_m + number(r, at), *(number(r, k, 0.0) for k in _ABCD)) for r in found]
         return tuple(sorted(records, key=lambda r: r.s_m))
 
+    road_m = number(element, "length")
+    MAP_ROAD_M.check(road_m, files.doing, here, "length")
+
     def geometry(record: Element) -> Geometry:
         shape = next((child for child in record if child.tag in KINDS), None)
         if shape is None:
             raise files.fail(here, f"a <geometry> of {[child.tag for child in record]}", f"use {', '.join(KINDS)}")
         numbers = tuple(number(shape, name) for name in _PARAMETERS[shape.tag])
         s, x, y, heading, length = (number(record, name) for name in ("s", "x", "y", "hdg", "length"))
-        if not 0 <= length <= MAX_ROAD_M:
-            raise files.fail(here, f"a <geometry> of {length} m", f"give 0 to {MAX_ROAD_M / 1000:.0f} km")
+        MAP_ROAD_M.check(length, files.doing, here, "length of a <geometry>")
+        if not -1.0 <= s <= road_m + 1.0:
+            raise files.fail(here, f"a <geometry> at s = {s:g} of a road of {road_m:g} m", "start every record on the road")
+        if shape.tag in ("arc", "spiral"):
+            for value in numbers:
+                MAP_CURVATURE_PER_M.check(value, files.doing, here)
         kind = next(k for k in KINDS if k == shape.tag)
         return Geometry(s, x, y, heading, length, kind, numbers, shape.get("pRange", "normalized") != "arcLength")
 
@@ -160,9 +168,7 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             None if mark is None else (mark.get("type", "none"), mark.get("color", "standard")),
         )  # fmt: skip
 
-    length = number(element, "length")
-    if not 0 <= length <= MAX_ROAD_M:
-        raise files.fail(here, f"a length of {length} m", f"give 0 to {MAX_ROAD_M / 1000:.0f} km")
+    length = road_m
     lanes = element.find("lanes")
     elements = sorted(lanes.findall("laneSection") if lanes is not None else [], key=lambda e: number(e, "s", 0.0))
     starts = [number(e, "s", 0.0) for e in elements]

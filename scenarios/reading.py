@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import tarfile
-import tokenize
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
+from alpasim_plugin import reading
+from alpasim_plugin.bounds import COORDINATE_M, MEMBERS, SOURCE_BYTES
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading.arrays import parse_npy
+from alpasim_plugin.reading.tables import Kind, check_columns
+from alpasim_plugin.reading.xml_files import parse_xml
 from alpasim_plugin.types import F64
 
-MAX_FILE_BYTES = 1 << 30  # refuse to load by mistake what is no scenario
-MAX_REACH_M = 10_000.0  # no recorded scene is wider; one broken coordinate must not ask for a ground grid of many gigabytes
+MAX_REACH_M = COORDINATE_M.high
 
 
 class SourceFiles:
@@ -74,15 +76,7 @@ class SourceFiles:
         Raises:
             InputError: It is missing, no file, empty, too large or unreadable.
         """
-        try:
-            size = path.stat().st_size
-            if size > MAX_FILE_BYTES:
-                raise self.fail(path, f"{size} bytes", f"give a file below {MAX_FILE_BYTES} bytes")
-            data = path.read_bytes()
-        except FileNotFoundError as error:
-            raise self.fail(path, "no such file", "check the path") from error
-        except OSError as error:
-            raise self.fail(path, f"it cannot be read: {error.strerror}", "check its type and permissions") from error
+        data = reading.read_bytes(path, self.doing, SOURCE_BYTES)
         if not data:
             raise self.fail(path, "an empty file", "fetch the file again")
         self.note_bytes(path.name, data)
@@ -99,56 +93,42 @@ class SourceFiles:
 
     def parse_json(self, data: bytes, where: Path | str) -> Any:
         """Parse a JSON document that came out of ``where``."""
-        try:
-            return json.loads(data)
-        except UnicodeDecodeError as error:
-            raise self.fail(where, f"bytes that are not UTF-8 at offset {error.start}", "fetch the file again") from error
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise self.fail(where, f"broken JSON: {error}", "fetch the file again; it may be truncated") from error
+        return reading.parse_json(data, where, self.doing, "fetch the file again; it may be truncated")
 
-    def read_feather(self, path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray[Any, Any]]:
+    def read_feather(self, path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray[Any, Any]]:
         """Read columns of a feather file (Arrow IPC).
 
         Raises:
-            InputError: The file is damaged or truncated, or lacks a column.
+            InputError: The file is damaged or truncated, lacks a column, or has one of another type or with empty values.
         """
-        data = self.read_bytes(path)
-        try:
+        data, do = self.read_bytes(path), "fetch the file again; it may be truncated"
+        with reading.parsing(self.doing, path, do, "no readable Arrow IPC file"):
             table = feather.read_table(pa.BufferReader(data))
             table.validate(full=True)
-            missing = [c for c in columns if c not in table.column_names]
-            if missing:
-                found = f"no column {missing[0]!r}, only {', '.join(table.column_names)}"
-                raise self.fail(path, found, "use a file of the Argoverse 2 sensor set")
-            return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
-        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise self.fail(path, f"no readable Arrow IPC file: {reason[:120]}", "fetch the file again; it may be truncated") from error
+        check_columns(table, columns, path, self.doing, "use a file of the Argoverse 2 sensor set")
+        nulls = next((name for name in columns if table.column(name).null_count), None)
+        if nulls is not None:
+            raise self.fail(path, f"column {nulls!r} with empty values", "repair or drop these rows")
+        return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
 
     def parse_npy(self, data: bytes, where: Path | str) -> np.ndarray[Any, Any]:
         """Parse a NumPy array without pickles."""
-        try:
-            array: np.ndarray[Any, Any] = np.load(io.BytesIO(data), allow_pickle=False)
-        except (ValueError, EOFError, OSError, SyntaxError, tokenize.TokenError, MemoryError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise self.fail(where, f"no readable NumPy array: {reason}", "fetch the file again; it may be truncated") from error
-        return array
+        return parse_npy(data, where, self.doing, "fetch the file again; it may be truncated")
 
     def read_tar(self, path: Path) -> dict[str, bytes]:
         """Read the regular files of an uncompressed tar, in memory, by member name."""
         data = self.read_bytes(path)
-        try:
-            with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
-                members: dict[str, bytes] = {}
-                for info in archive:
-                    handle = archive.extractfile(info) if info.isfile() else None
-                    if handle is not None:
-                        content = handle.read()
-                        if len(content) != info.size:
-                            raise tarfile.ReadError(f"member {info.name} has {len(content)} of {info.size} bytes")
-                        members[info.name] = content
-        except (tarfile.TarError, EOFError, OSError) as error:
-            raise self.fail(path, f"a damaged tar: {error}", "fetch the file again; it may be truncated") from error
+        damaged = reading.parsing(self.doing, path, "fetch the file again; it may be truncated", "a damaged tar")
+        members: dict[str, bytes] = {}
+        with damaged, tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
+            for info in archive:
+                MEMBERS.check(len(members), self.doing, path)
+                handle = archive.extractfile(info) if info.isfile() else None
+                if handle is not None:
+                    content = handle.read()
+                    if len(content) != info.size:
+                        raise tarfile.ReadError(f"member {info.name} has {len(content)} of {info.size} bytes")
+                    members[info.name] = content
         # A cut between two members leaves a readable tar: only the two empty blocks at its end show that it is complete.
         if any(data[-2 * tarfile.BLOCKSIZE :]):
             raise self.fail(path, "a damaged tar: no end-of-archive blocks", "fetch the file again; it may be truncated")
@@ -166,16 +146,4 @@ class SourceFiles:
 
     def parse_xml(self, data: bytes, path: Path | str) -> ElementTree.Element:
         """Parse an XML document that came out of ``path``; see `read_xml`."""
-
-        def refuse(*_: Any) -> None:
-            raise self.fail(path, "a DOCTYPE declaration", "remove it: entities are not accepted in scenario files")
-
-        scout = expat.ParserCreate()
-        scout.StartDoctypeDeclHandler = refuse
-        try:
-            scout.Parse(data, True)
-            return ElementTree.fromstring(data)
-        except (expat.ExpatError, ElementTree.ParseError) as error:
-            raise self.fail(path, f"malformed XML: {error}", "fetch the file again; it may be truncated") from error
-        except (ValueError, LookupError) as error:
-            raise self.fail(path, f"an unreadable text encoding: {error}", "save the file as UTF-8") from error
+        return parse_xml(data, path, self.doing)

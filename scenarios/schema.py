@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
+from alpasim_plugin import bounds as b
 from scenarios.schema_actors import ActorSpec
-from scenarios.schema_base import NonNegative, Part, Positive
+from scenarios.schema_base import BuildingHeight, Part, within
 from scenarios.schema_road import LogSpec, RoadSpec
 
 SCHEMA_FILE = Path(__file__).with_name("schema.json")
@@ -19,30 +20,38 @@ SCHEMA_FILE = Path(__file__).with_name("schema.json")
 class LaneChangeSpec(Part):
     """A lane change of the ego."""
 
-    at_m: NonNegative = Field(description="Start of the change, metres along the ego's path from where it starts.")
-    to_lane: int = Field(ge=0, description="Target forward lane; 0 is next to the centre line.")
-    length_m: Positive = Field(default=60.0, description="Length of the change along the road.")
+    at_m: Annotated[float, within(b.DISTANCE_M)] = Field(
+        description="Start of the change, metres along the ego's path from where it starts."
+    )
+    to_lane: Annotated[int, within(b.LANE_INDEX)] = Field(description="Target forward lane; 0 is next to the centre line.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(default=60.0, description="Length of the change along the road.")
 
 
 class EgoSpec(Part):
     """How the expert that writes the ego's log drives. It follows the road, keeps its distance and slows down for bends."""
 
-    lane: int = Field(default=0, ge=0, description="Forward lane at the start; 0 is next to the centre line.")
-    start_m: NonNegative = Field(default=20.0, description="Distance of the rear axle from the road's beginning at the log's start.")
-    speed_mps: NonNegative = Field(default=10.0, description="Speed at the log's start.")
-    cruise_mps: Positive = Field(default=10.0, description="Desired speed on a free straight.")
-    max_lateral_accel_mps2: Positive = Field(default=2.0, description="Limit that slows the expert in bends.")
-    headway_s: Positive = Field(default=1.5, description="Time gap to a leader.")
-    lane_changes: tuple[LaneChangeSpec, ...] = Field(default=(), description="Lane changes, in driving order.")
+    lane: Annotated[int, within(b.LANE_INDEX)] = Field(default=0, description="Forward lane at the start; 0 is next to the centre line.")
+    start_m: Annotated[float, within(b.DISTANCE_M)] = Field(
+        default=20.0, description="Distance of the rear axle from the road's beginning at the log's start."
+    )
+    speed_mps: Annotated[float, within(b.SPEED_MPS)] = Field(default=10.0, description="Speed at the log's start.")
+    cruise_mps: Annotated[float, within(b.CRUISE_MPS)] = Field(default=10.0, description="Desired speed on a free straight.")
+    max_lateral_accel_mps2: Annotated[float, within(b.ACCEL_MPS2)] = Field(default=2.0, description="Limit that slows the expert in bends.")
+    headway_s: Annotated[float, within(b.HEADWAY_S)] = Field(default=1.5, description="Time gap to a leader.")
+    lane_changes: tuple[LaneChangeSpec, ...] = Field(
+        default=(), max_length=int(b.ELEMENTS.high), description="Lane changes, in driving order."
+    )
 
 
 class EnvironmentSpec(Part):
     """Surroundings generated beside the road."""
 
     buildings: float = Field(default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
-    building_height_m: tuple[Positive, Positive] = Field(default=(6.0, 18.0), description="Least and greatest height of facades.")
-    trees_per_100m: NonNegative = Field(default=4.0, description="Trees per road side.")
-    poles_spacing_m: NonNegative = Field(default=30.0, description="Distance between lamp posts; 0: none.")
+    building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
+        default=(6.0, 18.0), description="Least and greatest height of facades."
+    )
+    trees_per_100m: Annotated[float, within(b.TREES_PER_100M)] = Field(default=4.0, description="Trees per road side.")
+    poles_spacing_m: float = Field(default=30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none.")
     sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
     texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
 
@@ -57,40 +66,47 @@ class CameraModel(Part):
     """A pinhole camera on the rig."""
 
     name: str = Field(default="front", min_length=1, description="Name that policies request.")
-    width: int = Field(default=256, ge=8, le=8192, description="Image width in pixels.")
-    height: int = Field(default=144, ge=8, le=8192, description="Image height in pixels.")
+    width: Annotated[int, within(b.IMAGE_SIDE_PX)] = Field(default=256, description="Image width in pixels.")
+    height: Annotated[int, within(b.IMAGE_SIDE_PX)] = Field(default=144, description="Image height in pixels.")
     hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
-    x_m: float = Field(default=1.6, description="Mount, metres ahead of the rear axle.")
-    y_m: float = Field(default=0.0, description="Mount, metres to the left.")
-    z_m: Positive = Field(default=1.5, description="Mount, metres above the ground.")
+    x_m: Annotated[float, within(b.MOUNT_M)] = Field(default=1.6, description="Mount, metres ahead of the rear axle.")
+    y_m: Annotated[float, within(b.MOUNT_M)] = Field(default=0.0, description="Mount, metres to the left.")
+    z_m: float = Field(default=1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground.")
     yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
     pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
-    shutter_us: int = Field(default=0, ge=0, description="Exposure from shutter start to shutter end.")
+    shutter_us: Annotated[int, within(b.SHUTTER_US)] = Field(default=0, description="Exposure from shutter start to shutter end.")
 
 
 class RatesSpec(Part):
     """Integer periods; camera and policy periods are whole multiples of the control period."""
 
-    control_us: int = Field(default=100_000, gt=0, description="Control period.")
-    camera_us: int = Field(default=100_000, gt=0, description="Camera period.")
-    policy_us: int = Field(default=100_000, gt=0, description="Policy period.")
+    control_us: Annotated[int, within(b.PERIOD_US)] = Field(default=100_000, description="Control period.")
+    camera_us: Annotated[int, within(b.PERIOD_US)] = Field(default=100_000, description="Camera period.")
+    policy_us: Annotated[int, within(b.PERIOD_US)] = Field(default=100_000, description="Policy period.")
 
 
 class TimingSpec(Part):
     """Which part of the log is driven."""
 
-    start_us: int = Field(default=500_000, ge=0, description="First frame, after the log's first pose; the log before it is context.")
-    duration_us: int | None = Field(
-        default=None, gt=0, description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log."
+    start_us: Annotated[int, within(b.TIME_US)] = Field(
+        default=500_000, description="First frame, after the log's first pose; the log before it is context."
     )
-    warmup_us: int = Field(default=500_000, ge=0, description="The log is forced for so long after the first frame.")
+    duration_us: int | None = Field(
+        default=None,
+        gt=0,
+        le=b.TIME_US.high,
+        description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log.",
+    )
+    warmup_us: Annotated[int, within(b.TIME_US)] = Field(
+        default=500_000, description="The log is forced for so long after the first frame."
+    )
 
 
 class LatencySpec(Part):
     """Delay from observation to the plan taking effect."""
 
     kind: Literal["none", "fixed", "measured"] = Field(default="none", description="No delay, a fixed one, or the measured one.")
-    fixed_us: int = Field(default=0, ge=0, description="Delay where kind is fixed.")
+    fixed_us: Annotated[int, within(b.TIME_US)] = Field(default=0, description="Delay where kind is fixed.")
 
 
 class DegradationSpec(Part):
@@ -105,9 +121,11 @@ class DegradationSpec(Part):
     views_per_s: float = Field(default=6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
     depth_error: float = Field(default=0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
     pose_error_m: float = Field(default=0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
-    severity: NonNegative = Field(default=1.5, description="Surrogate: scales all terms; 0 leaves the scene as built.")
-    onset_m: NonNegative = Field(default=0.1, description="Surrogate: distance from the logged path where the error starts to grow.")
-    full_m: Positive = Field(default=2.0, description="Surrogate: distance where it is full.")
+    severity: float = Field(default=1.5, ge=0, le=100, description="Surrogate: scales all terms; 0 leaves the scene as built.")
+    onset_m: Annotated[float, within(b.GAP_M)] = Field(
+        default=0.1, description="Surrogate: distance from the logged path where the error starts to grow."
+    )
+    full_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full.")
 
     @model_validator(mode="after")
     def _fitting(self) -> DegradationSpec:
@@ -141,15 +159,17 @@ class BackgroundSpec(Part):
 class VehicleSpec(Part):
     """The ego's body and chassis."""
 
-    length_m: Positive = Field(default=4.855, description="Body length.")
-    width_m: Positive = Field(default=1.88, description="Body width.")
-    height_m: Positive = Field(default=1.6, description="Body height.")
-    rear_axle_to_centre_m: float = Field(default=1.4, description="From the rear axle forwards to the body's middle.")
-    wheelbase_m: Positive = Field(default=2.85, description="Distance between the axles.")
-    max_steer_rad: Positive = Field(default=0.6, lt=1.5, description="Largest road-wheel angle.")
-    max_steer_rate_radps: Positive = Field(default=0.8, description="Largest steering rate.")
-    max_accel_mps2: Positive = Field(default=3.5, description="Largest acceleration.")
-    max_brake_mps2: Positive = Field(default=8.0, description="Largest deceleration.")
+    length_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=4.855, description="Body length.")
+    width_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=1.88, description="Body width.")
+    height_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=1.6, description="Body height.")
+    rear_axle_to_centre_m: Annotated[float, within(b.AXLE_M)] = Field(
+        default=1.4, description="From the rear axle forwards to the body's middle."
+    )
+    wheelbase_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=2.85, description="Distance between the axles.")
+    max_steer_rad: float = Field(default=0.6, ge=b.STEER_RAD.low, lt=b.STEER_RAD.high, description="Largest road-wheel angle.")
+    max_steer_rate_radps: Annotated[float, within(b.STEER_RATE_RADPS)] = Field(default=0.8, description="Largest steering rate.")
+    max_accel_mps2: Annotated[float, within(b.ACCEL_MPS2)] = Field(default=3.5, description="Largest acceleration.")
+    max_brake_mps2: Annotated[float, within(b.ACCEL_MPS2)] = Field(default=8.0, description="Largest deceleration.")
 
 
 class JitterSpec(Part):
@@ -160,7 +180,7 @@ class JitterSpec(Part):
     lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Relative change of the lane width.")
     speed: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
     position_m: float = Field(default=1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
-    time_us: int = Field(default=150_000, ge=0, description="Shift of scripted moments, each way.")
+    time_us: Annotated[int, within(b.TIME_US)] = Field(default=150_000, description="Shift of scripted moments, each way.")
 
 
 class RangeSpec(Part):
@@ -179,7 +199,7 @@ class RangeSpec(Part):
 class ChoiceSpec(Part):
     """One of several values, drawn with equal chance."""
 
-    choice: tuple[Any, ...] = Field(min_length=1, description="Values to choose from.")
+    choice: tuple[Any, ...] = Field(min_length=1, max_length=int(b.LISTED.high), description="Values to choose from.")
 
 
 class ScenarioSpec(Part):
@@ -187,18 +207,21 @@ class ScenarioSpec(Part):
 
     version: Literal[1] = Field(description="Version of this schema: 1.")
     scene_id: str | None = Field(
-        default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Name of the scene; none: the file's folder and name."
+        default=None,
+        max_length=100,
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$",
+        description="Name of the scene; none: the file's folder and name.",
     )
     description: str = Field(default="", description="One sentence.")
-    tags: tuple[str, ...] = Field(default=(), description="Keywords.")
-    seed: int = Field(default=0, ge=0, description="Scene seed: geometry, textures, scripted actors.")
+    tags: tuple[str, ...] = Field(default=(), max_length=int(b.LISTED.high), description="Keywords.")
+    seed: int = Field(default=0, ge=0, le=int(b.SEED.high), description="Scene seed: geometry, textures, scripted actors.")
     road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
     log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
     ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
-    actors: tuple[ActorSpec, ...] = Field(default=(), description="Other road users.")
+    actors: tuple[ActorSpec, ...] = Field(default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users.")
     environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
     cameras: tuple[CameraModel, ...] | None = Field(
-        default=None, min_length=1, description="Cameras; none: the log's own, or one named front."
+        default=None, min_length=1, max_length=int(b.CAMERAS.high), description="Cameras; none: the log's own, or one named front."
     )
     rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
     timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from scenarios.schema_base import Part, Positive
+from alpasim_plugin import bounds as b
+from scenarios.schema_base import Part, within
 
 Turn = Literal["left", "straight", "right"]
 CentrePaint = Literal["double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"]
@@ -16,38 +17,40 @@ class StraightSegment(Part):
     """A straight."""
 
     kind: Literal["straight"]
-    length_m: Positive = Field(description="Length.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(description="Length.")
 
 
 class ArcSegment(Part):
     """A circular bend."""
 
     kind: Literal["arc"]
-    length_m: Positive = Field(description="Length along the road's middle.")
-    curvature_per_m: float = Field(ge=-0.2, le=0.2, description="1 / radius; left is positive.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(description="Length along the road's middle.")
+    curvature_per_m: Annotated[float, within(b.CURVATURE_PER_M)] = Field(description="1 / radius; left is positive.")
 
 
 class ClothoidSegment(Part):
     """A transition whose curvature is linear in length."""
 
     kind: Literal["clothoid"]
-    length_m: Positive = Field(description="Length along the road's middle.")
-    start_curvature_per_m: float = Field(default=0.0, ge=-0.2, le=0.2, description="Curvature at the start; left is positive.")
-    end_curvature_per_m: float = Field(default=0.0, ge=-0.2, le=0.2, description="Curvature at the end.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(description="Length along the road's middle.")
+    start_curvature_per_m: Annotated[float, within(b.CURVATURE_PER_M)] = Field(
+        default=0.0, description="Curvature at the start; left is positive."
+    )
+    end_curvature_per_m: Annotated[float, within(b.CURVATURE_PER_M)] = Field(default=0.0, description="Curvature at the end.")
 
 
 class MergeSegment(Part):
     """A straight on which the rightmost forward lane ends."""
 
     kind: Literal["merge"]
-    length_m: Positive = Field(default=60.0, description="Length of the taper.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(default=60.0, description="Length of the taper.")
 
 
 class SplitSegment(Part):
     """A straight on which a new rightmost forward lane opens."""
 
     kind: Literal["split"]
-    length_m: Positive = Field(default=40.0, description="Length of the taper.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(default=40.0, description="Length of the taper.")
 
 
 class IntersectionSegment(Part):
@@ -57,7 +60,7 @@ class IntersectionSegment(Part):
     turn: Turn = Field(default="straight", description="Where the road goes on.")
     arms: tuple[Turn, ...] = Field(default=("left", "straight", "right"), min_length=1, description="Arms seen from the entry.")
     cross_lanes: int = Field(default=1, ge=1, le=4, description="Lanes per direction on the arms beside the road.")
-    arm_length_m: Positive = Field(default=40.0, description="Length of those arms.")
+    arm_length_m: float = Field(default=40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms.")
     corner_radius_m: float = Field(default=8.0, ge=3, le=40, description="Size of the kerb's corners.")
     crosswalks: bool = Field(default=True, description="Crosswalks on every arm.")
     guide_lines: bool = Field(default=True, description="Dashed lines through the junction along the road.")
@@ -67,7 +70,9 @@ class NarrowGapSegment(Part):
     """A straight on which parked cars on both sides leave a narrow gap for the ego."""
 
     kind: Literal["narrow_gap"]
-    length_m: Positive = Field(default=40.0, description="Length of the straight; the cars stand in its middle half.")
+    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(
+        default=40.0, description="Length of the straight; the cars stand in its middle half."
+    )
     gap_m: float = Field(default=3.0, gt=2.0, le=8, description="Free width between the rows of parked cars.")
     shift_m: float = Field(default=0.0, ge=-3, le=3, description="The gap's middle, metres left of the ego lane's middle.")
     cars_left: int = Field(default=2, ge=0, le=8, description="Parked cars on the left.")
@@ -99,10 +104,12 @@ class RoadSpec(Part):
     median_m: float = Field(default=0.0, ge=0, le=30, description="Raised median between the directions; 0: markings only.")
     shoulder_m: float = Field(default=0.5, ge=0, le=6, description="Paved strip outside the outer lanes.")
     parking_m: float = Field(default=0.0, ge=0, le=6, description="Parking strip outside the outer lanes, instead of the shoulder.")
-    speed_limit_mps: Positive | None = Field(default=None, description="Speed limit of all lanes.")
+    speed_limit_mps: Annotated[float | None, within(b.LIMIT_MPS)] = Field(default=None, description="Speed limit of all lanes.")
     centre_paint: CentrePaint = Field(default="double_yellow", description="Line between the directions.")
-    heading_deg: float = Field(default=0.0, ge=-360, le=360, description="Direction of the road's beginning, from east to the left.")
-    segments: tuple[SegmentSpec, ...] = Field(min_length=1, description="Segments in driving order.")
+    heading_deg: Annotated[float, within(b.ANGLE_DEG)] = Field(
+        default=0.0, description="Direction of the road's beginning, from east to the left."
+    )
+    segments: tuple[SegmentSpec, ...] = Field(min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order.")
 
 
 SHIPPED = ("argoverse", "commonroad", "cosmos", "usdz")

@@ -8,14 +8,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from alpasim_plugin.bounds import LISTED, SEED, SEEDS
 from alpasim_plugin.config import Document, load_yaml, validate
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import exists
 from scenarios.library import shipped_names, suites
-from scenarios.schema_base import Part
+from scenarios.schema_base import Part, within
 from scenarios.sources import source_of
 
 DOING = "reading a suite"
@@ -35,7 +37,9 @@ class SuiteItem(Part):
     """One entry of a suite."""
 
     path: str = Field(min_length=1, description="Scenario, suite or folder (relative to this file), or a shipped name.")
-    seeds: tuple[int, ...] = Field(default=(), description="Scene seeds; none: the file's own.")
+    seeds: tuple[Annotated[int, within(SEED)], ...] = Field(
+        default=(), max_length=int(SEEDS.high), description="Scene seeds; none: the file's own."
+    )
     set: dict[str, Any] = Field(default={}, description="Dotted key to value, as --set would.")
 
 
@@ -44,7 +48,9 @@ class SuiteSpec(Part):
 
     version: Literal[1] = Field(description="Version of this schema: 1.")
     description: str = Field(default="", description="One sentence for people.")
-    scenarios: tuple[str | SuiteItem, ...] = Field(min_length=1, description="Entries: a path or name, or {path, seeds, set}.")
+    scenarios: tuple[str | SuiteItem, ...] = Field(
+        min_length=1, max_length=int(LISTED.high), description="Entries: a path or name, or {path, seeds, set}."
+    )
 
 
 def load_suite(path_or_name: str | Path) -> list[ScenarioRef]:
@@ -99,7 +105,7 @@ def _locate(text: str, base: Path | None) -> Path:
     candidates = [Path(os.path.normpath(base / text))] if base is not None else []
     candidates.append(Path(text))
     for path in candidates:
-        if path.exists():
+        if exists(path):
             return path
     names = {**shipped_names(), **suites()}
     name = text.removesuffix(".yaml")

@@ -11,8 +11,8 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.types import F64, I64, Actor, Behaviour, Box, Trajectory, Vehicle
 from alpasim_plugin.world.idm import IdmParams
-from alpasim_plugin.world.path import Path
-from alpasim_plugin.world.roads import Road
+from alpasim_plugin.world.path import Path, polyline_path
+from alpasim_plugin.world.roads import Road, polyline
 from alpasim_plugin.world.scripted import (
     brake_rows,
     cut_in_track,
@@ -23,7 +23,7 @@ from alpasim_plugin.world.scripted import (
     track_on_path,
     walk_track,
 )  # fmt: skip
-from scenarios.ego_path import EgoPath, lane_path
+from scenarios.ego_path import EgoPath, lane_chain
 from scenarios.expert import Drive, ExpertStyle, Follower, drive
 from scenarios.lookahead import ScriptedTrack
 from scenarios.schema import ScenarioSpec
@@ -112,11 +112,15 @@ class _Placer:
     ego_path: EgoPath
     vehicle: Vehicle
     t_us: I64
+    lines: dict[tuple[str, ...], Path] = field(default_factory=dict)  # actors of one lane share its line
 
     def place(self, lane: int | str, s_m: float, actor_id: str) -> tuple[Path, float]:
         """Return a lane's line and the arc length on it abreast of the ego's line at ``s_m`` from the ego's start."""
         at = self.spec.ego.start_m + s_m
-        path = lane_path(self.road, self.ego_path, lane, at)
+        chain = lane_chain(self.road, self.ego_path, lane, at)
+        if chain not in self.lines:
+            self.lines[chain] = polyline_path(polyline(self.road.lane_map, chain))
+        path = self.lines[chain]
         if isinstance(lane, str):
             s = s_m
         else:

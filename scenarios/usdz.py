@@ -71,7 +71,7 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         vehicle, vehicle_notes = rig.vehicle()
         inside = [f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive]
     surface = [e for lane in road.lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None]
-    ground = from_points(np.concatenate([*surface, *road.lane_map.road_edges, rig.ego_log.xyz]), GROUND_CELL_M)
+    ground = from_points(np.concatenate([*surface, *road.lane_map.road_edges, rig.ego_log.xyz]), GROUND_CELL_M, rig.ego_log.xyz)
     notes = (
         f"{inside[0]} is a checkpoint of a closed renderer and is not read; the map is dressed instead" if inside
         else "no reconstruction in this scene; the map is dressed instead",

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import io
+import contextlib
 import zipfile
-import zlib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-import yaml
-
+from alpasim_plugin.bounds import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
+from alpasim_plugin.reading import parsing
+from alpasim_plugin.reading.files import open_regular
+from alpasim_plugin.reading.packed import check_names
+from alpasim_plugin.reading.tables import parse_parquet
+from alpasim_plugin.yaml_marks import parse
 from scenarios.reading import SourceFiles
-
-MAX_MEMBER_BYTES = 256 << 20  # the largest tables and tracks of public scenes are a few MiB
-MAX_MEMBERS = 100_000
 
 
 class Archive:
@@ -28,29 +26,21 @@ class Archive:
 
     def __init__(self, files: SourceFiles, path: Path) -> None:
         self.files, self.path = files, path
-        try:
-            self._zip = zipfile.ZipFile(path)
-            infos = self._zip.infolist()
-        except FileNotFoundError as error:
-            raise files.fail(path, "no such file", "check the path") from error
-        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-            raise files.fail(path, f"no readable ZIP: {error}", "fetch the file again; it may be truncated") from error
-        if len(infos) > MAX_MEMBERS:
-            raise files.fail(path, f"{len(infos)} members", f"give an archive of at most {MAX_MEMBERS}")
-        self._infos: dict[str, zipfile.ZipInfo] = {}
-        for info in infos:
-            parts = PurePosixPath(info.filename).parts
-            if info.filename.startswith("/") or "\\" in info.filename or ".." in parts or "\0" in info.filename:
-                raise files.fail(path, f"a member named {info.filename!r}, outside the archive", "do not use this file")
-            if info.filename in self._infos:
-                raise files.fail(path, f"member {info.filename!r} twice", "write the archive again")
-            self._infos[info.filename] = info
+        with contextlib.ExitStack() as opening:
+            stream = opening.enter_context(open_regular(path, files.doing, ARCHIVE_BYTES))
+            with parsing(files.doing, path, "fetch the file again; it may be truncated", "no readable ZIP"):
+                self._zip = zipfile.ZipFile(stream)
+                infos = self._zip.infolist()
+            check_names([info.filename for info in infos], path, files.doing)
+            self._open = opening.pop_all()
+        self._infos = {info.filename: info for info in infos}
 
     def __enter__(self) -> Archive:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         self._zip.close()
+        self._open.close()
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -70,15 +60,14 @@ class Archive:
         info = self._infos.get(member)
         if info is None:
             raise self.files.fail(where, "no such member", "give a complete AlpaSim scene")
-        if info.file_size > MAX_MEMBER_BYTES:
-            raise self.files.fail(where, f"{info.file_size} bytes", f"give a member below {MAX_MEMBER_BYTES} bytes")
-        try:
-            with self._zip.open(info) as stream:
-                data = stream.read(MAX_MEMBER_BYTES + 1)
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError) as error:
-            raise self.files.fail(where, f"it cannot be read: {error}", "fetch the file again; it may be damaged") from error
-        if len(data) > MAX_MEMBER_BYTES:
-            raise self.files.fail(where, f"more than {MAX_MEMBER_BYTES} bytes", "do not use this file")
+        most = int(SOURCE_BYTES.high)
+        if info.file_size > most:
+            raise self.files.fail(where, f"{info.file_size} bytes", f"give a member below {most} bytes")
+        do = "fetch the file again; it may be damaged"
+        with parsing(self.files.doing, where, do, "it cannot be read"), self._zip.open(info) as stream:
+            data = stream.read(most + 1)
+        if len(data) > most:
+            raise self.files.fail(where, f"more than {most} bytes", "do not use this file")
         self.files.note_bytes(member, data)
         return data
 
@@ -87,21 +76,17 @@ class Archive:
         return self.files.parse_json(self.read(member), f"{self.path}, {member}")
 
     def yaml(self, member: str) -> Any:
-        """Read a YAML member; only plain data is built."""
-        try:
-            return yaml.safe_load(self.read(member))
-        except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise self.files.fail(f"{self.path}, {member}", f"broken YAML: {reason}", "fetch the file again") from error
+        """Read a YAML member; only plain data is built, within the bounds of a configuration file."""
+        where, data = f"{self.path}, {member}", self.read(member)
+        YAML_BYTES.check(len(data), self.files.doing, where)
+        with parsing(self.files.doing, where, "fetch the file again", "broken YAML"):
+            text = data.decode("utf-8")
+        return parse(text, where, self.files.doing)[0]
 
     def table(self, member: str) -> list[dict[str, Any]]:
         """Read a parquet member as rows."""
-        data = self.read(member)
-        try:
-            table = pq.read_table(io.BytesIO(data))
-            table.validate(full=True)
+        where = f"{self.path}, {member}"
+        table = parse_parquet(self.read(member), where, self.files.doing, do_this="fetch the file again")
+        with parsing(self.files.doing, where, "fetch the file again", "no readable parquet"):
             rows: list[dict[str, Any]] = table.to_pylist()
-        except (pa.ArrowException, OSError, ValueError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise self.files.fail(f"{self.path}, {member}", f"no readable parquet: {reason[:120]}", "fetch the file again") from error
         return rows

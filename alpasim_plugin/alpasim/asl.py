@@ -19,10 +19,11 @@ from google.protobuf.message import DecodeError
 
 from alpasim_plugin.alpasim.wire import logging_pb2
 from alpasim_plugin.atomic import disk_error
+from alpasim_plugin.bounds import ENTRY_BYTES, LOG_BYTES
 from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.reading.files import open_regular
 
 _LENGTH = struct.Struct(">I")
-_MAX_ENTRY_BYTES = 1 << 30  # a video session request carries whole maps; a gigabyte is damage
 _COPY_AGAIN = "copy the log again from where it was written; nothing after this point can be trusted"
 
 
@@ -72,11 +73,7 @@ class AslReader:
             InputError: Missing or empty file, or damage before the last entry.
         """
         self.truncated = None
-        try:
-            stream = self.path.open("rb")
-        except OSError as error:
-            raise InputError("reading a rollout log", str(self.path), f"cannot open: {error.strerror}", "check the path") from error
-        with stream:
+        with open_regular(self.path, "reading a rollout log", LOG_BYTES) as stream:
             index = 0
             while (body := self._next(stream, index)) is not None:
                 yield self._parse(body, index, stream.tell() - len(body))
@@ -94,7 +91,7 @@ class AslReader:
             self.truncated = TruncatedTail(self.path, index, offset, None, 0)
             return None
         announced = _LENGTH.unpack(prefix)[0]
-        if announced == 0 or announced > _MAX_ENTRY_BYTES:
+        if announced == 0 or announced > ENTRY_BYTES.high:
             raise self._damaged(index, offset, f"a length of {announced} bytes")
         body = stream.read(announced)
         if len(body) == announced:

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
+from alpasim_plugin.bounds import SEED, SEEDS
 from alpasim_plugin.cli.progress import fixer_labels, make_progress
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.errors import InputError
@@ -24,7 +25,6 @@ from evaluators.report import fixer_lines, render_table
 from scenarios.suite import expand
 
 FIXER_PREFIX = "fixer."
-MAX_SEED = 2**63 - 1  # int64 in the tables
 
 EPILOG = """
 Examples:
@@ -137,9 +137,11 @@ def parse_seeds(text: str) -> list[int]:
         values = [int(part) for part in text.split(",") if part.strip()]
     except ValueError:
         values = []
-    if "," not in text and len(values) == 1 and 0 < values[0] <= MAX_SEED:
+    if "," not in text and len(values) == 1 and values[0] > 0:
+        SEEDS.check(values[0], "reading --seeds", f"--seeds {text}")
         return list(range(values[0]))
-    if "," in text and values and 0 <= min(values) <= max(values) <= MAX_SEED:
+    if "," in text and values and all(SEED.holds(value) for value in values):
+        SEEDS.check(len(values), "reading --seeds", "--seeds")
         return values
     found = "neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1"
     raise InputError("reading --seeds", f"--seeds {text}", found, "write a count such as 3, or a list such as 4,7")

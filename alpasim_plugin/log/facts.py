@@ -8,6 +8,7 @@ from pathlib import Path
 
 from alpasim_plugin.atomic import atomic_file
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import read_json_lines
 
 Fact = str | int | float | bool | None
 
@@ -35,18 +36,5 @@ def read_facts(path: Path | str) -> list[dict[str, Fact]]:
     Raises:
         InputError: Missing file, or a line that is no JSON object.
     """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError("reading facts of a rollout", str(path), f"cannot open: {error.strerror}", "check the path") from error
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = json.loads(line)
-        except ValueError as error:
-            raise InputError("reading facts of a rollout", f"{path}, line {number}", str(error), "run the rollout again") from error
-        if not isinstance(row, dict):
-            raise InputError("reading facts of a rollout", f"{path}, line {number}", f"{line[:60]!r}", "run the rollout again")
-        rows.append(row)
+    rows: list[dict[str, Fact]] = read_json_lines(path, "reading facts of a rollout", do_this="run the rollout again")
     return rows

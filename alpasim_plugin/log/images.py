@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import images
 from alpasim_plugin.types import U8
 
 ImageEncoding = Literal["png", "jpeg"]
@@ -38,9 +39,5 @@ def decode_image(data: bytes, what: str = "a camera image") -> U8:
     Raises:
         InputError: Not a whole image.
     """
-    bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
-    if bgr is None:
-        raise InputError(
-            "decoding a camera image", what, f"{len(data)} bytes beginning {data[:4]!r}", "store PNG or JPEG images in the log"
-        )
+    bgr = images.decode_image(data, what, "decoding a camera image", "store PNG or JPEG images in the log")
     return np.ascontiguousarray(bgr[..., ::-1])

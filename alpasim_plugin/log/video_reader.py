@@ -13,7 +13,9 @@ import av
 import numpy as np
 from av.video.reformatter import Interpolation
 
+from alpasim_plugin.bounds import ARCHIVE_BYTES
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import check_regular
 from alpasim_plugin.types import U8
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
@@ -73,6 +75,7 @@ class VideoReader:
 
     def __init__(self, path: Path | str, doing: str = "reading a video") -> None:
         self.path, self._doing = Path(path), doing
+        check_regular(self.path, doing, ARCHIVE_BYTES)
         try:
             self._container = av.open(str(self.path))
         except (OSError, av.FFmpegError) as error:

@@ -12,11 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from alpasim_plugin.bounds import WEIGHT_BYTES
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import check_regular, parsing
 
 StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")
@@ -43,8 +44,7 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     """
     path = Path(path)
     doing = "reading network weights"
-    if not path.is_file():
-        raise InputError(doing, str(path), "no such file", "give the path of a .safetensors file")
+    check_regular(path, doing, WEIGHT_BYTES)
     if sha256 is not None and (found := file_sha256(path)) != sha256.lower():
         do = "download the file again or correct the expected digest"
         raise InputError(doing, str(path), f"sha256 {found}, not {sha256.lower()}", do)
@@ -54,11 +54,9 @@ def load_weights(path: str | Path, dtype: torch.dtype | None = None, device: str
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path, device)
     else:
-        try:
+        what, do = f"not a complete safetensors file of {path.stat().st_size} bytes", "download or copy the file again"
+        with parsing(doing, path, f"{do}; it is truncated or of another format", what):
             content = load_file(path, device=device)
-        except (SafetensorError, ValueError) as error:
-            found = f"not a complete safetensors file of {path.stat().st_size} bytes: {error}"
-            raise InputError(doing, str(path), found, "download or copy the file again; it is truncated or of another format") from error
     tensors = unwrap(content, str(path))
     if dtype is None:
         return tensors
@@ -156,6 +154,6 @@ def _load_pickle(path: Path, device: str) -> object:
         reason = str(error).split("WeightsUnpickler error:")[-1].strip().split(". ")[0].split("\n")[0]
         found = f"a pickle that holds more than tensors ({reason}); loading it could run code"
         raise InputError("reading network weights", str(path), found, "save the tensors alone, best as safetensors") from error
-    except (RuntimeError, EOFError, OSError) as error:
-        found = f"a truncated or damaged torch file: {str(error).splitlines()[0]}"
+    except Exception as error:  # whatever the unpickler raises on damaged bytes
+        found = f"a truncated or damaged torch file: {(str(error).splitlines() or [type(error).__name__])[0]}"
         raise InputError("reading network weights", str(path), found, "download or copy the file again") from error

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.bounds import WEIGHT_BYTES
+from alpasim_plugin.reading import check_regular, parsing
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
@@ -16,10 +17,6 @@ def read_metadata(path: str | Path) -> dict[str, str]:
         InputError: No file, or anything but safetensors (a pickle, for example).
     """
     doing, do = "reading the header of a safetensors file", "give a whole .safetensors file"
-    if not Path(path).is_file():
-        raise InputError(doing, str(path), "no such file", do)
-    try:
-        with safe_open(path, framework="np") as file:
-            return dict(file.metadata() or {})
-    except (SafetensorError, ValueError) as error:
-        raise InputError(doing, str(path), f"not safetensors: {error}", do) from error
+    check_regular(path, doing, WEIGHT_BYTES)
+    with parsing(doing, path, do, "not safetensors"), safe_open(path, framework="np") as file:
+        return dict(file.metadata() or {})

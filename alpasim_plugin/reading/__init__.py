@@ -14,9 +14,10 @@ Light modules only are imported here; `arrays`, `images` and `tables` are import
 
 from __future__ import annotations
 
-from alpasim_plugin.reading.files import check_regular, parsing, read_bytes, read_text
+from alpasim_plugin.reading.files import check_regular, exists, parsing, read_bytes, read_text
 from alpasim_plugin.reading.json_files import parse_json, read_json, read_json_as, read_json_lines, read_json_object
 
 __all__ = [
-    "check_regular", "parse_json", "parsing", "read_bytes", "read_json", "read_json_as", "read_json_lines", "read_json_object", "read_text",
+    "check_regular", "exists", "parse_json", "parsing", "read_bytes", "read_json", "read_json_as", "read_json_lines", "read_json_object",
+    "read_text",
 ]  # fmt: skip

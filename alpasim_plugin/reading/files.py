@@ -57,6 +57,15 @@ def open_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_thi
             raise InputError(doing, str(path), f"it cannot be read: {error.strerror or error}", do_this or FETCH_AGAIN) from error
 
 
+def exists(path: Path | str) -> bool:
+    """Return whether something is at a path; a name that no file can have (too long, a null character) is at none."""
+    try:
+        os.stat(path)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def read_bytes(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> bytes:
     """Return a file's bytes; see `open_regular`.
 
@@ -90,7 +99,7 @@ def check_regular(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_th
 
 
 @contextmanager
-def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str = "") -> Iterator[None]:
+def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str = "it cannot be used") -> Iterator[None]:
     """Turn whatever a parser raises into the four-part error of the file that it parses.
 
     The original stays the cause, so ``--debug`` shows where it was raised.
@@ -99,7 +108,7 @@ def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str
         doing: First part.
         where: The file, or the member of a file.
         do_this: Last part.
-        what: What the file should be ("a parquet table"), for the third part.
+        what: What is wrong if anything is, for the third part: "no readable parquet".
 
     Raises:
         InputError: The block raised anything but a `SimrunError`.
@@ -110,5 +119,5 @@ def parsing(doing: str, where: Path | str, do_this: str = FETCH_AGAIN, what: str
         raise
     except Exception as error:
         lines = str(error).strip().splitlines()
-        reason = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-        raise InputError(doing, str(where), f"not {what}: {reason}" if what else f"it cannot be used: {reason}", do_this) from error
+        reason = lines[0] if lines and not isinstance(error, KeyError) else f"{type(error).__name__} {error}"
+        raise InputError(doing, str(where), f"{what}: {reason}", do_this) from error

@@ -32,7 +32,8 @@ def parse_json(data: bytes | str, where: Path | str, doing: str, do_this: str | 
         InputError: Not JSON, nested deeper than the bound, or a number that is not finite (JSON has no NaN).
     """
     do_this = do_this or FETCH_AGAIN
-    with parsing(doing, where, do_this, "JSON"):  # besides its own errors: UnicodeDecodeError, RecursionError, integers of 4300 digits
+    # Besides the parser's own errors: bytes that are not UTF-8, nesting beyond the stack, integers of more than 4300 digits.
+    with parsing(doing, where, do_this, "broken JSON"):
         value = json.loads(data)
     _check(value, where, doing, do_this)
     return value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +13,9 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.log.video_reader import VideoReader
+from alpasim_plugin.reading import parsing, read_json
+from alpasim_plugin.reading.arrays import open_npy
+from alpasim_plugin.reading.images import read_image
 from alpasim_plugin.training.pair_store import Pair, write_sequence
 from alpasim_plugin.types import F64, U8
 
@@ -86,17 +88,14 @@ def read_poses(path: Path, fps: float) -> tuple[F64, list[int]]:
     """
     if fps <= 0:
         raise InputError(DOING, "--fps", f"{fps}", "give a positive rate")
-    try:
+    with parsing(DOING, path, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame", "no poses"):
         if path.suffix == ".npy":
-            T, times = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64), None
+            T, times = np.asarray(open_npy(path, DOING), dtype=np.float64), None
         else:
-            rows = json.loads(path.read_text(encoding="utf-8"))
+            rows = read_json(path, DOING)
             with_times = bool(rows) and isinstance(rows[0], dict)
             T = np.array([r["T_world_camera"] if with_times else r for r in rows], dtype=np.float64)
             times = [int(r["t_us"]) for r in rows] if with_times and "t_us" in rows[0] else None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        found = f"{type(error).__name__}: {error}"
-        raise InputError(DOING, str(path), found, "give .npy (T, 4, 4), or JSON with a 4 x 4 matrix a frame") from error
     if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T):
         raise InputError(DOING, str(path), f"an array of shape {T.shape}", "give one 4 x 4 matrix a frame")
     off = np.abs(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -124,9 +123,7 @@ def read_frames(path: Path) -> Iterator[U8]:
         if not files:
             raise InputError(DOING, str(path), "a folder without images", f"put {', '.join(IMAGE_SUFFIXES)} there, named in order")
         for file in files:
-            image = cv2.imread(str(file), cv2.IMREAD_COLOR)
-            if image is None:
-                raise InputError(DOING, str(file), "not a readable image", "write it again")
+            image = read_image(file, DOING, "write it again as PNG or JPEG")
             yield np.ascontiguousarray(image[..., ::-1]).astype(np.uint8)
     elif path.suffix == ".npy":
         yield from _array_frames(path)
@@ -139,10 +136,7 @@ def read_frames(path: Path) -> Iterator[U8]:
 
 
 def _array_frames(path: Path) -> Iterator[U8]:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(DOING, str(path), str(error), "give a complete .npy array") from error
+    array = open_npy(path, DOING, "give a complete .npy array")
     if array.dtype != np.uint8 or array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in (1, 3)):
         raise InputError(DOING, str(path), f"{array.dtype} {array.shape}", "give uint8 (T, H, W) or (T, H, W, 3)")
     for image in array:

@@ -25,6 +25,8 @@ import numpy as np
 
 from alpasim_plugin.atomic import atomic_folder
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import read_json_object
+from alpasim_plugin.reading.arrays import open_npy
 from alpasim_plugin.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"
@@ -86,10 +88,7 @@ class PairSequence:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         path = folder / SEQUENCE_FILE
-        try:
-            self.info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(READING, str(path), str(error), "give a folder that 'simrun train pairs' finished") from error
+        self.info: dict[str, Any] = read_json_object(path, READING, do_this="give a folder that 'simrun train pairs' finished")
 
     @property
     def name(self) -> str:
@@ -109,10 +108,7 @@ class PairSequence:
     def _open(self, name: str) -> Any:
         path = self.folder / f"{name}.npy"
         axes, dtype = _FORMS[name]
-        try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(READING, str(path), str(error), "give a complete .npy file of this channel") from error
+        array = open_npy(path, READING, "give a complete .npy file of this channel")
         if array.ndim != axes or array.dtype != np.dtype(dtype):
             found = f"{array.dtype} with {array.ndim} axes"
             raise InputError(READING, str(path), found, f"give {dtype} with {axes} axes (docs/pairs.md)")

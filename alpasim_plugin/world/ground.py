@@ -9,6 +9,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, HeightField
 
 MAX_NODES = 30_000_000  # 240 MB of heights
+SIGHT_M = 400.0  # nothing farther from a drive is built or seen, so no ground is fitted there
 SLOPE_SPAN_M = 1.5  # half the length over which a pose's slope is taken: about half a wheelbase
 
 
@@ -17,7 +18,7 @@ def flat(z: float = 0.0) -> HeightField:
     return HeightField(0.0, 0.0, 1.0, np.full((2, 2), float(z)))
 
 
-def from_points(points: F64, cell_m: float = 2.0) -> HeightField:
+def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> HeightField:
     """Fit a height field to scattered ground points.
 
     Points are averaged per cell (position and height, so a plane stays a plane), the averages are joined by a Delaunay triangulation
@@ -26,6 +27,8 @@ def from_points(points: F64, cell_m: float = 2.0) -> HeightField:
     Args:
         points: ``(N, 3)`` metres, world; order does not matter.
         cell_m: Grid step in metres.
+        drive: ``(T, 3)`` positions of the ego; points more than `SIGHT_M` outside the rectangle around them are left out, so that a large
+            map costs no more than what is seen of it.
 
     Raises:
         InputError: There is no point, a coordinate is not finite, or the grid would have more than `MAX_NODES` nodes.
@@ -35,6 +38,9 @@ def from_points(points: F64, cell_m: float = 2.0) -> HeightField:
         bad = "no points" if len(xyz) == 0 else f"{int((~np.isfinite(xyz)).any(axis=1).sum())} points that are not finite"
         with_what = f"{len(xyz)} points, cell {cell_m} m"
         raise InputError("fitting a ground height field", with_what, bad, "give finite ground points and a cell > 0")
+    if drive is not None:
+        near = np.all((xyz[:, :2] >= drive[:, :2].min(axis=0) - SIGHT_M) & (xyz[:, :2] <= drive[:, :2].max(axis=0) + SIGHT_M), axis=1)
+        xyz = xyz[near] if near.any() else np.asarray(drive, dtype=np.float64)
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
     nx, ny = (int(n) + 2 for n in np.floor((xyz[:, :2].max(axis=0) - low) / cell_m))
     if nx * ny > MAX_NODES:

@@ -10,7 +10,9 @@ import scipy
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.types import F64
+from alpasim_plugin.types import F64, I64
+
+FEW_DISTANCES = 200_000  # above it, a tree over the stations is quicker than all distances, and takes no memory
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,7 @@ class Path:
             lo = max(0, int(np.searchsorted(self.s, window_m[0])) - 1)
             hi = min(len(self.s), int(np.searchsorted(self.s, window_m[1])) + 1)
             lo, hi = min(lo, len(self.s) - 2), max(hi, lo + 2)
-        points = self.xyz[lo:hi, :2]
-        delta = xy[:, None, :2] - points
-        i = lo + np.argmin(np.einsum("mnk,mnk->mn", delta, delta), axis=1)
+        i = lo + nearest(np.asarray(xy, dtype=np.float64)[:, :2], self.xyz[lo:hi, :2])
         rest = xy[:, :2] - self.xyz[i, :2]
         c, s = np.cos(self.yaw[i]), np.sin(self.yaw[i])
         along, across = c * rest[:, 0] + s * rest[:, 1], c * rest[:, 1] - s * rest[:, 0]
@@ -64,6 +64,23 @@ class Path:
         radial = 1.0 - k * across
         distance = (k * across * (2.0 - k * across) - (k * along) ** 2) / (k * (1.0 + np.hypot(k * along, radial)))
         return self.s[i] + np.arctan2(k * along, radial) / k, np.where(beyond, across, distance)
+
+
+def nearest(xy: F64, stations: F64) -> I64:
+    """Return for each of ``(M, 2)`` points the first of the nearest of ``(N, 2)`` stations.
+
+    All distances are compared where they are few; a tree finds them where they are many, and its answer is compared with the neighbours,
+    since of two equally near stations it may name either.
+    """
+    n = len(stations)
+    if len(xy) * n <= FEW_DISTANCES:
+        delta = xy[:, None] - stations
+        return np.asarray(np.argmin(np.einsum("mnk,mnk->mn", delta, delta), axis=1))
+    found = scipy.spatial.KDTree(stations).query(xy)[1]
+    around = np.clip(found[:, None] + np.array([-1, 0, 1]), 0, n - 1)
+    delta = xy[:, None] - stations[around]
+    best = np.argmin(np.einsum("mnk,mnk->mn", delta, delta), axis=1)
+    return np.asarray(np.take_along_axis(around, best[:, None], axis=1)[:, 0])
 
 
 def polyline_path(xyz: F64, doing: str = "building a path") -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,9 +9,12 @@ from typing import Any
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import read_json_object
+from alpasim_plugin.reading.json_files import as_shape, kind_of
 from evaluators.aggregate.rows import Row
 from evaluators.gate.rows import rows_of_run
 from evaluators.report.run_folder import Run
+from evaluators.report.shapes import BaselineRow, StoredBaseline
 
 SCHEMA_VERSION = 1
 DOING = "comparing with a stored baseline"
@@ -58,15 +60,17 @@ def read_baseline(path: Path) -> Baseline:
     Raises:
         InputError: Missing, not JSON, or not a baseline of this version.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(DOING, str(path), "no such file", "write one with simrun gate RUN --write-baseline FILE") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(DOING, str(path), f"not JSON: {error}", "restore the file or write it again") from error
+    content = read_json_object(path, DOING, do_this="write one with simrun gate RUN --write-baseline FILE")
     names = set(Baseline.__dataclass_fields__)
-    if not isinstance(content, dict) or set(content) != names or content["schema_version"] != SCHEMA_VERSION:
+    if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
         raise InputError(DOING, str(path), f"not a baseline of version {SCHEMA_VERSION}", "write it again with this version")
+    do = "restore the file or write it again"
+    as_shape(StoredBaseline, content, path, DOING, do)
+    for i, row in enumerate(content["rows"]):
+        as_shape(BaselineRow, row, f"{path}, row {i}", DOING, do)
+        odd = next((name for name, value in row.items() if f"{name}_valid" in row and not isinstance(value, float | int | None)), None)
+        if odd is not None:
+            raise InputError(DOING, f"{path}, row {i}", f"{odd}: {kind_of(row[odd])}, wanted a number", do)
     return Baseline(**content)
 
 

@@ -9,6 +9,10 @@ from pathlib import Path
 
 import cv2
 
+from alpasim_plugin.bounds import SOURCE_BYTES
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import read_bytes
+from alpasim_plugin.reading.images import decode_image
 from evaluators.report.numbers import fixed
 from evaluators.report.run_folder import Rollout, Run
 
@@ -117,10 +121,11 @@ def _start_us(run: Run, scene: str) -> int:
 
 def inline_jpeg(path: Path) -> tuple[str, int, int] | None:
     """Encode a picture as a ``data:`` address, smaller where it is large; None where it is not a readable picture."""
-    image = cv2.imread(str(path))
-    if image is None:
-        return None
-    data = path.read_bytes()
+    try:
+        data = read_bytes(path, "reading a picture of a run", SOURCE_BYTES)
+        image = decode_image(data, path, "reading a picture of a run")
+    except InputError:
+        return None  # the report says that the picture is absent
     height, width = image.shape[:2]
     if len(data) > MAX_BYTES or width > MAX_WIDTH:
         scale = min(1.0, MAX_WIDTH / width)

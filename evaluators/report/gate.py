@@ -7,10 +7,12 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from alpasim_plugin.atomic import write_text
+from alpasim_plugin.escape import markdown as escape
+from alpasim_plugin.escape import xml as clean
 from evaluators.gate.judge import Check, GateVerdict
-from evaluators.report.junit import clean, junit
+from evaluators.report.junit import junit
 from evaluators.report.run_folder import Run
-from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, escape, table
+from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, table
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "infrastructure": "error", "evaluator": "error"}
@@ -83,7 +85,7 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
         values = {key: check.entry[key] for key in ("diff", "ci95", "margin", "mean", "max", "min", "n_scenes") if key in check.entry}
         holder = ET.SubElement(case, "properties")
         for key, value in values.items():
-            ET.SubElement(holder, "property", {"name": key, "value": str(value)})
+            ET.SubElement(holder, "property", {"name": clean(key), "value": clean(str(value))})
         if check.cause == "pass":
             continue
         if check.cause == "undecided" and not check.binding:

@@ -5,14 +5,12 @@ A case is an ``error`` where its rollout could not be run or scored. Criteria (a
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from alpasim_plugin.atomic import write_text
+from alpasim_plugin.escape import xml as clean
 from evaluators.report.run_folder import Rollout, Run, read_run
-
-NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # characters that XML 1.0 cannot hold
 
 
 def write_junit(run_dir: Path | str) -> Path:
@@ -53,11 +51,6 @@ def junit(run: Run) -> ET.Element:
     for rollout in run.rollouts:
         _case(suite, rollout)
     return root
-
-
-def clean(text: str) -> str:
-    """Replace characters that no XML document can hold by U+FFFD."""
-    return NOT_XML.sub("\ufffd", text)
 
 
 def _suite_name(run: Run) -> str:

@@ -5,7 +5,6 @@ The report is a pure reader: it works on a folder that was copied from another m
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,11 +17,17 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
-import pyarrow.parquet as pq
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import parsing, read_json_as, read_json_object
+from alpasim_plugin.reading.tables import Kind, check_parquet, read_parquet
 from evaluators.metrics import declare_from
+from evaluators.report.shapes import RunInfo, Summary
 
+DOING = "reading a run folder"
+AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
+ROLLOUT_COLUMNS: dict[str, Kind] = {"renderer": "text", "policy": "text", "scene": "text", "seed": "integer", "status": "text"}
+STEP_COLUMNS: dict[str, Kind] = {**ROLLOUT_COLUMNS, "t_us": "integer", "metric": "text", "value": "number", "valid": "flag"}
+del STEP_COLUMNS["status"]
 KEY_COLUMNS = ("renderer", "policy", "scene", "seed")
 ROW_COLUMNS = (*KEY_COLUMNS, "status", "failure_class", "failure", "path", "wall_s", "frames", "steps")
 TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
@@ -163,7 +168,19 @@ class Run:
         keep = pc.field("metric").isin(list(metrics))
         if scenes is not None:
             keep = keep & pc.field("scene").isin(list(scenes))
-        return pads.dataset(path, format=TEXT_AS_CODES).to_table(columns=wanted, filter=keep)
+        self._check_steps(path)
+        with parsing(DOING, path, AGAIN, "no readable parquet"):
+            return pads.dataset(path, format=TEXT_AS_CODES).to_table(columns=wanted, filter=keep)
+
+    @cached_property
+    def _steps_checked(self) -> set[Path]:
+        return set()
+
+    def _check_steps(self, path: Path) -> None:
+        """Compare the table of steps with its columns, once."""
+        if path not in self._steps_checked:
+            check_parquet(path, DOING, STEP_COLUMNS, AGAIN)
+            self._steps_checked.add(path)
 
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
@@ -180,7 +197,9 @@ class Run:
         path = self.folder / "steps.parquet"
         if not path.is_file():
             return {}
-        table = pads.dataset(path).to_table(columns=["renderer", "metric", "reason"], filter=~pc.field("valid"))
+        self._check_steps(path)
+        with parsing(DOING, path, AGAIN, "no readable parquet"):
+            table = pads.dataset(path).to_table(columns=["renderer", "metric", "reason"], filter=~pc.field("valid"))
         if not table.num_rows:
             return {}
         counts = table.group_by(["renderer", "metric", "reason"]).aggregate([([], "count_all")]).sort_by("count_all")
@@ -232,21 +251,12 @@ def _coded(column: pa.ChunkedArray) -> tuple[npt.NDArray[np.int64], list[Any]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
+    """Read a JSON object of a run folder.
 
     Raises:
         InputError: Absent, not JSON, or not an object.
     """
-    doing = "reading a run folder"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(doing, str(path), "no such file", "give a folder written by simrun run or simrun score") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(doing, str(path), f"not JSON: {error}", "write the run again with the same command and --resume") from error
-    if not isinstance(content, dict):
-        raise InputError(doing, str(path), f"a {type(content).__name__}, not an object", "write the run again")
-    return content
+    return read_json_object(path, DOING, do_this=AGAIN)
 
 
 def read_run(run_dir: Path | str) -> Run:
@@ -259,24 +269,20 @@ def read_run(run_dir: Path | str) -> Run:
         InputError: A file is absent or unreadable, or ``rollouts.parquet`` lacks a key column.
     """
     folder = Path(run_dir)
-    info = read_json(folder / "run.json")
+    info: Mapping[str, Any] = read_json_as(RunInfo, folder / "run.json", DOING, do_this=AGAIN)
     declare_from(info)
-    summary = read_json(folder / "summary.json")
+    summary: Mapping[str, Any] = read_json_as(Summary, folder / "summary.json", DOING, do_this=AGAIN)
     rollouts, names = _read_rollouts(folder / "rollouts.parquet")
     return Run(folder, info, summary, rollouts, names)
 
 
 def _read_rollouts(path: Path) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
-    doing = "reading a run folder"
-    try:
-        table = pq.read_table(path)
-    except FileNotFoundError as error:
-        raise InputError(doing, str(path), "no such file", "finish the run: the same command with --resume writes it") from error
-    except pa.ArrowInvalid as error:
-        raise InputError(doing, str(path), f"not a parquet file: {error}", "finish the run: the same command with --resume") from error
-    lacking = [name for name in (*KEY_COLUMNS, "status") if name not in table.column_names]
-    if lacking:
-        raise InputError(doing, str(path), f"no column {', '.join(lacking)}", "write the run again with this version")
+    table = read_parquet(path, DOING, ROLLOUT_COLUMNS, AGAIN)
+    with parsing(DOING, path, AGAIN, "rows that are none of a run"):
+        return _rollouts_of(table)
+
+
+def _rollouts_of(table: pa.Table) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
     names = tuple(name.removesuffix("_valid") for name in table.column_names if name.endswith("_valid"))
     rows = []
     for row in table.to_pylist():

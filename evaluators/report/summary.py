@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from alpasim_plugin.atomic import write_text
+from alpasim_plugin.escape import markdown as escape
+from alpasim_plugin.escape import terminal
 from evaluators.report import tables
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows
@@ -70,7 +72,7 @@ def summary_md(run: Run) -> str:
         body = [[*_key(f.rollout), "; ".join(f"{label}: {text}" for label, text in f.parts)] for f in failures]
         parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
     command = provenance(run).command
-    parts.append(f"\n### Made with\n\n```\n{command.replace('```', '')}\n```\n")
+    parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")
     return "".join(parts)
 
 
@@ -78,13 +80,6 @@ def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     """Render a Markdown table."""
     lines = [head, ["---"] * len(head), *body]
     return "".join("| " + " | ".join(cell if i == 1 else escape(cell) for cell in line) + " |\n" for i, line in enumerate(lines))
-
-
-def escape(text: str) -> str:
-    """Make text safe in a Markdown table cell or line: no markup, no new line, no column."""
-    for char in "\\`*_[]<>|#~":
-        text = text.replace(char, "&lt;" if char == "<" else "&gt;" if char == ">" else f"\\{char}")
-    return " ".join(text.split())
 
 
 def cut(text: str, limit: int = MAX_BYTES) -> str:

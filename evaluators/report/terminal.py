@@ -9,6 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from alpasim_plugin.escape import terminal as escape
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.tables import metric_rows
 
@@ -32,14 +33,14 @@ def render_table(summary: Mapping[str, Any], headline_only: bool = False) -> Tab
     gaps = any("\u2014" in cell.text + cell.detail for row in rows for cell in row.cells)
     note = MARGIN_NOTE + (GAP_NOTE if gaps else "") if rows else None
     table = Table(box=box.SIMPLE_HEAD, caption=note, caption_justify="left", pad_edge=False)
-    table.add_column(Text(f"preset {summary.get('preset', '?')}", style="dim"), overflow="fold")
+    table.add_column(Text(escape(f"preset {summary.get('preset', '?')}"), style="dim"), overflow="fold")
     for variant, entries in (summary.get("metrics") or {}).items():
         counts = [(int(e.get("n_rollouts") or 0), int(e.get("n_scenes") or 0)) for e in entries.values()]
         n_rollouts, n_scenes = max(counts, default=(0, 0))
-        head = Text(variant, style="bold") + Text(f"\n{plural(n_rollouts, 'rollout')}\n{plural(n_scenes, 'scene')}", style="dim")
+        head = Text(escape(variant), style="bold") + Text(f"\n{plural(n_rollouts, 'rollout')}\n{plural(n_scenes, 'scene')}", style="dim")
         table.add_column(head, justify="right", overflow="fold")
     for row in rows:
-        label = Text(row.name, style="bold" if row.is_headline else "")
+        label = Text(escape(row.name), style="bold" if row.is_headline else "")
         facts = " ".join(part for part in (row.unit, row.arrow) if part)
         label.append(f" {facts}" if facts else "", style="not bold dim")
         table.add_row(label, *(_cell(cell) for cell in row.cells))

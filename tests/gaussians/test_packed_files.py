@@ -264,13 +264,13 @@ def test_fourth_degree_is_cut_and_counted(tmp_path: Path) -> None:
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_count_beyond_the_data_is_refused_without_unpacking_it(tmp_path: Path, version: int) -> None:
     path = write_spz(tmp_path / "a.spz", version, 2, 0, body_streams(version, 2, 0), claim=100_000_000)
-    with pytest.raises(InputError, match="100000000 Gaussians need"):
+    with pytest.raises(InputError, match="Gaussians of a file = 100,000,000, outside"):
         read_spz(path)
 
 
 def test_absurd_count_is_refused(tmp_path: Path) -> None:
     path = write_spz(tmp_path / "a.spz", 3, 2, 0, body_streams(3, 2, 0), claim=4_000_000_000)
-    with pytest.raises(InputError, match="4000000000 Gaussians of degree 0"):
+    with pytest.raises(InputError, match="Gaussians of a file = 4,000,000,000, outside"):
         read_spz(path)
 
 
@@ -309,5 +309,5 @@ def test_unknown_form_lists_the_known_ones(tmp_path: Path) -> None:
 
 
 def test_missing_file_says_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         read_gaussians(tmp_path / "absent.spz")

@@ -218,7 +218,7 @@ def test_colours_over_time_are_refused_not_misread(tmp_path: Path) -> None:
 
 
 def test_missing_file_says_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         read_ply(tmp_path / "absent.ply")
 
 
@@ -245,7 +245,7 @@ def test_wrong_magic_is_refused(tmp_path: Path) -> None:
 def test_absurd_count_is_refused_without_allocating(tmp_path: Path) -> None:
     header = "element vertex 99999999999999\n" + "".join(f"property float {n}\n" for n in NAMES)
     path = write_elements(tmp_path / "a.ply", (header, bytes(560)))
-    with pytest.raises(InputError, match="announces 99999999999999 rows of 56 bytes, the file ends after 10"):
+    with pytest.raises(InputError, match="element count = 99,999,999,999,999, outside"):
         read_ply(path)
 
 

@@ -145,8 +145,8 @@ def empty(folder: Path) -> Path:
         (cut_short, r"stops after frame \d+ of 40|damage after frame"),
         (damaged, "damage after frame"),
         (sound_only, "no video stream"),
-        (lambda folder: folder, "directory"),
-        (lambda folder: folder / "absent.mp4", "No such file"),
+        (lambda folder: folder, "a folder, not a file"),
+        (lambda folder: folder / "absent.mp4", "no such file"),
     ],
 )
 def test_broken_files_are_refused_with_what_was_found(tmp_path: Path, make: object, found: str) -> None:

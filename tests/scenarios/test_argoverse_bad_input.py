@@ -125,7 +125,7 @@ def without(document, layer, key=None):
         ([], "no object 'lane_segments'"),
         (vector_map() | {"lane_segments": {"1": lane(1, 0, 10, 0, lane_type="RIVER")}}, "lane type 'RIVER'"),
         (vector_map() | {"lane_segments": {"1": lane(1, 0, 10, 0, left_lane_boundary=line((0, 2)))}}, "boundary with 1 finite points"),
-        (vector_map() | {"lane_segments": {"1": lane(1, 0, float("nan"), 0)}}, "left_lane_boundary with 2 finite points"),
+        (vector_map() | {"lane_segments": {"1": lane(1, 0, float("nan"), 0)}}, "the number nan"),
     ],
 )
 def test_map_without_what_every_map_has(tmp_path, document, found):
@@ -159,7 +159,7 @@ def bad_poses(name, row, value):
         (bad_poses("qw", 3, 0.0), "a quaternion of length 0 in row 3"),
         (bad_poses("qw", 3, 2.0), "a quaternion of length 2 in row 3"),
         (bad_poses("tx_m", 4, np.nan), "positions that are not finite, first in row 4"),
-        (poses() | {"timestamp_ns": poses()["timestamp_ns"].astype(float)}, "timestamp_ns of type float64"),
+        (poses() | {"timestamp_ns": poses()["timestamp_ns"].astype(float)}, "column 'timestamp_ns' of double"),
         ({k: v for k, v in poses().items() if k != "qz"}, "no column 'qz'"),
     ],
 )

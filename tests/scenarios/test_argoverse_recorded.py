@@ -171,7 +171,7 @@ def test_real_calibration(shared_data):
     np.testing.assert_allclose(front.T_rig_camera[:3, 1], [0, 0, -1], atol=0.01)  # image down is world down
     assert front.T_rig_camera[2, 3] == pytest.approx(1.398 + 0.33, abs=1e-3)
     sweep = folder / "sensors" / "lidar" / "315966265259836000.feather"
-    assert len(SourceFiles("testing").read_feather(sweep, ("x",))["x"]) == 99229
+    assert len(SourceFiles("testing").read_feather(sweep, {"x": "number"})["x"]) == 99229
 
 
 def test_rotations_stay_rigid(real):

@@ -200,7 +200,7 @@ def test_poses_that_are_no_drive(tmp_path, matrices, found):
         ({"3d_road_boundaries": []}, "a map without road edges"),
         ({"3d_lanes": [label("1", polyline((0, 0, 0), (9, 0, 0)))]}, "1 edges"),
         ({"3d_lanes": [lane("1", 0, 50, 0), lane("1", 50, 90, 0)]}, "lane id 1 twice"),
-        ({"3d_lanes": [lane("1", 0, float("nan"), 0)]}, "a shape without finite vertices"),
+        ({"3d_lanes": [lane("1", 0, float("nan"), 0)]}, "the number nan"),
         ({"3d_lanes": [label("1", {"sphere3d": {}})]}, "no readable shape"),
         ({"3d_lanes": [{}]}, "no readable shape"),
         ({"3d_poles": 7}, "no list 'labels'"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,9 +110,9 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
             ),
             "kilometres apart",
         ),
-        (changed(metadata_dot_yaml=b"scene_id: [1"), "broken YAML"),
+        (changed(metadata_dot_yaml=b"scene_id: [1"), "not valid YAML"),
         (changed(metadata_dot_yaml=b"version: 1"), "scene_id None"),
-        (changed(metadata_dot_yaml=b"!!python/object/apply:os.system ['true']"), "broken YAML"),
+        (changed(metadata_dot_yaml=b"!!python/object/apply:os.system ['true']"), "the tag"),
         (changed(rig_trajectories_dot_json=b"{"), "broken JSON"),
         (changed(rig_trajectories_dot_json=json.dumps(rig() | {"rig_trajectories": []}).encode()), "0 rigs"),
         (changed(rig_trajectories_dot_json=json.dumps(rig(1)).encode()), "1 pose"),
@@ -150,7 +151,7 @@ def test_a_member_that_stands_twice_is_refused(tmp_path: Path) -> None:
 def test_a_member_that_swells_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "a.usdz", changed(rig_trajectories_dot_json=b" " * 300_000))
     assert path.stat().st_size < 20_000
-    monkeypatch.setattr(usdz_archive, "MAX_MEMBER_BYTES", 100_000)
+    monkeypatch.setattr(usdz_archive, "SOURCE_BYTES", replace(usdz_archive.SOURCE_BYTES, high=100_000))
     with pytest.raises(InputError, match="300000 bytes"):
         read_usdz(path)
     data = bytearray(path.read_bytes())

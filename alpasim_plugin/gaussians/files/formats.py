@@ -12,7 +12,9 @@ from alpasim_plugin.gaussians.files.ply import read_ply_arrays
 from alpasim_plugin.gaussians.files.ply_header import read_ply_header
 from alpasim_plugin.gaussians.files.splat import read_splat
 from alpasim_plugin.gaussians.files.spz import read_spz
+from alpasim_plugin.reading.files import open_regular, parsing
 
+DOING = "reading a Gaussian model"
 SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz")
 
 
@@ -35,7 +37,8 @@ def read_gaussians(path: Path | str, element: str | None = None) -> tuple[Gaussi
     Example:
         >>> cloud, report = read_gaussians("garden.spz")  # doctest: +SKIP
     """
-    return build_cloud(_read_arrays(Path(path), element))
+    with parsing(DOING, path):
+        return build_cloud(_read_arrays(Path(path), element))
 
 
 def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
@@ -56,10 +59,5 @@ def _read_arrays(path: Path, element: str | None) -> GaussianArrays:
 
 
 def _first_bytes(path: Path) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            return stream.read(4)
-    except OSError as error:
-        raise InputError(
-            "reading a Gaussian model", str(path), f"cannot open: {error.strerror}", "check the path and its permissions"
-        ) from error
+    with open_regular(path, DOING) as stream:
+        return stream.read(4)

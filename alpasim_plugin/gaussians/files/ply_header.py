@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from alpasim_plugin.bounds import GAUSSIANS
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading.files import open_regular
 
 _MAX_HEADER_BYTES = 1 << 20
+MAX_PROPERTIES = 512  # the highest degree of colour takes 62
 _SCALAR_CODES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -134,11 +137,8 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
 
 def _header_lines(path: Path) -> tuple[list[str], int]:
     """Return the header's lines and the byte position after it."""
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(_MAX_HEADER_BYTES)
-    except OSError as error:
-        raise InputError("reading a PLY file", str(path), f"cannot open: {error.strerror}", "check the path and its permissions") from error
+    with open_regular(path, "reading a PLY file") as stream:
+        head = stream.read(_MAX_HEADER_BYTES)
     if head[:3] != b"ply" or head[3:4] not in (b"\n", b"\r"):
         raise InputError("reading a PLY file", str(path), f"first bytes {head[:4]!r}, expected b'ply'", "give a PLY file")
     marker = head.find(b"\nend_header")
@@ -160,9 +160,11 @@ def _byte_order(path: Path, word: str) -> str:
 
 
 def _count(path: Path, number: int, word: str) -> int:
-    if not word.isdigit():
+    if not (word.isascii() and word.isdigit()):
         raise InputError("reading a PLY header", f"{path}, line {number}", f"element count {word!r}, not a whole number", _EXPORT_AGAIN)
-    return int(word)
+    count = int(word) if len(word) <= 20 else 10**20
+    GAUSSIANS.check(count, "reading a PLY header", f"{path}, line {number}", "element count")
+    return count
 
 
 def _with_property(
@@ -176,7 +178,7 @@ def _with_property(
     name, count, fields = element
     if words[1] == "list" or fields is None:
         return name, count, None
-    if words[1] not in _SCALAR_CODES or not byte_order or any(words[2] == known for known, _ in fields):
+    if len(fields) >= MAX_PROPERTIES or words[1] not in _SCALAR_CODES or not byte_order or any(words[2] == known for known, _ in fields):
         raise _bad_line(path, number, " ".join(words))
     return name, count, [*fields, (words[2], byte_order + _SCALAR_CODES[words[1]])]
 

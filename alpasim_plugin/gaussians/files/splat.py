@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.atomic import atomic_file
+from alpasim_plugin.bounds import GAUSSIANS
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.arrays import SH_C0, GaussianArrays
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.reading import read_bytes
 
 _ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)],
@@ -23,12 +25,7 @@ def read_splat(path: Path | str) -> GaussianArrays:
         InputError: Missing or empty file, or a size that is not a multiple of 32 bytes.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            "reading a .splat file", str(path), f"cannot open: {error.strerror}", "check the path and its permissions"
-        ) from error
+    data = read_bytes(path, "reading a .splat file")
     if not data or len(data) % _ROW.itemsize:
         raise InputError(
             "reading a .splat file",
@@ -36,6 +33,7 @@ def read_splat(path: Path | str) -> GaussianArrays:
             f"{len(data)} bytes, not a whole number of {_ROW.itemsize}-byte rows",
             "copy or export the file again; it has no header, so a cut file shows only in its size",
         )
+    GAUSSIANS.check(len(data) // _ROW.itemsize, "reading a .splat file", path)
     rows = np.frombuffer(data, dtype=_ROW)
     rgba = rows["rgba"].astype(np.float64) / 255.0
     return GaussianArrays(

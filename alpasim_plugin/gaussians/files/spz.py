@@ -13,15 +13,17 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
+from alpasim_plugin.bounds import GAUSSIANS
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.arrays import GaussianArrays
+from alpasim_plugin.reading import read_bytes
+from alpasim_plugin.reading.packed import unzstd
 
 MAGIC = 0x5053474E  # "NGSP" in file order
 _GZIP = b"\x1f\x8b"
-_MAX_POINTS = 1 << 28  # 268 million: far above any trained scene, far below what a damaged header can claim
+DOING = "reading an SPZ file"
 _COLOUR_SCALE = 0.15
 _EXPORT_AGAIN = "copy or export the file again"
 Axes = Literal["rdf", "rub"]
@@ -58,10 +60,7 @@ def read_spz(path: Path | str, axes: Axes = "rdf") -> GaussianArrays:
         InputError: Missing or truncated file, wrong magic, unknown version, or sizes that do not fit the count.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise _failure(path, f"cannot open: {error.strerror}", "check the path and its permissions") from error
+    data = read_bytes(path, DOING)
     if data[:2] == _GZIP:
         data = _gunzip(path, data)
     header = _parse_header(path, data)
@@ -139,7 +138,8 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
         raise _failure(path, f"magic {data[:4]!r}, expected b'NGSP'", "give an SPZ file")
     if version not in (2, 3, 4):
         raise _failure(path, f"version {version}; versions 2, 3 and 4 are known", "export the file as version 3 or 4")
-    if count > _MAX_POINTS or degree > 4 or bits > 24:
+    GAUSSIANS.check(count, DOING, path)
+    if degree > 4 or bits > 24:
         raise _failure(path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN)
     return SpzHeader(version, count, degree, bits, flags)
 
@@ -181,15 +181,8 @@ def _zstd_streams(path: Path, data: bytes, header: SpzHeader) -> list[NDArray[np
 
 
 def _unzstd(path: Path, index: int, packed: bytes, need: int) -> NDArray[np.uint8]:
-    try:
-        # One byte more than needed is asked for, so that an over-long stream shows without being unpacked whole.
-        body = zstandard.ZstdDecompressor().stream_reader(packed).read(need + 1) if need else b""
-    except zstandard.ZstdError as error:
-        raise _failure(path, f"stream {index} is damaged ({error})", _EXPORT_AGAIN) from error
-    if len(body) != need:
-        raise _failure(path, f"stream {index} unpacks to {len(body)} bytes, {need} are needed", _EXPORT_AGAIN)
-    return np.frombuffer(body, dtype=np.uint8)
+    return np.frombuffer(unzstd(packed, need, f"{path}, stream {index}", DOING, _EXPORT_AGAIN), dtype=np.uint8)
 
 
 def _failure(path: Path, found: str, do_this: str) -> InputError:
-    return InputError("reading an SPZ file", str(path), found, do_this)
+    return InputError(DOING, str(path), found, do_this)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from typing_extensions import TypedDict
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
@@ -19,8 +19,17 @@ from alpasim_plugin.gaussians.scene.builder import with_background
 from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.reading import read_json_as
+from alpasim_plugin.reading.images import read_image
 
+DOING = "reading a reconstruction"
 INDEX_FILE, BACKGROUND_FILE, SKY_FILE = "reconstruction.json", "background.ply", "sky.png"
+
+
+class _Index(TypedDict):
+    """What is relied on in `INDEX_FILE`."""
+
+    actors: dict[str, str]  # actor id -> its file
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +78,11 @@ class Reconstruction:
         path = folder / INDEX_FILE
         if not path.exists():
             do = "make it with 'simrun train splat SCENARIO --out FOLDER'"
-            raise InputError("reading a reconstruction", str(folder), f"no {INDEX_FILE}", do)
-        files = json.loads(path.read_text(encoding="utf-8"))["actors"]
-        image = cv2.imread(str(folder / SKY_FILE), cv2.IMREAD_COLOR)
-        if image is None or image.shape != (HEIGHT, WIDTH, 3):
-            found = "no readable image" if image is None else f"an image of shape {image.shape}"
-            raise InputError("reading a reconstruction", str(folder / SKY_FILE), found, f"give {WIDTH} x {HEIGHT} pixels, or make it again")
+            raise InputError(DOING, str(folder), f"no {INDEX_FILE}", do)
+        files = read_json_as(_Index, path, DOING)["actors"]
+        image = read_image(folder / SKY_FILE, DOING)
+        if image.shape != (HEIGHT, WIDTH, 3):
+            found = f"an image of shape {image.shape}"
+            raise InputError(DOING, str(folder / SKY_FILE), found, f"give {WIDTH} x {HEIGHT} pixels, or make it again")
         actors = {name: read_ply(folder / file) for name, file in files.items()}
         return cls(read_ply(folder / BACKGROUND_FILE), actors, Sky(image[..., ::-1].astype(np.float32) / 255))

@@ -16,7 +16,6 @@ from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.atomic import write_json
+from alpasim_plugin.bounds import SOURCE_BYTES
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -32,6 +32,9 @@ from alpasim_plugin.gaussians.files.ply_header import read_ply_element, read_ply
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.geometry import inverse
+from alpasim_plugin.reading import read_bytes, read_json_object
+from alpasim_plugin.reading.images import decode_image
+from alpasim_plugin.reading.json_files import as_shape
 from alpasim_plugin.types import F64, Bool
 
 FILE = "transforms.json"
@@ -56,15 +59,12 @@ def read_views(folder: Path, actors_at: ActorsAt | None = None) -> tuple[list[Po
         InputError: A file or key is missing, or something in them cannot be: names the frame and what was found.
     """
     path = folder / FILE
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(DOING, str(path), str(error), f"give a folder with a readable {FILE} (docs/reconstruction.md)") from error
+    document = read_json_object(path, DOING, do_this=f"give a folder with a readable {FILE} (docs/reconstruction.md)")
     axes = document.get("axes")
-    if axes not in AXES:
+    if not isinstance(axes, str) or axes not in AXES:
         do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)'
         raise InputError(DOING, f"{path}, key 'axes'", repr(axes), do)
-    frames = document.get("frames") or []
+    frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'", DOING)
     if not frames:
         raise InputError(DOING, str(path), "no frames", "list at least one frame")
     views = [_view(folder, {**document, **frame}, f"{path}, frame {i}", AXES[axes], actors_at) for i, frame in enumerate(frames)]
@@ -118,7 +118,7 @@ def _view(folder: Path, frame: Mapping[str, Any], where: str, axes: F64, actors_
         K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], dtype=np.float64)
         T_world_camera = np.array(frame["transform_matrix"], dtype=np.float64) @ axes
         file = folder / frame["file_path"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(DOING, where, f"{type(error).__name__}: {error}", "see docs/reconstruction.md for the keys of a frame") from error
     rgb = _read_image(file, where, cv2.IMREAD_COLOR)[..., ::-1]
     camera = PinholeCamera.from_pose(width, height, K, T_world_camera)
@@ -132,9 +132,8 @@ def _flags(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Bool
 
 
 def _read_image(path: Path, where: str, flag: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    image = cv2.imread(str(path), flag)
-    if image is None:
-        raise InputError(DOING, f"{where}, {path}", "no readable image", "check the path, which is relative to the folder, and the file")
+    do = "check the path, which is relative to the folder, and the file"
+    image = decode_image(read_bytes(path, DOING, SOURCE_BYTES, do), f"{where}, {path}", DOING, do, flag)
     return np.asarray(image, dtype=np.uint8)
 
 

@@ -1,0 +1,125 @@
+"""Shapes of the JSON files of a run folder, as far as reports and gates rely on them; members that are not named may be anything.
+
+`alpasim_plugin.reading.read_json_as` compares a file with one of these before any of it is used.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from typing_extensions import TypedDict
+
+Number = float | None
+
+
+class SceneFacts(TypedDict, total=False):
+    """One scene of ``run.json``."""
+
+    source: str
+    content_hash: str
+    notes: list[str]
+    ref: dict[str, Any]
+
+
+class RunInfo(TypedDict, total=False):
+    """``run.json``."""
+
+    key: str
+    command: list[str]
+    version: str
+    started_at: str
+    preset: str
+    suite: str | None
+    config: dict[str, Any]
+    scenes: dict[str, SceneFacts]
+    renderers: list[str]
+    policies: list[str]
+    seeds: list[int]
+    hardware: dict[str, Any]
+    versions: dict[str, str | None]
+    weights: dict[str, Any]
+    left_out: list[str]
+    metrics: dict[str, Any]
+
+
+class Mean(TypedDict, total=False):
+    """A metric of a renderer over rollouts."""
+
+    mean: Number
+    ci95: Number
+    ci95_clustered: list[Number] | None
+    n_rollouts: int
+    n_scenes: int
+    unit: str
+    direction: str
+
+
+class Difference(TypedDict, total=False):
+    """A paired difference of a renderer from the baseline."""
+
+    baseline: str
+    diff: Number
+    ci95: list[Number] | None
+    p_value: Number
+    verdict: str | None
+    n_cells: int
+    n_scenes: int
+
+
+class Invalid(TypedDict, total=False):
+    """Why values of a metric are not valid."""
+
+    reasons: dict[str, int]
+
+
+class Censoring(TypedDict, total=False):
+    """What is not in a renderer's numbers."""
+
+    rollouts: int
+    failed: dict[str, Any]
+    dropped: dict[str, Any]
+    invalid: dict[str, Invalid]
+
+
+class Failures(TypedDict, total=False):
+    """Rollouts that did not run to their end."""
+
+    n_failed: int
+    n_rollouts: int
+    by_class: dict[str, int]
+    cells: list[dict[str, Any]]
+
+
+class Summary(TypedDict, total=False):
+    """``summary.json``."""
+
+    preset: str
+    metrics: dict[str, dict[str, Mean]]
+    paired: dict[str, dict[str, Difference]]
+    censoring: dict[str, Censoring]
+    failures: Failures
+    speed: dict[str, dict[str, Any]]
+    determinism: dict[str, Any] | None
+    pool: dict[str, Any]
+    fixers: dict[str, dict[str, Any]]
+
+
+class StoredBaseline(TypedDict):
+    """A stored baseline of the gate."""
+
+    preset: str
+    scenes: dict[str, str]
+    weights: dict[str, Any]
+    rows: list[dict[str, Any]]
+    made_with: dict[str, Any]
+    schema_version: int
+
+
+class BaselineRow(TypedDict):
+    """The key and fate of a row of a stored baseline; its metrics are numbers or null, with flags NAME_valid."""
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+    status: str
