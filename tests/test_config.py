@@ -118,7 +118,7 @@ def test_deep_nesting_is_stopped(tmp_path: Path) -> None:
 def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_yaml(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="directory"):
+    with pytest.raises(InputError, match="a folder, not a file"):
         load_yaml(tmp_path)
     (tmp_path / "b.yaml").write_bytes(b"a: \xff\xfe\n")
     with pytest.raises(InputError, match="byte 3 is not UTF-8"):

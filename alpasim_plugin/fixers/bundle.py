@@ -21,8 +21,7 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
-from alpasim_plugin.reading import parse_json
-from alpasim_plugin.reading.json_files import as_shape
+from alpasim_plugin.reading.json_files import kind_of, parse_json
 
 BundleSettings = OneFixerSettings | PixelFixerSettings
 FORMAT = "simrun-fixer-1"
@@ -90,7 +89,7 @@ def save_bundle(
     Raises:
         InputError: A part that is not known, or one that is missing.
     """
-    kind = kind_of(settings)
+    kind = bundle_kind(settings)
     problems = KINDS[kind].problems(parts)
     if problems:
         do = f"give {', '.join(sorted(KINDS[kind].needed))}, and nothing else but {', '.join(sorted(KINDS[kind].optional)) or 'these'}"
@@ -101,7 +100,7 @@ def save_bundle(
     write_safetensors(path, tensors, header)
 
 
-def kind_of(settings: BundleSettings) -> str:
+def bundle_kind(settings: BundleSettings) -> str:
     """Return the kind of bundle that a fixer's settings take."""
     return "per-frame" if isinstance(settings, PixelFixerSettings) else "block"
 
@@ -113,7 +112,7 @@ def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
     header, trained_with = _header(path)
-    name = kind_of(settings)
+    name = bundle_kind(settings)
     found_kind = header.get("kind", OLDEST_KIND)
     if found_kind != name:
         do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
@@ -141,7 +140,9 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
         InputError: Not a bundle.
     """
     _, trained_with = _header(path)
-    name = as_shape(str, trained_with.pop("name"), f"{path}, name in its settings", DOING)
+    name = trained_with.pop("name")
+    if not isinstance(name, str):
+        raise InputError(DOING, f"{path}, settings in its header", f"name: {kind_of(name)}", "give a file that save_bundle wrote")
     return RENAMED.get(name, name), (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
 
 
