@@ -13,7 +13,7 @@ MAX_PART = 300  # characters of one part of an error
 _CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]|[\ud800-\udfff]")
 # What XML 1.0 has no way to write (section 2.2, production Char).
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_MARKDOWN = re.compile(r"([\\`*\[\]<>|~#!]|(?<![^\W_])_|_(?![^\W_]))")  # an underscore inside a word means nothing
+_MARKDOWN = re.compile(r"([\\`*\[\]|~#!]|(?<![^\W_])_|_(?![^\W_]))")  # an underscore inside a word means nothing
 
 
 def shorten(text: str, most: int = MAX_PART) -> str:
@@ -45,9 +45,10 @@ def markdown(text: str) -> str:
 
     Example:
         >>> markdown("a|b <i>")
-        'a\\|b \\<i\\>'
+        'a\\|b &lt;i&gt;'
     """
-    return _MARKDOWN.sub(r"\\\1", terminal(text)).replace("&", "&amp;")
+    plain = terminal(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return _MARKDOWN.sub(r"\\\1", " ".join(plain.split()))
 
 
 def xml(text: str) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.alpasim.asl import AslReader
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.log.facts import Fact
 from alpasim_plugin.log.schema import EGO
 
@@ -72,7 +73,11 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]] = ()) -> dict[str,
             parts["plans"][asked_us, "plan"] = sha256(entry.driver_return.SerializeToString())
     for fact in facts:
         text = json.dumps({name: value for name, value in fact.items() if not name.endswith("_ms")}, sort_keys=True)
-        parts["frames"][int(fact["t_us"] or 0), f"camera {fact['camera']}"] = sha256(text.encode())
+        t_us, camera = fact.get("t_us"), fact.get("camera")
+        if not isinstance(t_us, int) or not isinstance(camera, str):
+            found = f"frame facts of camera {camera!r} at t_us {t_us!r}"
+            raise InputError("comparing rollouts", str(path), found, "run the rollout again: its facts are damaged")
+        parts["frames"][t_us, f"camera {camera}"] = sha256(text.encode())
     return parts
 
 

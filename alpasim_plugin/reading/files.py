@@ -72,11 +72,15 @@ def read_bytes(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this:
     Raises:
         InputError: As there, or the file grew beyond the bound while it was read.
     """
+    parts: list[bytes] = []
     with open_regular(path, doing, bound, do_this) as stream:
-        data = stream.read(int(bound.high) + 1)
-    if len(data) > bound.high:
-        raise InputError(doing, str(path), f"more than {bound.high:.0f} bytes ({bound.name})", "give a smaller file")
-    return data
+        # As much as the file holds, not as the bound allows: a read takes the memory that it is asked for at once.
+        size = os.fstat(stream.fileno()).st_size + 1
+        while part := stream.read(size):
+            parts.append(part)
+            if sum(map(len, parts)) > bound.high:
+                raise InputError(doing, str(path), f"more than {bound.high:.0f} bytes ({bound.name})", "give a smaller file")
+    return b"".join(parts)
 
 
 def read_text(path: Path | str, doing: str, bound: Bound = FILE_BYTES, do_this: str | None = None) -> str:

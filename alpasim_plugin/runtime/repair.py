@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import parsing
 from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.check import Inspection, inspect_run
 from alpasim_plugin.runtime.contents import CONTENTS, DOING, REPORTS, RUN_INFO, TABLES, write_run_json
@@ -89,9 +90,9 @@ def remake_tables(found: Inspection) -> None:
         },
         "determinism": {"status": "skipped", "reason": "the run was stopped before it repeated a rollout"},
     }
-    finish_run(
-        found.root, manifests, lost | {key: found.info[key] for key in KEPT if key in found.info}, (found.root / REPORTS[0]).exists()
-    )
+    kept = {key: found.info[key] for key in KEPT if key in found.info}
+    with parsing(DOING, found.root, "make the run again", "manifests from which no table can be made"):
+        finish_run(found.root, manifests, lost | kept, (found.root / REPORTS[0]).exists())
 
 
 def repair_run(found: Inspection, workers: int | None, progress: Progress, wait: bool = False) -> None:

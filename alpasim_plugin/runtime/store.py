@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from alpasim_plugin import reading
 from alpasim_plugin.atomic import write_bytes
-from alpasim_plugin.errors import InputError
 
 
 def read_json(path: Path) -> Any:
@@ -20,12 +19,7 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: The file is missing or is not JSON.
     """
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise InputError("reading a run", str(path), "no such file", "name a folder written by simrun") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError("reading a run", str(path), f"not JSON: {error}", "restore the file or run again") from error
+    return reading.read_json(path, "reading a run", do_this="restore the file or run again")
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:

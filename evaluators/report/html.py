@@ -14,6 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from alpasim_plugin.atomic import write_text
+from alpasim_plugin.reading import parsing
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.certificate import certificate
@@ -27,7 +28,7 @@ from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import provenance
-from evaluators.report.run_folder import Run, Series, read_run
+from evaluators.report.run_folder import AGAIN, DOING, Run, Series, read_run
 from evaluators.report.scene_table import SCENE_METRICS, scene_rows
 from evaluators.report.speed import speed
 from evaluators.report.strata import heads, strata, stratum_rows
@@ -163,7 +164,8 @@ def scene_views(
         rollouts = [r for r in run.rollouts if r.scene == scene]
         if content is None or not rollouts or len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
             continue
-        view = scene_view(scene, content, rollouts, series, variant_of)
+        with parsing(DOING, run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
+            view = scene_view(scene, content, rollouts, series, variant_of)
         if view is not None:
             drawn[scene] = view
             spent += len(view.lanes) + len(view.lines) + len(view.edges) + sum(len(t.d) for t in view.tracks)

@@ -21,7 +21,7 @@ import pyarrow.dataset as pads
 from alpasim_plugin.reading import parsing, read_json_as, read_json_object
 from alpasim_plugin.reading.tables import Kind, check_parquet, read_parquet
 from evaluators.metrics import declare_from
-from evaluators.report.shapes import RunInfo, Summary
+from evaluators.report.shapes import RunInfo, SceneFile, Summary
 
 DOING = "reading a run folder"
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
@@ -132,7 +132,7 @@ class Run:
     def scene_data(self, scene: str) -> Mapping[str, Any] | None:
         """Read a scene's map and logged drive; None where the run has no such file."""
         path = self.scene_path(scene)
-        return None if path is None else read_json(path)
+        return None if path is None else read_json_as(SceneFile, path, DOING, do_this=AGAIN)
 
     def manifest(self, rollout: Rollout) -> Mapping[str, Any]:
         """Read a rollout's manifest; empty where the rollout did not get so far."""

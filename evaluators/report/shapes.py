@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field
 from typing_extensions import TypedDict
 
 Number = float | None
@@ -102,6 +103,46 @@ class Summary(TypedDict, total=False):
     determinism: dict[str, Any] | None
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
+
+
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
+
+
+class DrawnLane(TypedDict, total=False):
+    """A lane in a scene's file."""
+
+    left: Line | None
+    right: Line | None
+    paint: Annotated[list[str], Field(min_length=2, max_length=2)]
+
+
+class DrawnDrive(TypedDict):
+    """The recorded drive in a scene's file."""
+
+    x_m: list[Coordinate]
+    y_m: list[Coordinate]
+
+
+class Body(TypedDict, total=False):
+    """The ego's body in a scene's file."""
+
+    length_m: Coordinate
+    width_m: Coordinate
+    rear_axle_to_centre_m: Coordinate
+
+
+class SceneFile(TypedDict, total=False):
+    """``scenes/SCENE.json``: what the bird's-eye view draws."""
+
+    scene_id: str
+    source: str
+    start_us: int
+    lanes: list[DrawnLane]
+    road_edges: list[Line]
+    crosswalks: list[Line]
+    ego_log: DrawnDrive
+    vehicle: Body
 
 
 class StoredBaseline(TypedDict):

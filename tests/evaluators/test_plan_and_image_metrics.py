@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import inverse, offset_trajectory
 from alpasim_plugin.types import LoggedImage, LoggedPlan, Trajectory
 from evaluators import PRESETS, rollout_values, score
@@ -153,7 +153,7 @@ def test_a_log_without_images_has_no_value_for_them():
 
 def test_bytes_that_are_no_image_are_an_error():
     log = rollout(drive(), images=[LoggedImage("front", 0, 0, b"not a picture")])
-    with pytest.raises(EvaluatorError, match="13 bytes that are no image"):
+    with pytest.raises(InputError, match="13 bytes beginning b'not ', no PNG or JPEG"):
         score(log, scene(TWO_LANES, log))
 
 

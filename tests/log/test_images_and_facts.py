@@ -67,7 +67,7 @@ def test_broken_facts_name_their_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="jsonl:2"):
         read_facts(tmp_path / "f.jsonl")
     (tmp_path / "f.jsonl").write_text("[1]\n")
-    with pytest.raises(InputError, match="line 1"):
+    with pytest.raises(InputError, match="jsonl:1"):
         read_facts(tmp_path / "f.jsonl")
     with pytest.raises(InputError, match="no such file"):
         read_facts(tmp_path / "absent.jsonl")

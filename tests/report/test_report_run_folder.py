@@ -65,11 +65,11 @@ def test_paths_that_leave_the_run_folder_are_not_followed(tmp_path: Path, usual_
     ("break_it", "found"),
     [
         (lambda run: (run / "run.json").unlink(), "no such file"),
-        (lambda run: (run / "summary.json").write_text('{"metrics": '), "not JSON"),
-        (lambda run: (run / "summary.json").write_text("[1]"), "a list, not an object"),
+        (lambda run: (run / "summary.json").write_text('{"metrics": '), "broken JSON"),
+        (lambda run: (run / "summary.json").write_text("[1]"), "the document: a list of 1"),
         (lambda run: (run / "rollouts.parquet").unlink(), "no such file"),
-        (lambda run: (run / "rollouts.parquet").write_bytes(b"PAR1"), "not a parquet file"),
-        (lambda run: pq.write_table(pa.table({"renderer": ["a"]}), run / "rollouts.parquet"), "no column policy, scene, seed, status"),
+        (lambda run: (run / "rollouts.parquet").write_bytes(b"PAR1"), "no readable parquet"),
+        (lambda run: pq.write_table(pa.table({"renderer": ["a"]}), run / "rollouts.parquet"), "no column 'policy'"),
     ],
 )
 def test_broken_folder_is_a_four_part_error(tmp_path: Path, usual_run: Path, break_it, found: str) -> None:  # type: ignore[no-untyped-def]
