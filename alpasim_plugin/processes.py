@@ -72,7 +72,7 @@ def boot_id() -> str:
 def started_of(pid: int) -> str:
     """Return when a process started, in the system's own units; empty where there is none, or only what its parent has not yet fetched."""
     try:
-        # The name of the program, in parentheses, may hold spaces. Field 3 is the state, field 22 the start in clock ticks after the machine's.
+        # The name of the program, in parentheses, may hold spaces. Fields 3 and 22: state, and start in clock ticks after the machine's.
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if fields[0] in ENDED else fields[19]
     except OSError:
