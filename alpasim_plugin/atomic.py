@@ -5,6 +5,7 @@ A process that is killed leaves at most a hidden ``.NAME.PID.RANDOM.tmp`` behind
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -63,7 +64,9 @@ def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None
     except OSError as error:
         raise disk_error(path, error, doing, do_this) from error
     finally:
-        partial.unlink(missing_ok=True)
+        # A read-only folder refuses this as well, even for a file that is not there; the write's own error says so.
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 @contextmanager

@@ -65,12 +65,14 @@ def one_writer(
         if taken is not None:
             break
         if not wait:
-            raise _in_use(path, doing, what, owner)
+            named = _named(path)
+            raise _in_use(named if named.exists() else path, doing, what, owner)
         if not told:
             waiting(f"waiting: {owner or 'another process'} writes {what}")
             told = True
         time.sleep(POLL_S)
     try:
+        os.utime(path)
         yield Held(path, path.stat().st_mtime_ns)
     finally:
         taken()
@@ -125,7 +127,7 @@ def _take(path: Path) -> tuple[Release | None, ProcessName | None]:
 
 def _take_by_text(path: Path) -> tuple[Release | None, ProcessName | None]:
     """Try once without the help of the file system: whoever makes the file with its name in it holds the lock."""
-    named, mine = path.with_name(path.name + ".owner"), temporary_path(path)
+    named, mine = _named(path), temporary_path(path)
     mine.write_bytes(_own_text())
     try:
         for _ in range(2):
@@ -141,6 +143,11 @@ def _take_by_text(path: Path) -> tuple[Release | None, ProcessName | None]:
     finally:
         mine.unlink(missing_ok=True)
     return None, None
+
+
+def _named(path: Path) -> Path:
+    """Return the file that is the lock where the file system has none."""
+    return path.with_name(path.name + ".owner")
 
 
 def _put_aside(named: Path, text: bytes) -> bool:
@@ -169,7 +176,6 @@ def _text(handle: int) -> bytes:
 def _write(handle: int, text: bytes) -> None:
     os.ftruncate(handle, 0)
     os.pwrite(handle, text, 0)
-    os.utime(handle)
 
 
 def _owner(text: bytes) -> ProcessName | None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
+ENDED = ("Z", "X")  # states of a process that runs no more
 ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
 
 Life = Literal["running", "gone", "elsewhere"]
@@ -69,12 +70,14 @@ def boot_id() -> str:
 
 
 def started_of(pid: int) -> str:
-    """Return when a process started, in the system's own units; empty where there is none."""
+    """Return when a process started, in the system's own units; empty where there is none, or only what its parent has not yet fetched."""
     try:
-        # The name of the program, in parentheses, may hold spaces. Field 22 is the start in clock ticks after the machine's.
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+        # The name of the program, in parentheses, may hold spaces. Fields 3 and 22: state, and start in clock ticks after the machine's.
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return "" if fields[0] in ENDED else fields[19]
     except OSError:
-        return "" if sys.platform == "linux" else _said_by("ps", "-o", "lstart=", "-p", str(pid))
+        state, _, start = ("", "", "") if sys.platform == "linux" else _said_by("ps", "-o", "stat=,lstart=", "-p", str(pid)).partition(" ")
+        return "" if state[:1] in ENDED else start.strip()
 
 
 def is_running(pid: int) -> bool:

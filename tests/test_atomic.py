@@ -155,6 +155,20 @@ def test_the_folder_of_bytes_is_made_and_a_file_in_its_place_is_refused(tmp_path
         write_bytes(tmp_path / "new" / "a" / "b", b"x")
 
 
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_a_read_only_folder_is_an_error_with_four_parts(
+    write: Callable[[Path, int], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Path, *rest: object, **more: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(atomic.os, "fsync", lambda handle: refuse(tmp_path))
+    monkeypatch.setattr(Path, "unlink", refuse)  # refused even where there is no file
+    with pytest.raises(InfrastructureError, match="Read-only file system") as caught:
+        write(tmp_path / "out", 1)
+    assert "make the folder writable" in caught.value.do_this
+
+
 def test_nan_is_refused_in_json(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
         write_json(tmp_path / "a.json", {"x": float("nan")})

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from typing_extensions import TypedDict
+
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.reading.json_files import as_shape
 from alpasim_plugin.runtime.pictures import STRIP_NAME, VIDEO_NAME
@@ -19,6 +21,15 @@ DERIVED = (STEPS_NAME,)  # files that scoring makes from the log
 DOING, DO_THIS = "reading a rollout", "simrun check RUN --repair runs the rollout again"
 
 Remedy = Literal["none", "score", "drive"]
+
+
+class _Shape(TypedDict):
+    files: dict[str, FileFacts]
+    renderer: str
+    policy: str
+    scene: str
+    path: str
+    status: str
 
 
 @dataclass(frozen=True)
@@ -78,12 +89,10 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         InputError: It is missing, damaged, or lacks what every manifest has.
     """
     manifest, seal = read_sealed(folder / MANIFEST, DOING, DO_THIS)
-    as_shape(dict[str, FileFacts], manifest.get("files"), folder / MANIFEST, DOING, DO_THIS)
+    as_shape(_Shape, manifest, folder / MANIFEST, DOING, DO_THIS)
     others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
     if others:
         raise InputError(DOING, str(folder / MANIFEST), f"it vouches for {others[0]!r}, which no rollout has", DO_THIS)
-    for key in ("renderer", "policy", "scene", "path", "status"):
-        as_shape(str, manifest.get(key), folder / MANIFEST, DOING, DO_THIS)
     if manifest["status"] == "ok" and STEPS_NAME not in manifest["files"]:
         raise InputError(DOING, str(folder / MANIFEST), f"it does not vouch for {STEPS_NAME}", DO_THIS)
     return manifest, seal

@@ -160,7 +160,7 @@ NO_SHAPE = '<geometry s="0" x="0" y="0" hdg="0" length="9"/>'
         ("osm", "", "a document <osm>"),
         ("OpenDRIVE", "", "without roads"),
         ("OpenDRIVE", road(right=lane(-1), length=float("nan")), "length = 'nan'"),
-        ("OpenDRIVE", road(right=lane(-1), length=1e308), "a length of 1e+308 m"),
+        ("OpenDRIVE", road(right=lane(-1), length=1e308), "length = 1e+308 m, outside"),
         ("OpenDRIVE", road(right=lane(-1, '<width sOffset="0" a="1e300" b="0" c="0" d="0"/>')), "not finite or not on a road"),
         ("OpenDRIVE", road(right=lane(-1)).replace('id="-1"', 'id="x"'), "<lane> with id = 'x'"),
         ("OpenDRIVE", road(right=lane(-1), view=NO_SHAPE), "a <geometry> of []"),

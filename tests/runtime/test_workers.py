@@ -1,0 +1,75 @@
+"""Workers that die, hang or lose their parent cost their own item and nothing else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.runtime.workers import Lost, in_workers
+
+
+def work(item: str) -> str:
+    """Do what the item says."""
+    if item == "dies":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if item == "leaves":
+        os._exit(3)
+    if item == "hangs":
+        time.sleep(60)
+    if item == "raises":
+        raise ValueError("no")
+    if item == "cannot be sent":
+        return lambda: item  # type: ignore[return-value]
+    return item.upper()
+
+
+def test_every_item_has_a_result_and_a_worker_that_dies_costs_only_its_own() -> None:
+    items = ["a", "dies", "b", "leaves", "c", "d"]
+    found = dict(in_workers(work, items, 2, 1))
+    assert {item: got for item, got in found.items() if isinstance(got, str)} == {"a": "A", "b": "B", "c": "C", "d": "D"}
+    assert found["dies"] == Lost("its worker process ended (killed by SIGKILL)")
+    assert found["leaves"] == Lost("its worker process ended (exit code 3)")
+
+
+def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not() -> None:
+    found = dict(in_workers(work, ["hangs", "a"], 1, 1, limit_s=0.5))
+    assert found["a"] == "A"
+    assert found["hangs"] == Lost("it did not finish within 0.5 s", hung=True)
+
+
+@pytest.mark.parametrize(("item", "error"), [("raises", "no"), ("cannot be sent", "cannot be sent to the parent")])
+def test_an_error_ends_the_work_and_reaches_the_parent(item: str, error: str) -> None:
+    with pytest.raises(Exception, match=error):
+        dict(in_workers(work, [item, "a"], 1, 1))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path, repo: Path) -> None:
+    (tmp_path / "driver.py").write_text(
+        "import os, time\n"
+        "from pathlib import Path\n"
+        "from alpasim_plugin.runtime.workers import in_workers\n"
+        "def work(folder):\n"
+        "    Path(folder, str(os.getpid())).touch()\n"
+        "    time.sleep(60)\n"
+        "if __name__ == '__main__':\n"
+        f"    list(in_workers(work, [{str(tmp_path / 'pids')!r}] * 2, 2, 1))\n"
+    )
+    (tmp_path / "pids").mkdir()
+    driver = subprocess.Popen([sys.executable, str(tmp_path / "driver.py")], env={**os.environ, "PYTHONPATH": str(repo)})
+    until = time.monotonic() + 60
+    while len(pids := list((tmp_path / "pids").iterdir())) < 2 and time.monotonic() < until:
+        time.sleep(0.02)
+    driver.kill()
+    driver.wait()
+    assert len(pids) == 2
+    until = time.monotonic() + 10
+    while any(Path("/proc", pid.name).exists() and " Z " not in Path("/proc", pid.name, "stat").read_text() for pid in pids):
+        assert time.monotonic() < until, "a worker outlives its parent"
+        time.sleep(0.02)
