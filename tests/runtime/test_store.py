@@ -10,7 +10,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.store import read_json
 
 
-@pytest.mark.parametrize(("content", "found"), [(None, "no such file"), ("{", "not JSON")])
+@pytest.mark.parametrize(("content", "found"), [(None, "no such file"), ("{", "broken JSON")])
 def test_unreadable_json_is_named(tmp_path: Path, content: str | None, found: str) -> None:
     path = tmp_path / "run.json"
     if content is not None:
