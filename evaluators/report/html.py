@@ -28,7 +28,7 @@ from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import provenance
-from evaluators.report.run_folder import AGAIN, DOING, Run, Series, read_run
+from evaluators.report.run_folder import AGAIN, DOING, Run, Series, read_run, reporting
 from evaluators.report.scene_table import SCENE_METRICS, scene_rows
 from evaluators.report.speed import speed
 from evaluators.report.strata import heads, strata, stratum_rows
@@ -56,7 +56,9 @@ def write_report(run_dir: Path | str) -> Path:
     """
     run = read_run(run_dir)
     path = run.folder / "report.html"
-    write_text(path, render_report(run), "writing a report")
+    with reporting(run):
+        text = render_report(run)
+    write_text(path, text, "writing a report")
     return path
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from alpasim_plugin.atomic import write_text
 from alpasim_plugin.escape import xml as clean
-from evaluators.report.run_folder import Rollout, Run, read_run
+from evaluators.report.run_folder import Rollout, Run, read_run, reporting
 
 
 def write_junit(run_dir: Path | str) -> Path:
@@ -20,7 +20,8 @@ def write_junit(run_dir: Path | str) -> Path:
         InputError: The run folder is not complete enough to be read.
     """
     run = read_run(run_dir)
-    root = junit(run)
+    with reporting(run):
+        root = junit(run)
     ET.indent(root)
     path = run.folder / "junit.xml"
     write_text(path, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n", "writing a report")

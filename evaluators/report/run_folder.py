@@ -6,6 +6,7 @@ The report is a pure reader: it works on a folder that was copied from another m
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -257,6 +258,11 @@ def read_json(path: Path) -> dict[str, Any]:
         InputError: Absent, not JSON, or not an object.
     """
     return read_json_object(path, DOING, do_this=AGAIN)
+
+
+def reporting(run: Run) -> AbstractContextManager[None]:
+    """Give what makes a report of a run that says something impossible an error of that run, and not a traceback."""
+    return parsing("writing a report", run.folder, AGAIN, "a run from which no report can be made")
 
 
 def read_run(run_dir: Path | str) -> Run:

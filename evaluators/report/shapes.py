@@ -82,13 +82,52 @@ class Censoring(TypedDict, total=False):
     invalid: dict[str, Invalid]
 
 
+class Stage(TypedDict, total=False):
+    """Milliseconds of one stage of the loop."""
+
+    per_frame_ms: Number
+    p50_ms: Number
+    p95_ms: Number
+    share: Number
+
+
+class Speed(TypedDict, total=False):
+    """Milliseconds per frame of one renderer."""
+
+    ms_per_frame_mean: Number
+    ms_per_frame_p50: Number
+    ms_per_frame_p95: Number
+    frames_per_s: Number
+    first_frame_ms: Number
+    stages: dict[str, Stage]
+
+
+class FailedCell(TypedDict):
+    """The key of a rollout that failed."""
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+
+
+class Determinism(TypedDict, total=False):
+    """The rollout that was repeated."""
+
+    status: str
+    cell: dict[str, Any]
+    digests: dict[str, str]
+    repeated: dict[str, str]
+    first_difference: dict[str, Any] | None
+
+
 class Failures(TypedDict, total=False):
     """Rollouts that did not run to their end."""
 
     n_failed: int
     n_rollouts: int
     by_class: dict[str, int]
-    cells: list[dict[str, Any]]
+    cells: list[FailedCell]
 
 
 class Summary(TypedDict, total=False):
@@ -99,8 +138,8 @@ class Summary(TypedDict, total=False):
     paired: dict[str, dict[str, Difference]]
     censoring: dict[str, Censoring]
     failures: Failures
-    speed: dict[str, dict[str, Any]]
-    determinism: dict[str, Any] | None
+    speed: dict[str, Speed]
+    determinism: Determinism | None
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
 

@@ -14,7 +14,7 @@ from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.provenance import provenance
-from evaluators.report.run_folder import Rollout, Run, read_run
+from evaluators.report.run_folder import Rollout, Run, read_run, reporting
 from evaluators.report.speed import speed
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
@@ -32,7 +32,9 @@ def write_summary_md(run_dir: Path | str) -> Path:
     """
     run = read_run(run_dir)
     path = run.folder / "summary.md"
-    write_text(path, cut(summary_md(run)), "writing a report")
+    with reporting(run):
+        text = summary_md(run)
+    write_text(path, cut(text), "writing a report")
     return path
 
 
