@@ -12,6 +12,7 @@ from typing import Any, Literal
 import pyarrow.parquet as pq
 
 from alpasim_plugin.atomic import scratch_folder
+from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Key, digests, first_difference, sha256, trace_log
 from alpasim_plugin.runtime.cell import run_cell
@@ -86,6 +87,9 @@ def _repeat(plan: RunPlan, cell: Cell, root: Path, manifest: Mapping[str, Any], 
     with scratch_folder(root / "repeat", "repeating a rollout") as scratch:
         again = run_cell(cell, plan.options, scratch, threads)
         if again["status"] != "ok":
+            error = again["error"]
+            if error["failure_class"] == InfrastructureError.failure_class:  # a full disk says nothing about the rollout
+                raise InfrastructureError(error["doing"], error["with"], error["found"], error["do"])
             found = f"the repeat failed: {again['error']['found']}"
             verdict: dict[str, Any] = {
                 "status": "different",
