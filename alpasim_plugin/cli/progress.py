@@ -111,7 +111,7 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
 def fixer_labels(plan: RunPlan) -> list[str]:
     """Return one line per fixer: label, with the origin of its weights, and mode."""
     named = [(spec.name, spec.fixer) for spec in plan.renderers if spec.fixer is not None]
-    return [f"{name}: {fixer.label}, {getattr(fixer.settings, 'mode', '')}" for name, fixer in named]
+    return [", ".join(filter(None, (f"{name}: {fixer.label}", getattr(fixer.settings, "loop_mode", "")))) for name, fixer in named]
 
 
 def describe(manifest: dict[str, Any], reused: bool) -> str:

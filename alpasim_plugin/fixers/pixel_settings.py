@@ -41,6 +41,11 @@ class PixelFixerSettings(FixerSettings):
         default="auto", description="Of the network. auto: bf16 where the machine has matrix instructions for it, else fp32."
     )
 
+    @property
+    def loop_mode(self) -> str:
+        """How the closed loop runs the fixer, in one word."""
+        return "frame by frame"
+
     @field_validator("steps", mode="before")
     @classmethod
     def _counted(cls, value: Any) -> Any:

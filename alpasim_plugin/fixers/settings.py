@@ -40,6 +40,11 @@ class FixerSettings(Part):
     tolerance_deg: float = Field(default=0.1, ge=0, description="Speculative: largest camera rotation from the predicted pose.")
     uses_map: bool = Field(default=False, description="Whether the semantic map is drawn and given to the fixer.")
 
+    @property
+    def loop_mode(self) -> str:
+        """How the closed loop runs the fixer, in one word."""
+        return self.mode
+
     @classmethod
     def load(cls, name: str, overrides: Sequence[str] = ()) -> Self:
         """Return the settings of a fixer's name; see `load_settings`."""

@@ -118,7 +118,7 @@ def sizes_of(settings: PixelFixerSettings) -> PixelSizes:
 
 def write_bundle(run: PixelRun, path: Path, weights: Mapping[str, Tensor], updates: int) -> Path:
     """Write averaged weights as a float16 bundle."""
-    settings = run.settings.model_copy(update={"uses_map": run.objectives.use_map, "steps": (1000.0,)})
+    settings = run.settings.model_copy(update={"uses_map": run.objectives.use_map, "steps": (1000.0,), "holes": "noise"})
     tensors: dict[str, Any] = {key: half(value) for key, value in weights.items()}
     save_bundle(path, {"generator": tensors}, settings, trained=True, note=f"{updates} updates")
     return path

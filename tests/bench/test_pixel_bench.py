@@ -7,7 +7,7 @@ from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from tests.fixers.small_clip import driving_clip
 
-SMALL = ("weights.bundle=null", "generator.widths=[8,8,8]", "untrained=random")
+SMALL = ("weights.bundle=null", "holes=noise", "generator.widths=[8,8,8]", "untrained=random")
 
 
 def test_rows_have_times_and_errors_that_mean_something() -> None:

@@ -42,14 +42,14 @@ def generator() -> PixelGenerator:
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pixel") / "small.safetensors"
-    settings = fixer_settings("onefixer", ["weights.bundle=null"])
+    settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
     assert isinstance(settings, PixelFixerSettings)
     save_bundle(path, {"generator": generator().state_dict()}, settings, trained=True, note="9 updates")
     return path
 
 
 def at(bundle: Path, *overrides: str) -> PixelFixerSettings:
-    settings = fixer_settings("onefixer", [f"weights.bundle={bundle}", "precision=fp32", *overrides])
+    settings = fixer_settings("onefixer", [f"weights.bundle={bundle}", "precision=fp32", "holes=noise", *overrides])
     assert isinstance(settings, PixelFixerSettings)
     return settings
 
