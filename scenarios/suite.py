@@ -48,7 +48,7 @@ class SuiteSpec(Part):
 
     version: Literal[1] = Field(description="Version of this schema: 1.")
     description: str = Field(default="", description="One sentence for people.")
-    scenarios: tuple[str | SuiteItem, ...] = Field(
+    scenarios: tuple[Annotated[str, Field(min_length=1)] | SuiteItem, ...] = Field(
         min_length=1, max_length=int(LISTED.high), description="Entries: a path or name, or {path, seeds, set}."
     )
 

@@ -75,6 +75,7 @@ def test_an_unknown_entry_is_placed_in_the_suite(folder: Path) -> None:
         ("version: 1\nscenarios: [{path: a, sed: 1}]\n", "unknown key 'sed'"),
         ("version: 1\nscenarios: [bad.yaml]\n", "contains itself"),
         ("scenarios: [a]\n", "no 'version'"),
+        ("version: 1\nscenarios: ['']\n", "scenarios[0] = ''"),
     ],
 )
 def test_bad_suites_are_refused(folder: Path, text: str, found: str) -> None:
