@@ -15,6 +15,8 @@ from alpasim_plugin.reading.files import FETCH_AGAIN, open_regular, parsing
 
 Array = np.ndarray[Any, Any]
 
+LONGEST_HEADER = 1 << 16  # bytes; NumPy itself refuses headers of more than 10,000
+
 
 def parse_npy(data: bytes, where: Path | str, doing: str, do_this: str = FETCH_AGAIN) -> Array:
     """Return the array of a ``.npy`` document.
@@ -34,7 +36,8 @@ def open_npy(path: Path | str, doing: str, do_this: str = FETCH_AGAIN, bound: Bo
     with open_regular(path, doing, bound, do_this) as stream, parsing(doing, path, do_this, "no readable NumPy array"):
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
-        _check_header(stream, size, path, doing, do_this)
+        # A header may claim any length; a file gives the memory for it before it looks how much there is.
+        _check_header(io.BytesIO(stream.read(LONGEST_HEADER)), size, path, doing, do_this)
     with parsing(doing, path, do_this, "no readable NumPy array"):
         array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
         return array

@@ -11,6 +11,7 @@ from typing import Any
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.reading import parsing
+from alpasim_plugin.reading.json_files import as_shape
 from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.check import Inspection, inspect_run
 from alpasim_plugin.runtime.contents import CONTENTS, DOING, REPORTS, RUN_INFO, TABLES, write_run_json
@@ -79,7 +80,7 @@ def remake_tables(found: Inspection) -> None:
     if any(one.file == RUN_INFO for one in found.damage):
         write_run_json(found.root, found.info)
     manifests = [read_manifest(found.root / cell)[0] for cell in found.cells]
-    config = found.info["config"]
+    config = as_shape(dict[str, Any], found.info["config"], f"{found.root / RUN_INFO}, config", DOING, "make the run again")
     lost = {
         "pool": {
             "workers": config.get("workers"),
