@@ -54,8 +54,8 @@ def scenes_without_event(margin: float) -> int | None:
         return None
     if margin >= 1.0:
         return 2
-    n = max(2, math.ceil(math.log(TAIL) / math.log1p(-margin)))
-    return n if n <= MOST_SCENES else None
+    n = math.log(TAIL) / math.log1p(-margin)
+    return max(2, math.ceil(n)) if n <= MOST_SCENES else None
 
 
 def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_flag: bool) -> int | None:

@@ -104,6 +104,7 @@ def test_more_scenes_counts_from_what_there_is():
 
 def test_without_any_event_the_exact_bound_says_how_many_scenes_are_needed():
     assert scenes_without_event(0.05) == 72
+    assert scenes_without_event(1e-300) is None  # more scenes than a float can count
     assert 1 - 0.025 ** (1 / 72) < 0.05 < 1 - 0.025 ** (1 / 71)
     assert more_scenes(0.0, 0.0, 20, 0.05, is_flag=True) == 52
     assert more_scenes(0.0, 0.0, 20, 0.0, is_flag=True) is None
