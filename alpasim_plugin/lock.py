@@ -55,7 +55,7 @@ def one_writer(
     Raises:
         InfrastructureError: Another process holds it, or the folder cannot be written.
     """
-    told = False
+    announced = False
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,9 +67,9 @@ def one_writer(
         if not wait:
             named = _named(path)
             raise _in_use(named if named.exists() else path, doing, what, owner)
-        if not told:
+        if not announced:
             waiting(f"waiting: {owner or 'another process'} writes {what}")
-            told = True
+            announced = True
         time.sleep(POLL_S)
     try:
         os.utime(path)

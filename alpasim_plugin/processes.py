@@ -24,7 +24,7 @@ Life = Literal["running", "gone", "elsewhere"]
 
 @dataclass(frozen=True)
 class ProcessName:
-    """A process, told from every other one, also from a later one with the same number.
+    """Identity of a process, distinct from that of a later process with the same number.
 
     Attributes:
         pid: Its number.

@@ -24,7 +24,7 @@ class Silent:
         """Ignore."""
 
     def noticed(self, text: str) -> None:
-        """Print it: what was damaged is told even where nothing else is."""
+        """Print the line: damage is reported even with ``--quiet``."""
         print(f"warning: {text}", file=sys.stderr, flush=True)
 
 

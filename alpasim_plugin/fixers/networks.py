@@ -10,8 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import FixerError, InputError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
+from alpasim_plugin.fixers.devices import require_device
 from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.checkpoints import load_weights
@@ -55,8 +56,7 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
         InputError: Weights that are missing or do not fit.
         FixerError: The device does not work.
     """
-    if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
-        raise FixerError(DOING, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
+    require_device(device, DOING)
     loop = FixerSettings(name="")  # settings of the loop do not change the networks
     return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
 

@@ -13,8 +13,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import FixerError, InputError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
+from alpasim_plugin.fixers.devices import require_device
 from alpasim_plugin.fixers.keep_render import render_share
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.recorded_step import RecordedStep
@@ -56,8 +57,7 @@ def load_generator(settings: PixelFixerSettings, device: str = "cpu") -> LoadedG
         InputError: Weights that are missing or do not fit.
         FixerError: The device does not work.
     """
-    if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
-        raise FixerError(DOING, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
+    require_device(device, DOING)
     return _load(settings.model_copy(update={"keep_render": True}), device)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from alpasim_plugin.nets.streaming_state import State, Stream
 
 
-class StreamingDecoder(nn.Module):
+class StreamingDecoder(nn.Module, ABC):
     """Decode clips and streams of latents.
 
     ``latents_per_pass`` (1; None for all) is the number of latents processed at once, which bounds memory; results differ by rounding only.
@@ -24,9 +25,9 @@ class StreamingDecoder(nn.Module):
         """Precision of the learned weights, and of every result."""
         return next(self.parameters()).dtype
 
+    @abstractmethod
     def decode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
         """Decode the next latents of a stream; a pure function ``(latents, state, **options) -> (frames, state)``."""
-        raise NotImplementedError
 
     def decode(self, z: Tensor, **options: Any) -> Tensor:
         """Decode a whole clip.
@@ -51,9 +52,9 @@ class StreamingDecoder(nn.Module):
 class StreamingCodec(StreamingDecoder):
     """Encode and decode clips and streams."""
 
+    @abstractmethod
     def encode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
         """Encode the next frames of a stream; a pure function ``(frames, state, detach=False) -> (latents, state)``."""
-        raise NotImplementedError
 
     def encode(self, video: Tensor) -> Tensor:
         """Encode a whole clip.

@@ -65,7 +65,7 @@ def execute(
     """Run every unfinished cell and return all manifests in the plan's order.
 
     Whole rollouts are reused; those scored with another preset, or whose table is damaged, are scored again from their logs; damaged
-    ones are driven again. If the process is told to stop, the workers are stopped; finished rollouts stay on disk.
+    ones are driven again. On SIGINT, SIGTERM or SIGHUP the workers are stopped; finished rollouts stay on disk.
 
     Args:
         plan: The run.

@@ -25,8 +25,9 @@ from alpasim_plugin.types import F32, I64, U8
 DOING = "making training streams"
 KINDS = ("pairs", "identity", "video", "damaged_video")
 SIDE = 16  # crops are multiples of it
-BACKWARD, SKIPPING, FLIPPED, RELIT, RECOLOURED = 0.25, 0.2, 0.5, 0.7, 0.25  # shares of the episodes
-GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a relit episode
+# Probability of each augmentation of an episode: played backward, every second frame, mirrored, photometric, class colours of the map.
+P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
+GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
 
 
 @dataclass(frozen=True)
@@ -169,14 +170,15 @@ class TrainingStreams:
         sequence = sequences[int(rng.integers(len(sequences)))]
         length, height, width = sequence.clip.rgb_gt.shape[:3]
         start, top, left = (int(rng.integers(n)) for n in (length, height - self.crop[0] + 1, width - self.crop[1] + 1))
-        backward, skipping, flipped, relit, recoloured = (rng.random(5) < (BACKWARD, SKIPPING, FLIPPED, RELIT, RECOLOURED)).tolist()
+        chances = (P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS)
+        reverse, stride_2, flip, photometric, class_colours = (rng.random(5) < chances).tolist()
         gain, channels, gamma = rng.uniform(*GAIN), rng.uniform(*CHANNEL_GAIN, 3), rng.uniform(*GAMMA)
         other = OTHERS[int(rng.integers(len(OTHERS)))]
         grey = np.arange(256)[:, None] / 255
-        shown = np.clip(gain * channels * grey**gamma, 0, 1) if relit else np.repeat(grey, 3, axis=1)
+        shown = np.clip(gain * channels * grey**gamma, 0, 1) if photometric else np.repeat(grey, 3, axis=1)
         levels: F32 = (shown * 2 - 1).astype(np.float32)
-        step = (-1 if backward else 1) * (2 if skipping else 1)
-        return Episode(kind, sequence, start, step, top, left, flipped, levels, other if recoloured else None)
+        step = (-1 if reverse else 1) * (2 if stride_2 else 1)
+        return Episode(kind, sequence, start, step, top, left, flip, levels, other if class_colours else None)
 
     def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32]:
         """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map and target of an episode's update."""

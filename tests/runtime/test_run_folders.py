@@ -1,4 +1,4 @@
-"""A damaged run folder: what is damaged is told, that and only that is made again, and the tables are as before."""
+"""A damaged run folder: damage is reported, only the damaged part is made again, and the tables are as before."""
 
 from __future__ import annotations
 
