@@ -15,7 +15,7 @@ from rich.console import Console
 
 from alpasim_plugin.cli.training_options import AsJson, Debug, Progress, Seed, Steps, scene_files
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.training.demonstrations import DEMONSTRATIONS_FILE, DemonstrationRecipe, read_demonstrations, write_demonstrations
+from alpasim_plugin.training.demonstrations import DemonstrationRecipe, Demonstrations, read_demonstrations, write_demonstrations
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.policy import PolicyRecipe, PolicyTask, measure
 from alpasim_plugin.training.scenes import SPLITS, TEST_SPLITS
@@ -65,7 +65,7 @@ def policy_data(
     for i, path in enumerate(paths, start=1):
         folder = out / split / path.stem
         made = write_demonstrations(load_scenario(path), folder, DemonstrationRecipe(), seed)
-        rows.append({"scene": path.stem, "folder": str(folder), "made": made, "samples": _samples_in(folder)})
+        rows.append({"scene": path.stem, "folder": str(folder), "made": made, "samples": len(Demonstrations(folder))})
         console.print(f"[{i}/{len(paths)}] {path.stem}{'' if made else ' (exists)'}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         totals = {"scenes": len(rows), "made": sum(row["made"] for row in rows), "samples": sum(row["samples"] for row in rows)}
@@ -110,7 +110,3 @@ def demonstration_facts(task: PolicyTask) -> dict[str, Any]:
         "scenes": dict(Counter(one.folder.name.rsplit("_", 1)[0] for one in task.demonstrations)),
         "renderer": task.demonstrations[0].info["recipe"]["renderer"],
     }
-
-
-def _samples_in(folder: Path) -> int:
-    return int(json.loads((folder / DEMONSTRATIONS_FILE).read_text(encoding="utf-8"))["samples"])

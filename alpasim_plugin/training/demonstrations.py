@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from alpasim_plugin.atomic import atomic_folder, write_json
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import inverse, quat_from_yaw, se3
+from alpasim_plugin.reading import read_json_as, read_json_object
+from alpasim_plugin.reading.arrays import open_npy
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.perturbed_rollouts import PerturbedRollout, RolloutState, perturbed_rollouts
@@ -27,6 +30,7 @@ from policies.learned_command import COMMANDS, route_command
 DEMONSTRATIONS_FILE = "demonstrations.json"
 DEMONSTRATIONS_VERSION = 3  # of the format
 READING = "reading demonstrations for the learned policy"
+GIVE = "give a folder that 'simrun train policy-data' wrote"
 WIDE_PX, TOP_ROW = 352, 30  # frames are wider than the policy's input, so that it can be rotated; most of the sky is cut
 MAX_YAW_RAD = np.deg2rad(8.5)
 
@@ -48,6 +52,15 @@ class DemonstrationRecipe:
     drive_s: float = 10.0
     headings: int = 5
     announcement_sigma_m: float = 2.5
+
+
+class DemonstrationFacts(TypedDict):
+    """What ``demonstrations.json`` holds besides the key that made it."""
+
+    samples: int
+    K: list[list[float]]
+    T_rig_camera: list[list[float]]
+    recipe: Mapping[str, Any]
 
 
 _FORMS: dict[str, tuple[int, str]] = {
@@ -88,7 +101,7 @@ def write_demonstrations(scenario: Scenario, folder: Path, recipe: Demonstration
     info = {"scene_id": scenario.scene_id, "scene_hash": scenario.content_hash, "seed": seed, "recipe": asdict(recipe)}
     info["version"] = DEMONSTRATIONS_VERSION
     path = folder / DEMONSTRATIONS_FILE
-    if path.exists() and {k: v for k, v in json.loads(path.read_text(encoding="utf-8")).items() if k in info} == info:
+    if path.exists() and {k: v for k, v in read_json_object(path, READING, do_this=GIVE).items() if k in info} == info:
         return False
     camera = wide_camera(front_camera(scenario))
     arrays = _demonstrate(scenario, camera, recipe, seed, threads)
@@ -163,13 +176,10 @@ class Demonstrations:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        try:
-            self.info: dict[str, Any] = json.loads((folder / DEMONSTRATIONS_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(READING, str(folder), str(error), "give a folder that 'simrun train policy-data' wrote") from error
+        self.info = read_json_as(DemonstrationFacts, folder / DEMONSTRATIONS_FILE, READING, do_this=GIVE)
 
     def __len__(self) -> int:
-        return int(self.info["samples"])
+        return self.info["samples"]
 
     @cached_property
     def camera(self) -> CameraSpec:
@@ -183,10 +193,7 @@ class Demonstrations:
         out = {}
         for name, (axes, dtype) in _FORMS.items():
             path = self.folder / f"{name}.npy"
-            try:
-                out[name] = np.load(path, mmap_mode="r", allow_pickle=False)
-            except (OSError, ValueError) as error:
-                raise InputError(READING, str(path), str(error), "write the demonstrations again") from error
+            out[name] = open_npy(path, READING, "write the demonstrations again")
             if out[name].ndim != axes or out[name].dtype != np.dtype(dtype):
                 found = f"{out[name].dtype} with {out[name].ndim} axes"
                 raise InputError(READING, str(path), found, f"{dtype} with {axes} axes is needed: write the demonstrations again")

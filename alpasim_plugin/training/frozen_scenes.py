@@ -7,13 +7,15 @@ other scenes are not comparable with published ones.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from typing_extensions import TypedDict
+
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.reading import read_json_as
 from alpasim_plugin.training.scenes import TEST_SPLITS
 
 DOING = "checking test scenes"
@@ -31,6 +33,13 @@ class FrozenSplit:
 
     sha256: str
     scenes: Mapping[str, str]
+
+
+class FrozenEntry(TypedDict):
+    """A `FrozenSplit` in the record."""
+
+    sha256: str
+    scenes: dict[str, str]
 
 
 def hash_scenes(folder: Path) -> FrozenSplit:
@@ -68,10 +77,9 @@ def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
     Raises:
         InputError: Another scene, one too few or one too many, or no readable record.
     """
-    try:
-        known = {split: FrozenSplit(**entry) for split, entry in json.loads(record.read_text(encoding="utf-8")).items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(DOING, str(record), str(error), "give the record that 'simrun train check-scenes --freeze' wrote") from error
+    do_this = "give the record that 'simrun train check-scenes --freeze' wrote"
+    entries = read_json_as(dict[str, FrozenEntry], record, DOING, do_this=do_this)
+    known = {split: FrozenSplit(**entry) for split, entry in entries.items()}
     for split, frozen in known.items():
         found = hash_scenes(folder / split)
         differ = sorted({name for name, _ in frozen.scenes.items() ^ found.scenes.items()})

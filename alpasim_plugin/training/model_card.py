@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
 import shlex
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 
 from alpasim_plugin.atomic import write_json
+from alpasim_plugin.reading import read_json_lines
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def curves(log: Path, points: int = 25) -> tuple[list[Mapping[str, float]], floa
     Returns:
         Rows with ``step`` (the last of the interval) and the means of all values; hours.
     """
-    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    rows = read_json_lines(log, "reading a training log")
     size = max(len(rows) // points, 1)
     parts = [rows[i : i + size] for i in range(0, len(rows), size)]
     out: list[Mapping[str, float]] = []

@@ -136,7 +136,7 @@ def is_made(folder: Path, info: Mapping[str, Any]) -> bool:
     path = folder / SEQUENCE_FILE
     if not path.exists():
         return False
-    document = json.loads(path.read_text(encoding="utf-8"))
+    document = read_json_object(path, READING, do_this=f"remove {folder}; it is made again")
     return all(document.get(key) == value for key, value in info.items())
 
 

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from alpasim_plugin.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.nets.checkpoints import listed, load_weights
+from alpasim_plugin.reading import parse_json, parsing, read_text
+from alpasim_plugin.reading.checkpoints import START_ANEW, read_checkpoint
 
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
@@ -230,25 +230,19 @@ class Trainer(Generic[Batch]):
             raise disk_error(path, error, "writing a training log") from error
 
     def _resume(self) -> None:
-        path = self.folder / STATE_FILE
-        with safe_open(str(path), "pt") as file:
-            meta = file.metadata()
-        if meta["facts"] != self._facts:
-            raise InputError(
-                "continuing a training run", str(path), f"the folder has {meta['facts']}, this run {self._facts}", "choose another folder"
-            )
-        self.step = int(meta["step"])
-        steps, decay_from = json.loads(meta.get("end", "[null, null]"))
+        path, doing = self.folder / STATE_FILE, "continuing a training run"
+        meta, tensors = read_checkpoint(path, doing, self._facts)
+        with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+            self.step = int(meta["step"])
+            steps, decay_from = json.loads(meta.get("end", "[null, null]"))
         if decay_from is not None and self.step > decay_from and [steps, decay_from] != [self.schedule.steps, self.schedule.decay_from]:
             found = f"its decay from {decay_from} to {steps} has begun: it is at {self.step}"
-            raise InputError(
-                "continuing a training run", str(path), found, "give the same steps and decay, or begin a run from its weights"
-            )
-        tensors = load_file(str(path))
-        self._kept = {key.removeprefix(CARRIED): value for key, value in tensors.items() if key.startswith(CARRIED)}
-        if self._carried is not None:
-            self._carried.carry(self._kept)
-        self._take(tensors)
+            raise InputError(doing, str(path), found, "give the same steps and decay, or begin a run from its weights")
+        with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+            self._kept = {key.removeprefix(CARRIED): value for key, value in tensors.items() if key.startswith(CARRIED)}
+            if self._carried is not None:
+                self._carried.carry(self._kept)
+            self._take(tensors)
         self._cut_log()
 
     def _take(self, tensors: Mapping[str, Tensor]) -> None:
@@ -258,11 +252,17 @@ class Trainer(Generic[Batch]):
                 p.copy_(tensors[f"weight.{name}"])
                 self.average[name].copy_(tensors[f"average.{name}"])
                 moments = {k.split(".")[1]: t for k, t in tensors.items() if k.startswith("moment.") and k.split(".", 2)[2] == name}
+                if wrong := [key for key, t in moments.items() if t.shape not in (p.shape, torch.Size([]))]:
+                    raise ValueError(f"the moments {wrong} of {name} have another shape")
+                if not all(bool(t.isfinite().all()) for t in (p, self.average[name], *moments.values())):
+                    raise ValueError(f"{name} or its moments are not finite")
                 self.optimiser.state[p] = {k: t if k == "step" else t.to(p.device) for k, t in moments.items()}
 
     def _cut_log(self) -> None:
-        """Drop log rows of updates after the checkpoint, which are repeated."""
-        path = self.folder / LOG_FILE
+        """Drop log rows of updates after the checkpoint, which are repeated, and a last row that a kill cut short."""
+        path, doing = self.folder / LOG_FILE, "continuing a training log"
         if path.exists():
-            rows = [line for line in path.read_text(encoding="utf-8").splitlines() if json.loads(line)["step"] <= self.step]
-            write_text(path, "".join(row + "\n" for row in rows))
+            lines = read_text(path, doing).split("\n")[:-1]
+            with parsing(doing, path, f"remove {path}; only the curves are lost", "not a training log"):
+                kept = [line for line in lines if parse_json(line, path, doing)["step"] <= self.step]
+            write_text(path, "".join(line + "\n" for line in kept))

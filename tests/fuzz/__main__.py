@@ -1,14 +1,18 @@
 """Fuzz every reader: ``python -m tests.fuzz --inputs 20000 --jobs 1``.
 
 Input i of a seed is always the same. Children are reused from input to input; one that hangs is ended and replaced. ``--start`` goes on
-where an earlier call stopped; ``--only`` takes targets whose name contains a word; ``--input N`` runs one input here, with its traceback.
+where an earlier call stopped; ``--seconds`` ends the run after a time; ``--only`` takes targets whose name contains a word; ``--input N``
+runs one input here, with its traceback. Ctrl-C and SIGTERM end the run with the table of what was done.
 """
 
 from __future__ import annotations
 
 import argparse
 import collections
+import itertools
+import math
 import multiprocessing.connection
+import signal
 import sys
 import time
 
@@ -20,6 +24,7 @@ def main() -> int:
     """Run the inputs and print a table; return 1 if there are findings."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=20_000)
+    parser.add_argument("--seconds", type=float, default=math.inf)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start", type=int, default=0)
@@ -32,11 +37,16 @@ def main() -> int:
         with workplace() as folder:
             print(target.name, check(target, inputs(target, rng_of(arguments.seed, arguments.input)), folder))
         return 0
-    todo = iter(range(arguments.start, arguments.start + arguments.inputs))
+    stopped: list[int] = []
+    for stop in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(stop, lambda number, _: stopped.append(number))
+    numbers = range(arguments.start, arguments.start + arguments.inputs)
     tally: collections.Counter[tuple[str, str]] = collections.Counter()
     findings: dict[tuple[str, str, str], list[int]] = {}
     workers = [Worker(arguments.seed, targets) for _ in range(arguments.jobs)]
     busy: list[Worker] = []
+    until = time.monotonic() + arguments.seconds
+    todo = itertools.takewhile(lambda _: not stopped and time.monotonic() < until, numbers)
     for worker in workers:
         if (number := next(todo, None)) is not None:
             worker.give(number)

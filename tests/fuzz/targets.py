@@ -28,7 +28,10 @@ from tests.fuzz.uses import (
     use_pairs,
     use_picture,
     use_poses,
+    use_training_run,
+    use_video,
     use_views,
+    use_weights,
 )  # fmt: skip
 from tests.fuzz.valid_files import (
     RICH,
@@ -45,7 +48,10 @@ from tests.fuzz.valid_files import (
     make_poses,
     make_run,
     make_scene_file,
+    make_torch_weights,
+    make_training_run,
     make_usdz,
+    make_video,
     make_views,
     make_xodr,
     picture_bytes,
@@ -105,9 +111,12 @@ def check(target: Target, files: Files, folder: Path) -> str:
 
 
 def out_of_memory(error: BaseException | None) -> None:
-    """Raise the shortage of memory that an error stands for, if it does."""
+    """Raise the shortage of memory that an error stands for, if it does.
+
+    FFmpeg answers ENOMEM for a size beyond its own bound, without asking for the memory: that is a refusal.
+    """
     while error is not None:
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError) and not type(error).__module__.startswith("av."):
             raise error
         error = error.__cause__
 
@@ -162,6 +171,10 @@ TARGETS: tuple[Target, ...] = (
     Target("run folder, gate", make_run, resealed(command("gate", "@/run")), REPORT[:4]),
     Target("gate and baseline", make_baseline, command("gate", "@/run", "--gate", "@/gate.yaml", "--baseline-file", "@/baseline.json"),
            ("gate.yaml", "baseline.json")),
+    Target("run folder, check", make_run, command("check", "@/run"), REPORT),
+    Target("torch weights", make_torch_weights, one_of("*.pt", use_weights)),
+    Target("training run", make_training_run, use_training_run),
+    Target("video", make_video, one_of("*.mp4", use_video)),
     Target("pairs", make_pairs, use_pairs),
     Target("poses", make_poses, one_of("*.json", use_poses)),
     Target("posed views", make_views, use_views),

@@ -102,6 +102,34 @@ def use_bundle(path: Path) -> None:
     load_weights(path)
 
 
+def use_weights(path: Path) -> None:
+    from alpasim_plugin.nets.checkpoints import load_weights
+
+    load_weights(path)
+
+
+def toy_training(folder: Path) -> Any:
+    """Return a trainer of one small layer, four updates long, that continues what the folder holds."""
+    import torch
+
+    from alpasim_plugin.training.trainer import Schedule, Trainer
+
+    torch.manual_seed(0)
+    net = torch.nn.Linear(2, 2)
+    return Trainer(net, folder, Schedule(4, 1e-3, 0), lambda i: torch.ones(1, 2) * i, lambda x, i: (net(x).square().mean(), {}), {"toy": 1})
+
+
+def use_training_run(folder: Path) -> None:
+    assert 0 <= toy_training(folder / "run").step
+
+
+def use_video(path: Path) -> None:
+    from alpasim_plugin.log.video_reader import VideoReader
+
+    with VideoReader(path) as video:
+        assert all(frame.image.ndim == 3 for frame in video)
+
+
 def use_picture(path: Path) -> None:
     from alpasim_plugin.log import decode_image
 

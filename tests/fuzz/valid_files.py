@@ -130,6 +130,24 @@ def make_bundle(folder: Path) -> None:
     (folder / "a.safetensors").write_bytes(save(tensors, {"format": "simrun-fixer-1", "settings": settings, "trained": "true"}))
 
 
+def make_torch_weights(folder: Path) -> None:
+    import torch
+
+    torch.save({"state_dict": {"net.a": torch.zeros(2, 3), "net.b": torch.ones(4)}}, folder / "a.pt")
+
+
+def make_training_run(folder: Path) -> None:
+    from tests.fuzz.uses import toy_training
+
+    toy_training(folder / "run").run(until=2)
+
+
+def make_video(folder: Path) -> None:
+    from alpasim_plugin.log.video import write_mp4
+
+    write_mp4(folder / "a.mp4", [np.full((32, 32, 3), 20 * i, np.uint8) for i in range(6)], 10)
+
+
 def make_run(folder: Path) -> None:
     from tests.report.make_run import Plan, make_run
 

@@ -60,7 +60,8 @@ def _where() -> str:
 
 
 def child(pipe: multiprocessing.connection.Connection, seed: int, names: list[str]) -> None:
-    """Answer inputs until the pipe closes."""
+    """Answer inputs until the pipe closes; Ctrl-C is for the parent, which then gives no further input."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     targets = [t for t in TARGETS if t.name in names]
     with workplace() as folder:
         for target in targets:  # import all that a valid input needs, before memory is limited

@@ -130,11 +130,13 @@ def test_slower_car_is_followed_at_a_distance() -> None:
 
 @pytest.mark.parametrize(
     "flat",
-    first_of([
-        tuple(Patch((30.0, 33.0), (-3.0 + i, -2.5 + i), (225, 225, 225)) for i in range(9)),  # a crosswalk
-        (Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),  # a stop line
-        (Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),  # a shadow
-    ]),
+    first_of(
+        [
+            tuple(Patch((30.0, 33.0), (-3.0 + i, -2.5 + i), (225, 225, 225)) for i in range(9)),  # a crosswalk
+            (Patch((30.0, 30.5), (-1.7, 1.7), (230, 230, 230)),),  # a stop line
+            (Patch((28.0, 34.0), (-3.0, 6.5), (45, 45, 48)),),  # a shadow
+        ]
+    ),
     ids=["crosswalk", "stop line", "shadow"],
 )
 def test_flat_things_on_the_road_are_not_braked_for(flat: tuple[Patch, ...]) -> None:

@@ -87,9 +87,9 @@ def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) ->
 
 def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
     trainer(tmp_path, Schedule(steps=2)).run()
-    with pytest.raises(InputError, match="the folder has"):
+    with pytest.raises(InputError, match="it was begun as"):
         trainer(tmp_path, Schedule(steps=2), facts="b")
-    with pytest.raises(InputError, match="the folder has"):
+    with pytest.raises(InputError, match="it was begun as"):
         trainer(tmp_path, Schedule(steps=3))
 
 

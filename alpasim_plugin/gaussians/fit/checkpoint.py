@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors import safe_open
-from safetensors.torch import load_file
-
 from alpasim_plugin.atomic import write_safetensors
-from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.fit.adam import RowAdam
 from alpasim_plugin.gaussians.fit.density import ScreenGradients
 from alpasim_plugin.gaussians.fit.model import NAMES, SplatModel
+from alpasim_plugin.reading import parsing
+from alpasim_plugin.reading.checkpoints import START_ANEW, read_checkpoint
 
 STATE_FILE = "state.safetensors"
 
@@ -29,19 +27,17 @@ def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: Screen
     """Put a saved state into objects made from the same start, and return the number of updates made.
 
     Raises:
-        InputError: The folder was begun with other views, another start or another recipe.
+        InputError: The folder was begun with other views, another start or another recipe, or its file is damaged.
     """
-    path = folder / STATE_FILE
-    with safe_open(str(path), "pt") as file:
-        meta = file.metadata()
-    if meta["facts"] != facts:
-        raise InputError("continuing a fit", str(path), f"it was begun as {meta['facts']}, this is {facts}", "choose another folder")
+    path, doing = folder / STATE_FILE, "continuing a fit"
+    meta, stored = read_checkpoint(path, doing, facts)
     device = model.node.device
-    tensors = {name: t.to(device) for name, t in load_file(str(path)).items()}
-    model.node = tensors["node"]
-    model.params = {name: tensors[f"value.{name}"].requires_grad_() for name in NAMES}
-    adam.first = {name: tensors[f"first.{name}"] for name in NAMES}
-    adam.second = {name: tensors[f"second.{name}"] for name in NAMES}
-    adam.step = int(meta["adam_step"])
-    gradients.total, gradients.count = tensors["gradients.total"], tensors["gradients.count"]
-    return int(meta["step"])
+    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+        tensors = {name: t.to(device) for name, t in stored.items()}
+        model.node = tensors["node"]
+        model.params = {name: tensors[f"value.{name}"].requires_grad_() for name in NAMES}
+        adam.first = {name: tensors[f"first.{name}"] for name in NAMES}
+        adam.second = {name: tensors[f"second.{name}"] for name in NAMES}
+        adam.step = int(meta["adam_step"])
+        gradients.total, gradients.count = tensors["gradients.total"], tensors["gradients.count"]
+        return int(meta["step"])
