@@ -120,7 +120,7 @@ def toy_training(folder: Path) -> Any:
 
 
 def use_training_run(folder: Path) -> None:
-    assert 0 <= toy_training(folder / "run").step
+    assert toy_training(folder / "run").step >= 0
 
 
 def use_video(path: Path) -> None:
