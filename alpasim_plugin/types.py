@@ -231,10 +231,11 @@ class Degradation:
 
 @dataclass(frozen=True)
 class Latency:
-    """Delay from observation to the plan taking effect: none, a fixed time, or the measured one."""
+    """Delay from observation to the plan taking effect: none, a fixed time, or the measured one, of the fixer too if ``fixer``."""
 
     kind: Literal["none", "fixed", "measured"] = "none"
     fixed_us: int = 0
+    fixer: bool = False
 
 
 @dataclass(frozen=True)

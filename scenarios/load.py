@@ -146,7 +146,7 @@ def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenari
     cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else (camera_spec(),)
     return Scenario(
         scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
-        _rates(spec), start, last_us(spec), spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us),
+        _rates(spec), start, last_us(spec), spec.timing.warmup_us, Latency(**spec.latency.model_dump()),
         _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, scene_id),
     )  # fmt: skip
 
@@ -181,7 +181,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
     return Scenario(
         chosen_id, record.source, spec.seed, record.lane_map, record.ground, record.ego_log,
         _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
-        _rates(spec), start, end, spec.timing.warmup_us, Latency(spec.latency.kind, spec.latency.fixed_us), _environment(spec),
+        _rates(spec), start, end, spec.timing.warmup_us, Latency(**spec.latency.model_dump()), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
         _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map, kind,
     )  # fmt: skip

@@ -107,6 +107,13 @@ class LatencySpec(Part):
 
     kind: Literal["none", "fixed", "measured"] = Field(default="none", description="No delay, a fixed one, or the measured one.")
     fixed_us: Annotated[int, within(b.TIME_US)] = Field(default=0, description="Delay where kind is fixed.")
+    fixer: bool = Field(default=False, description="Where kind is measured: the policy also waits for the fixer of its frames.")
+
+    @model_validator(mode="after")
+    def _fitting(self) -> LatencySpec:
+        if self.fixer and self.kind != "measured":
+            raise ValueError(f"fixer = true with kind: {self.kind}, to which it means nothing | say kind: measured, or remove fixer")
+        return self
 
 
 class DegradationSpec(Part):

@@ -62,6 +62,8 @@ def run_rollout(
         requests = rig.requests(tick, state.history, others)
         with recorder.rendering(renderer, len(requests)):
             frames = checked_frames(renderer, requests)
+        if frames:
+            plans.frames(tick.t_us, renderer.stage_ms)
         for frame, request in zip(frames, requests, strict=True):
             state.frames[frame.camera] = frame
             recorder.frame(frame, request)

@@ -37,3 +37,30 @@ def test_a_slow_answer_never_replaces_a_newer_fast_one() -> None:
     queue.submit(fast, 100_000, wall_us=10_000)
     assert queue.active(110_000) is fast
     assert queue.active(500_000) is fast
+
+
+def test_a_query_waits_until_the_fixer_is_done_with_its_frames() -> None:
+    queue = PlanQueue(Latency("measured", fixer=True))
+    queue.frames(0, {"fix": 20.0, "map": 10.0})  # ms
+    now = plan(0)
+    queue.submit(now, 0, wall_us=5_000)
+    assert queue.active(34_999) is None
+    assert queue.active(35_000) is now
+
+
+def test_a_fixer_slower_than_the_camera_falls_behind() -> None:
+    queue = PlanQueue(Latency("measured", fixer=True))
+    for t_us in (0, 100_000, 200_000):
+        queue.frames(t_us, {"fix": 150.0})
+    late = plan(200_000)
+    queue.submit(late, 200_000, wall_us=0)
+    assert queue.active(449_999) is None
+    assert queue.active(450_000) is late
+
+
+def test_the_fixer_counts_only_where_asked_for() -> None:
+    queue = PlanQueue(Latency("measured"))
+    queue.frames(0, {"fix": 150.0})
+    now = plan(0)
+    queue.submit(now, 0, wall_us=5_000)
+    assert queue.active(5_000) is now

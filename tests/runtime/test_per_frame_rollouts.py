@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 
+import numpy as np
+
+from alpasim_plugin import run_rollout
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.per_frame import PerFrameRenderer
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
-from alpasim_plugin.types import CameraSpec, Frame, Scenario
+from alpasim_plugin.types import F64, CameraSpec, Frame, Latency, Scenario
+from tests.runtime.grey_renderer import Grey
 from tests.runtime.test_fixed_rollouts import Watching, Zigzag, assert_same_pictures, drive, rendered
 
 SMALL = ("weights.bundle=null", "generator.widths=[8,8,8]", "untrained=random", "uses_map=false")
@@ -49,3 +54,14 @@ def test_cameras_of_different_rates_share_a_session(straight_road: Scenario) -> 
     for camera in ("front", "slow"):
         mine = [frame for frame in frames if frame.camera == camera]
         assert_same_pictures([frame for frame in run.frames if frame.camera == camera], offline(mine))
+
+
+def test_the_fixers_time_delays_plans_where_latency_says_so(straight_road: Scenario) -> None:
+    class Slow(Grey):
+        stage_ms = MappingProxyType({"fix": 150.0})  # longer than the camera's period
+
+    def path(latency: Latency) -> F64:
+        scenario = replace(straight_road, end_us=1_500_000, latency=latency)
+        return run_rollout(scenario, Slow(), Zigzag(scenario)).log().ego.xyz
+
+    assert not np.array_equal(path(Latency("measured", fixer=True)), path(Latency("measured")))
