@@ -14,8 +14,8 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.precision import choose_precision
-from alpasim_plugin.training.pixel_rollout import PixelObjectives
 from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
+from alpasim_plugin.training.pixel_variants import DEPLOYED, PIXEL_VARIANTS, pixel_variant
 from alpasim_plugin.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.training.trainer import Schedule
 
@@ -49,6 +49,7 @@ def per_frame(
     perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")] = 0.1,
     temporal: Annotated[float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")] = 0.25,
     flow: Annotated[float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")] = 0.25,
+    variant: Annotated[str, typer.Option("--variant", help=f"Row of the paper's ablation: {', '.join(PIXEL_VARIANTS)}.")] = DEPLOYED,
     init: Annotated[Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="A setting of that fixer: fixer.key=value.")] = None,
@@ -84,10 +85,11 @@ def per_frame(
     schedule = Schedule(
         steps, peak_lr=lr, warmup=warmup, clip=0.5, ema=ema, save_every=save_every, decay_from=decay_from or max(4 * steps // 5, 1)
     )
-    objectives = PixelObjectives(perceptual, temporal, flow, horizon=frames)
-    distance = progress.perceptual_term(metric_weights) if perceptual else None
+    chosen_variant = pixel_variant(variant).weighted(perceptual, temporal, flow, horizon=frames)
+    needs_distance = any(stage.perceptual for stage in chosen_variant.stages)
+    distance = progress.perceptual_term(metric_weights) if needs_distance else None
     dtype = torch.bfloat16 if chosen.name == "bf16" else None
-    run = PixelRun(settings, source, objectives, schedule, init, seed, dtype, keep_every)
+    run = PixelRun(settings, source, chosen_variant, schedule, init, seed, dtype, keep_every)
     progress.wrote(train_per_frame(run, out, distance, progress.update, stop_at), as_json)
 
 

@@ -113,13 +113,14 @@ class PixelFixer(Fixer):
         height, width = view.shape
 
         def source(draw: int) -> Tensor:
-            if view.alpha is None or self.settings.holes == "render":
+            everywhere = self.settings.holes == "everywhere"
+            if self.settings.holes == "render" or (view.alpha is None and not everywhere):
                 return inputs.render
 
             def noise(b: int, pixels: I64) -> F32:
                 return pixel_noise(self.scene_id, self.seed, view.cameras[b], draw, counts[b], pixels)
 
-            return sparse_source(inputs.render, inputs.opacity, noise)
+            return sparse_source(inputs.render, torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity, noise)
 
         joined = PixelState(*(torch.cat(parts) for parts in zip(*states, strict=True))) if len(states) > 1 else states[0]
         video, after = fix_frame(self.generator, self.settings, inputs, joined, source)

@@ -31,8 +31,9 @@ class PixelFixerSettings(FixerSettings):
         default="refuse", description="Initialisation without weights: returns the render (identity), random, or an error (refuse)."
     )
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
-    holes: Literal["noise", "render"] = Field(
-        default="noise", description="Source of a frame where the render is transparent: noise (Eq. 1), or the render."
+    holes: Literal["noise", "render", "everywhere"] = Field(
+        default="noise",
+        description="Source of a frame: noise where the render is transparent (Eq. 1), the render alone, or noise everywhere.",
     )
     keep_render: bool = Field(
         default=True, description="Keep the render where it is opaque, the change is large, and neither map nor history supports it."

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
 from alpasim_plugin.nets.pixel_source import pixel_source
 from alpasim_plugin.nets.sampling import interpolant
 
+History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
@@ -32,9 +34,10 @@ class PixelObjectives:
     """Weights of the terms, and the axes of the ablation.
 
     Args:
-        perceptual, temporal, flow: Weights of the terms beside the picture's; 0 switches a term off.
+        perceptual, temporal, flow, picture: Weights of the terms; 0 switches a term off.
         horizon: k, frames that gradients pass through; 1 cuts the history at every frame.
-        clean_history: Whether the truth takes the place of the generator's own outputs in the state (diffusion forcing).
+        history: What the state holds of the past: the generator's ``own`` outputs, the truth in their place (``clean``), or the truth that
+            the generator noised and denoised again (``redenoised``; no gradient passes through it).
         use_map: Whether the map is given; otherwise it is black.
         mixed: Whether the source is Eq. 1; otherwise it is noise everywhere, with the render as a condition.
     """
@@ -43,9 +46,15 @@ class PixelObjectives:
     temporal: float = 0.25
     flow: float = 0.25
     horizon: int = 4
-    clean_history: bool = False
+    history: History = "own"
     use_map: bool = True
     mixed: bool = True
+    picture: float = 1.0
+
+    @property
+    def in_pixels(self) -> bool:
+        """Whether a term is computed on the deployed step, so that gradients pass through the rollout."""
+        return bool(self.picture or self.perceptual or self.temporal)
 
 
 @dataclass(frozen=True)
@@ -60,6 +69,7 @@ class PixelSample:
         t: ``(B,)`` uniform in 0..1, times of the flow term.
         flow_frame: Frame of the flow term.
         perceptual_frames: Frames of the perceptual term.
+        t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
     """
 
     render: Tensor
@@ -71,6 +81,7 @@ class PixelSample:
     t: Tensor
     flow_frame: int
     perceptual_frames: Sequence[int]
+    t_history: Tensor
 
 
 @dataclass(frozen=True)
@@ -111,10 +122,16 @@ def pixel_losses(
             flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
         if i and i % objectives.horizon == 0:
             state = state.detached()
-        out, state = net(render, opacity, sdmap, state, _source(render, opacity, sample.eps[:, i], objectives))
+        before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
+        with torch.set_grad_enabled(objectives.in_pixels):
+            out, state = net(render, opacity, sdmap, before, source)
         outputs.append(out)
-        if objectives.clean_history:
+        if objectives.history == "clean":
             state = state._replace(output=truth)
+        elif objectives.history == "redenoised":
+            t = sample.t_history[:, i]
+            with torch.no_grad():
+                _, state = net(render, opacity, sdmap, before, interpolant(truth, source, t[:, None, None, None]), t)
     made = torch.stack(outputs, dim=1)
     picture = (made - sample.truth).abs().mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
@@ -124,7 +141,7 @@ def pixel_losses(
         chosen = list(sample.perceptual_frames)
         images = [x[:, chosen].flatten(0, 1).permute(0, 3, 1, 2) for x in (made, sample.truth)]
         perceptual = distance(images[0], images[1]).mean()
-    total = picture + objectives.perceptual * perceptual + objectives.temporal * temporal + objectives.flow * flow
+    total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal + objectives.flow * flow
     return PixelLosses(total, picture, perceptual, temporal, flow, made, state.detached())
 
 

@@ -19,8 +19,9 @@ from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.seeding import derive_seed
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE, half
 from alpasim_plugin.training.model_card import ModelCard, curves
-from alpasim_plugin.training.pixel_rollout import Distance, PixelObjectives
+from alpasim_plugin.training.pixel_rollout import Distance
 from alpasim_plugin.training.pixel_task import FrameStreams, PixelTask
+from alpasim_plugin.training.pixel_variants import DEPLOYED, PixelVariant
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 DOING = "training a per-frame generator"
@@ -33,7 +34,7 @@ class PixelRun:
     Args:
         settings: Fixer to train: its sizes.
         streams: Data.
-        objectives: Weights of the terms.
+        variant: Objectives.
         schedule: Optimisation.
         init: A checkpoint of another run (weights, averages and moments go on) or a bundle (weights); None begins anew.
         seed: Of the initial weights and the noise.
@@ -43,7 +44,7 @@ class PixelRun:
 
     settings: PixelFixerSettings
     streams: FrameStreams
-    objectives: PixelObjectives
+    variant: PixelVariant
     schedule: Schedule
     init: Path | None = None
     seed: int = 0
@@ -72,7 +73,7 @@ def train_per_frame(
         InfrastructureError: The loss is not finite.
     """
     net = initial_generator(run)
-    task = PixelTask(net, run.streams, run.objectives, distance, run.seed)
+    task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed)
     facts = {**task.facts, "init": file_sha256(run.init) if run.init else None, "precision": str(run.precision)}
     trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision, task)
     if run.init is not None and _is_checkpoint(run.init):
@@ -118,9 +119,10 @@ def sizes_of(settings: PixelFixerSettings) -> PixelSizes:
 
 def write_bundle(run: PixelRun, path: Path, weights: Mapping[str, Tensor], updates: int) -> Path:
     """Write averaged weights as a float16 bundle."""
-    settings = run.settings.model_copy(update={"uses_map": run.objectives.use_map, "steps": (1000.0,), "holes": "noise"})
+    settings = run.settings.model_copy(update={"uses_map": run.variant.use_map, "steps": (1000.0,), "holes": run.variant.holes})
     tensors: dict[str, Any] = {key: half(value) for key, value in weights.items()}
-    save_bundle(path, {"generator": tensors}, settings, trained=True, note=f"{updates} updates")
+    named = "" if run.variant.name == DEPLOYED else f"{run.variant.name}, "
+    save_bundle(path, {"generator": tensors}, settings, trained=True, note=f"{named}{updates} updates")
     return path
 
 

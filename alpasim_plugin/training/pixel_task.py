@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
@@ -11,7 +11,8 @@ from torch import Tensor
 
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
 from alpasim_plugin.seeding import derive_seed, stream
-from alpasim_plugin.training.pixel_rollout import Distance, PixelObjectives, PixelSample, pixel_losses
+from alpasim_plugin.training.pixel_rollout import Distance, PixelSample, pixel_losses
+from alpasim_plugin.training.pixel_variants import PixelVariant
 
 SEEN = 2  # frames of the perceptual term in an update
 
@@ -71,15 +72,22 @@ class PixelTask:
     Args:
         net: Trained.
         streams: Data.
-        objectives: Weights of the terms.
+        variant: Objectives, which may change in the course of the run.
+        steps: Updates of the run, which a variant of several stages divides.
         distance: Name and function of the perceptual term, or None.
         seed: Of the noise.
     """
 
     def __init__(
-        self, net: PixelGenerator, streams: FrameStreams, objectives: PixelObjectives, distance: tuple[str, Distance] | None, seed: int = 0
+        self,
+        net: PixelGenerator,
+        streams: FrameStreams,
+        variant: PixelVariant,
+        steps: int,
+        distance: tuple[str, Distance] | None,
+        seed: int = 0,
     ) -> None:
-        self.net, self.streams, self.objectives, self.distance, self.seed = net, streams, objectives, distance, seed
+        self.net, self.streams, self.variant, self.steps, self.distance, self.seed = net, streams, variant, steps, distance, seed
         self._state: PixelState | None = None
 
     @property
@@ -87,7 +95,7 @@ class PixelTask:
         """What identifies the task."""
         named = self.distance and self.distance[0]
         return {
-            "streams": dict(self.streams.facts()), "objectives": asdict(self.objectives), "sizes": self.net.facts, "distance": named,
+            "streams": dict(self.streams.facts()), "variant": self.variant.facts(self.steps), "sizes": self.net.facts, "distance": named,
             "seed": self.seed,
         }  # fmt: skip
 
@@ -101,17 +109,17 @@ class PixelTask:
         rng = stream("training", self.seed, "pixel.frames", index)
         frames = render.shape[1]
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
-        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, int(rng.integers(frames)), seen)
+        t_history = torch.rand(len(render), frames, generator=source)
+        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, int(rng.integers(frames)), seen, t_history)
         return NoisyBatch(sample, got.fresh)
 
     def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of an update and what is logged; the state goes on to the next."""
-        del index
         sample = batch.sample
         start = self.net.start(sample.render[:, 0])
         state = start if self._state is None else self._state.restarted(batch.fresh, start)
         distance = None if self.distance is None else self.distance[1]
-        found = pixel_losses(self.net, sample, state, self.objectives, distance)
+        found = pixel_losses(self.net, sample, state, self.variant.objectives(index, self.steps), distance)
         self._state = found.state
         made, given = (_psnr_db(x, sample.truth) for x in (found.predictions.detach(), sample.render))
         degraded = given < 40  # renders that are the truth, or nearly, say nothing about repair

@@ -23,6 +23,7 @@ from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from alpasim_plugin.types import U8, BlockRule, Frame
+from tests.examples import first_of
 from tests.fixers.fixer_cases import SIZE, maps_of, moving_picture, pixels, small_settings
 
 FRAMES = moving_picture(12)  # the last ones through a recording of the network
@@ -66,16 +67,19 @@ def scaled(images: np.ndarray) -> Tensor:
     return torch.from_numpy(images).float() / 127.5 - 1
 
 
-def test_streaming_equals_the_rollout_of_the_training(bundle: Path) -> None:
-    streamed = pixels(run(session(bundle, "keep_render=false"), FRAMES, MAPS))
+@pytest.mark.parametrize("holes", first_of(["noise", "everywhere"]))
+def test_streaming_equals_the_rollout_of_the_training(bundle: Path, holes: str) -> None:
+    streamed = pixels(run(session(bundle, "keep_render=false", f"holes={holes}"), FRAMES, MAPS))
     render, sdmap = scaled(pixels(FRAMES))[None], scaled(np.stack(MAPS))[None]
     opacity = torch.from_numpy(np.stack([f.alpha for f in FRAMES if f.alpha is not None]))[None, ..., None]
     everywhere = np.arange(SIZE[0] * SIZE[1])
     eps = np.stack([pixel_noise("scene", 0, "front", 0, i, everywhere).reshape(*SIZE, 3) for i in range(len(FRAMES))])
-    sample = PixelSample(render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, ())
+    sample = PixelSample(render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, (), torch.ones(1, 1))
     net = generator().requires_grad_(False)
     with torch.no_grad():
-        whole = pixel_losses(net, sample, net.start(render[:, 0]), PixelObjectives(0, 0, 0, horizon=99), None).predictions[0]
+        whole = pixel_losses(
+            net, sample, net.start(render[:, 0]), PixelObjectives(0, 0, 0, horizon=99, mixed=holes == "noise"), None
+        ).predictions[0]
     expected = whole.clamp(-1, 1).add(1).mul(127.5).round().to(torch.uint8).numpy()
     assert load_generator(at(bundle)).step.recorded  # the last frames went through a recording
     assert np.abs(streamed.astype(int) - pixels(FRAMES)).mean() > 2  # these weights do something

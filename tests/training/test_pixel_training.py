@@ -10,13 +10,14 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.bundle import parts_of
+from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.nets.pixel_source import pixel_source
 from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
+from alpasim_plugin.training.pixel_variants import pixel_variant
 from alpasim_plugin.training.trainer import STATE_FILE, Schedule
 
 SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
@@ -52,7 +53,16 @@ def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
     render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity))
     torch.manual_seed(seed)
     return PixelSample(
-        render, truth, sdmap, opacity, torch.randn_like(render), torch.randn_like(render[:, 0]), torch.full((2,), t), 1, (0, 2)
+        render,
+        truth,
+        sdmap,
+        opacity,
+        torch.randn_like(render),
+        torch.randn_like(render[:, 0]),
+        torch.full((2,), t),
+        1,
+        (0, 2),
+        torch.rand(2, FRAMES),
     )
 
 
@@ -103,18 +113,57 @@ def test_switches_of_the_ablation() -> None:
         return pixel_losses(net, s, start, PixelObjectives(perceptual=0, **changes), None).predictions
 
     own = made()
-    assert torch.equal(made(clean_history=True)[:, 0], own[:, 0])
-    assert not torch.allclose(made(clean_history=True)[:, 1], own[:, 1])
+    for history in ("clean", "redenoised"):
+        assert torch.equal(made(history=history)[:, 0], own[:, 0])
+        assert not torch.allclose(made(history=history)[:, 1], own[:, 1])
     assert not torch.allclose(made(use_map=False), own)
     assert not torch.allclose(made(mixed=False), own)
     assert float(pixel_losses(net, s, start, PixelObjectives(flow=0, temporal=0), None).flow) == 0
 
 
-def run_of(steps: int = 4, decay_from: int = 3, **changes: Any) -> PixelRun:
+def test_a_redenoised_history_is_the_truth_noised_and_denoised() -> None:
+    net, s = generator(), sample()
+    found = pixel_losses(net, s, net.start(s.render[:, 0]), PixelObjectives(perceptual=0, history="redenoised"), None)
+    state = net.start(s.render[:, 0])
+    for i in range(FRAMES):
+        z_1 = pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i])
+        given = (s.render[:, i], s.opacity[:, i], s.sdmap[:, i], state)
+        torch.testing.assert_close(found.predictions[:, i], net(*given, z_1)[0])
+        t = s.t_history[:, i]
+        at = t[:, None, None, None]
+        _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
+
+
+def test_flow_matching_alone_sends_no_gradient_through_the_rollout() -> None:
+    net, s = generator(), sample()
+    flow_alone = pixel_variant("V2").stages[0]
+    found = pixel_losses(net, s, net.start(s.render[:, 0]), flow_alone, None)
+    assert not found.predictions.requires_grad
+    assert torch.equal(found.total, found.flow)
+
+
+def test_stages_take_their_shares_of_the_updates() -> None:
+    two = pixel_variant("V7").weighted(perceptual=0.2, temporal=0.25, flow=0.25, horizon=4)
+    assert [two.objectives(i, 8).in_pixels for i in range(8)] == [False] * 5 + [True] * 3
+    assert two.objectives(7, 8).perceptual == 0.2
+    assert two.objectives(0, 8).perceptual == 0
+    assert two.facts(8) != two.facts(16)
+    assert pixel_variant("V9").facts(8) == pixel_variant("V9").facts(16)
+
+
+def test_a_variant_is_written_as_it_must_be_run(tmp_path: Path) -> None:
+    for name, holes, uses_map in (("V5", "noise", False), ("V6", "everywhere", True)):
+        bundle = train_per_frame(run_of(2, 1, variant=name), tmp_path / name, None)
+        settings = fixer_settings(*bundle_fixer(bundle))
+        assert isinstance(settings, PixelFixerSettings)
+        assert (settings.holes, settings.uses_map) == (holes, uses_map)
+
+
+def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: Any) -> PixelRun:
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)
     schedule = Schedule(steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from)
-    return PixelRun(settings, Streams(), PixelObjectives(perceptual=0), schedule, **changes)
+    return PixelRun(settings, Streams(), pixel_variant(variant).weighted(0, 0.25, 0.25, horizon=4), schedule, **changes)
 
 
 def weights(path: Path) -> dict[str, Tensor]:
