@@ -9,18 +9,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-import av
 import numpy as np
-from av.video.reformatter import Interpolation
 
 from alpasim_plugin.bounds import ARCHIVE_BYTES
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.log.pyav import exact_conversion, load_av
 from alpasim_plugin.reading import check_regular
 from alpasim_plugin.types import U8
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
-# The scaler's faster settings darken pictures by a grey level each way; these are exact to a tenth of one.
-EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP | Interpolation.FULL_CHR_H_INT
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
 
 
@@ -76,9 +73,10 @@ class VideoReader:
     def __init__(self, path: Path | str, doing: str = "reading a video") -> None:
         self.path, self._doing = Path(path), doing
         check_regular(self.path, doing, ARCHIVE_BYTES)
+        self._av = load_av(doing)
         try:
-            self._container = av.open(str(self.path))
-        except (OSError, av.FFmpegError) as error:
+            self._container = self._av.open(str(self.path))
+        except (OSError, self._av.FFmpegError) as error:
             raise self._refusal(error.strerror or str(error)) from error
         try:
             self._begin()
@@ -150,12 +148,12 @@ class VideoReader:
             for frame in self._container.decode(self._stream):
                 yield frame
                 count += 1
-        except av.FFmpegError as error:
+        except self._av.FFmpegError as error:
             raise self._refusal(f"damage after frame {count}: {error.strerror or error}") from error
 
     def _upright(self, frame: Any) -> U8:
         # By the matrix that the frame states; BT.601 where it states none.
-        image: U8 = frame.to_ndarray(format="rgb24", interpolation=EXACT, threads=1)
+        image: U8 = frame.to_ndarray(format="rgb24", interpolation=exact_conversion(self._av), threads=1)
         turns = round(frame.rotation / 90) % 4  # counter-clockwise
         return np.ascontiguousarray(np.rot90(image, turns)) if turns else image
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import av
 import numpy as np
 
 from alpasim_plugin.atomic import temporary_path
 from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.log.video_reader import EXACT, UNSPECIFIED
+from alpasim_plugin.log.pyav import exact_conversion, load_av
+from alpasim_plugin.log.video_reader import UNSPECIFIED
 from alpasim_plugin.types import U8
 
 BT601, BT709 = 5, 1  # matrices of ITU-T H.273
@@ -57,9 +57,10 @@ class VideoWriter:
         self._matrix = WRITABLE.get(colour[0], BT709)
         self._size: tuple[int, ...] | None = None
         self._partial = temporary_path(self.path)
+        self._av = load_av(DOING)
         try:
-            self._container = av.open(str(self._partial), mode="w", format="mp4")
-        except (OSError, av.FFmpegError) as error:
+            self._container = self._av.open(str(self._partial), mode="w", format="mp4")
+        except (OSError, self._av.FFmpegError) as error:
             raise self._failure(error) from error
         self._stream = self._container.add_stream("libx264", rate=rate, options={"crf": str(crf), "preset": "veryfast"})
         self._stream.pix_fmt = "yuv420p"
@@ -79,7 +80,7 @@ class VideoWriter:
                 raise InputError(DOING, str(self.path), "no frames", "give at least one frame")
             if error is None:
                 self._partial.replace(self.path)
-        except (OSError, av.FFmpegError) as failure:
+        except (OSError, self._av.FFmpegError) as failure:
             raise self._failure(failure) from (error or failure)
         finally:
             self._partial.unlink(missing_ok=True)
@@ -93,12 +94,12 @@ class VideoWriter:
         even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
         if self.count == 0:
             self._state_format(*even.shape[:2])
-        rgb = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-        frame = rgb.reformat(format="yuv420p", dst_colorspace=self._matrix, interpolation=EXACT, threads=1)
+        rgb = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+        frame = rgb.reformat(format="yuv420p", dst_colorspace=self._matrix, interpolation=exact_conversion(self._av), threads=1)
         frame.pts, frame.time_base, frame.duration = time, self._time_base, duration
         try:
             self._container.mux(self._stream.encode(frame))
-        except (OSError, av.FFmpegError) as error:
+        except (OSError, self._av.FFmpegError) as error:
             raise self._failure(error) from error
         self.count += 1
 
