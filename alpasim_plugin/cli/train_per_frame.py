@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.precision import choose_precision
 from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.training.pixel_variants import DEPLOYED, PIXEL_VARIANTS, pixel_variant
+from alpasim_plugin.training.ranks import in_ranks
 from alpasim_plugin.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.training.trainer import Schedule
 
@@ -24,6 +26,8 @@ EPILOG = """
 Examples:
 
 - `simrun train per-frame data/pairs --video data/video --out runs/s --steps 20000 --decay-from 16000`
+
+- `simrun train per-frame data/pairs --out runs/s --threads 1 --processes 2`: two cores, three streams each
 
 - `simrun train per-frame data/pairs --out runs/s2 --init runs/s/state.safetensors --warmup 0`: further, on other data
 """
@@ -59,6 +63,9 @@ def per_frame(
         Literal["auto", "fp32", "bf16"], typer.Option("--precision", help="Of the forward passes; auto: what pays on this machine.")
     ] = "auto",
     threads: options.Threads = None,
+    processes: Annotated[
+        int, typer.Option("--processes", min=1, help="Processes that share the streams of a batch; a divisor of --streams.")
+    ] = 1,
     seed: options.Seed = 0,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
@@ -90,7 +97,8 @@ def per_frame(
     distance = progress.perceptual_term(metric_weights) if needs_distance else None
     dtype = torch.bfloat16 if chosen.name == "bf16" else None
     run = PixelRun(settings, source, chosen_variant, schedule, init, seed, dtype, keep_every)
-    progress.wrote(train_per_frame(run, out, distance, progress.update, stop_at), as_json)
+    work = partial(train_per_frame, run, out, distance, stop_at)
+    progress.wrote(in_ranks(work, processes, progress.update), as_json)
 
 
 def _size(text: str) -> tuple[int, int]:

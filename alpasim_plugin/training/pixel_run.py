@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.pixel_rollout import Distance
 from alpasim_plugin.training.pixel_task import FrameStreams, PixelTask
 from alpasim_plugin.training.pixel_variants import DEPLOYED, PixelVariant
+from alpasim_plugin.training.ranks import ALONE, Ranks, Report
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 DOING = "training a per-frame generator"
@@ -56,8 +57,9 @@ def train_per_frame(
     run: PixelRun,
     out: Path,
     distance: tuple[str, Distance] | None,
-    report: Callable[[int, Mapping[str, float]], None] | None = None,
     stop_at: int | None = None,
+    ranks: Ranks = ALONE,
+    report: Report | None = None,
 ) -> Path:
     """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write OUT/fixer.safetensors and its card.
 
@@ -65,17 +67,18 @@ def train_per_frame(
         run: Definition of the run.
         out: Folder of the run.
         distance: Name and function of the perceptual term, or None.
-        report: Called after every update with its number and the logged values.
         stop_at: Update after which to stop and write the weights; a later call continues.
+        ranks: The processes that train together; see `alpasim_plugin.training.ranks.in_ranks`.
+        report: Called after every update with its number and the logged values.
 
     Raises:
         InputError: Weights of other sizes, or a folder of another run.
         InfrastructureError: The loss is not finite.
     """
     net = initial_generator(run)
-    task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed)
+    task = PixelTask(net, run.streams, run.variant, run.schedule.steps, distance, run.seed, ranks)
     facts = {**task.facts, "init": file_sha256(run.init) if run.init else None, "precision": str(run.precision)}
-    trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision, task)
+    trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision, task, ranks)
     if run.init is not None and _is_checkpoint(run.init):
         trainer.begin_from(run.init)
 
@@ -86,6 +89,8 @@ def train_per_frame(
             report(step, numbers)
 
     trainer.run(reported, stop_at)
+    if not ranks.is_first:
+        return out / BUNDLE_FILE
     path = write_bundle(run, out / BUNDLE_FILE, trainer.averaged(), trainer.step)
     rows, hours = curves(out / LOG_FILE)
     training = {"schedule": asdict(run.schedule), "updates": trainer.step, **facts}

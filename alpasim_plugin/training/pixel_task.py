@@ -13,6 +13,7 @@ from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
 from alpasim_plugin.seeding import derive_seed, stream
 from alpasim_plugin.training.pixel_rollout import Distance, PixelSample, pixel_losses
 from alpasim_plugin.training.pixel_variants import PixelVariant
+from alpasim_plugin.training.ranks import ALONE, Ranks
 
 SEEN = 2  # frames of the perceptual term in an update
 
@@ -49,8 +50,13 @@ class FrameBatch(Protocol):
 class FrameStreams(Protocol):
     """Batches by number of update."""
 
-    def update(self, i: int) -> FrameBatch:
-        """Return the frames of update ``i``, a function of ``i`` only."""
+    def update(self, i: int, slots: slice) -> FrameBatch:
+        """Return the frames of some streams in update ``i``, a function of ``i`` only."""
+        ...
+
+    @property
+    def batch(self) -> int:
+        """Number of streams."""
         ...
 
     def facts(self) -> Mapping[str, Any]:
@@ -76,6 +82,7 @@ class PixelTask:
         steps: Updates of the run, which a variant of several stages divides.
         distance: Name and function of the perceptual term, or None.
         seed: Of the noise.
+        ranks: The processes that share the batches, each with some of the streams.
     """
 
     def __init__(
@@ -86,8 +93,10 @@ class PixelTask:
         steps: int,
         distance: tuple[str, Distance] | None,
         seed: int = 0,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.net, self.streams, self.variant, self.steps, self.distance, self.seed = net, streams, variant, steps, distance, seed
+        self.slots = ranks.rows(streams.batch)
         self._state: PixelState | None = None
 
     @property
@@ -101,15 +110,17 @@ class PixelTask:
 
     def batch(self, index: int) -> NoisyBatch:
         """Return the frames and noise of update ``index``."""
-        got = self.streams.update(index)
+        got, slots = self.streams.update(index, self.slots), self.slots
         render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2).contiguous() for x in (got.render, got.target, got.map, got.opacity))
         source = torch.Generator().manual_seed(derive_seed("training", self.seed, "pixel.noise", index) % 2**63)
-        eps, eps_flow = (torch.randn(shape, generator=source) for shape in (render.shape, render[:, 0].shape))
-        t = torch.rand(len(render), generator=source)
+        # Drawn for all streams, so that a stream's noise does not depend on which process has it.
+        whole = (self.streams.batch, *render.shape[1:])
+        eps, eps_flow = (torch.randn(shape, generator=source)[slots] for shape in (whole, (whole[0], *whole[2:])))
+        t = torch.rand(whole[0], generator=source)[slots]
         rng = stream("training", self.seed, "pixel.frames", index)
         frames = render.shape[1]
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
-        t_history = torch.rand(len(render), frames, generator=source)
+        t_history = torch.rand(whole[0], frames, generator=source)[slots]
         sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, int(rng.integers(frames)), seen, t_history)
         return NoisyBatch(sample, got.fresh)
 

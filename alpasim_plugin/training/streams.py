@@ -142,9 +142,9 @@ class TrainingStreams:
                 found = f"frames of {size[1]}x{size[0]}, smaller than the crop {crop[1]}x{crop[0]}"
                 raise InputError(DOING, str(sequence.folder), found, "crop less")
 
-    def update(self, i: int) -> StreamBatch:
-        """Return the batch of update ``i``, counted from 0."""
-        slots = [self.episode_of(slot, i) for slot in range(self.batch)]
+    def update(self, i: int, some: slice = slice(None)) -> StreamBatch:
+        """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""
+        slots = [self.episode_of(slot, i) for slot in range(self.batch)[some]]
         shown = [self._show(episode, at) for episode, at in slots]
         render, opacity, sdmap, target = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
         fresh = torch.tensor([at == 0 or i == 0 for _, at in slots])

@@ -22,6 +22,7 @@ from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.nets.checkpoints import listed, load_weights
 from alpasim_plugin.reading import parse_json, parsing, read_text
 from alpasim_plugin.reading.checkpoints import START_ANEW, read_checkpoint
+from alpasim_plugin.training.ranks import ALONE, Ranks
 
 Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
@@ -100,6 +101,7 @@ class Trainer(Generic[Batch]):
         facts: Identity of the run; a folder of another run is refused.
         autocast: Precision of the forward pass, or None.
         carried: What the task carries from batch to batch, or None.
+        ranks: The processes that share the batches; ``batch`` and ``carried`` are this one's rows.
 
     Raises:
         InputError: The folder holds another run, or one whose decay has begun under another schedule.
@@ -115,7 +117,9 @@ class Trainer(Generic[Batch]):
         facts: Mapping[str, Any],
         autocast: torch.dtype | None = None,
         carried: Carried | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
+        self.ranks = ranks
         self.module, self.folder, self.schedule = module, folder, schedule
         self._batch, self._loss, self._autocast, self._carried = batch, loss, autocast, carried
         self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
@@ -140,8 +144,9 @@ class Trainer(Generic[Batch]):
         last = min(until or self.schedule.steps, self.schedule.steps)
         while self.step < last:
             numbers = self._update()
-            self._write_log(numbers)
-            if report is not None:
+            if self.ranks.is_first:
+                self._write_log(numbers)
+            if report is not None and self.ranks.is_first:
                 report(self.step, numbers)
             if self.step % self.schedule.save_every == 0 or self.step == last:
                 self.save()
@@ -172,8 +177,9 @@ class Trainer(Generic[Batch]):
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
         for name, p in self.parameters.items():
             tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state[p].items()}
-        if self._kept:
-            tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self._kept.items()}
+        tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self.ranks.joined(self._kept).items()}
+        if not self.ranks.is_first:
+            return
         meta = {"step": str(self.step), "facts": self._facts, "end": json.dumps([self.schedule.steps, self.schedule.decay_from])}
         write_safetensors(self.folder / STATE_FILE, tensors, meta)
 
@@ -188,11 +194,12 @@ class Trainer(Generic[Batch]):
             device = next(iter(self.parameters.values())).device.type
             with torch.autocast(device, self._autocast or torch.bfloat16, enabled=self._autocast is not None):
                 loss, numbers = self._loss(batch, index)
-            if not torch.isfinite(loss):
+            if not torch.isfinite(loss) and self.ranks.count == 1:  # several notice together, by the norm of their mean gradient
                 self._stop(batch, f"loss {loss.item()} in batch {index}")
             (loss / n).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": float(loss.detach()), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / n
+        self._average_ranks(sums)
         norm = float(nn.utils.clip_grad_norm_(list(self.parameters.values()), self.schedule.clip))
         if not math.isfinite(norm):
             self._stop(batch, f"gradient norm {norm} at update {self.step}")
@@ -205,6 +212,13 @@ class Trainer(Generic[Batch]):
         self._update_average()
         return {**sums, "grad_norm": norm, "lr": lr, "s": time.perf_counter() - began}
 
+    def _average_ranks(self, numbers: dict[str, float]) -> None:
+        """Replace gradients and logged values by their means over the ranks."""
+        if self.ranks.count > 1:
+            logged = torch.tensor([*numbers.values()], dtype=torch.float32)
+            self.ranks.average([*(p.grad for p in self.parameters.values() if p.grad is not None), logged])
+            numbers.update(zip(numbers, logged.tolist(), strict=True))
+
     def _update_average(self) -> None:
         """Update the EMA; its decay is lower in early updates, so that the initial weights have little influence."""
         decay = min(self.schedule.ema, (1 + self.step) / (10 + self.step))
@@ -213,7 +227,7 @@ class Trainer(Generic[Batch]):
                 self.average[name].lerp_(p, 1 - decay)
 
     def _stop(self, batch: Batch, found: str) -> None:
-        path = self.folder / BAD_FILE
+        path = self.folder / (BAD_FILE if self.ranks.is_first else f"{self.ranks.rank}-{BAD_FILE}")
         with atomic_file(path) as partial:
             torch.save(batch, partial)
         self.save()
@@ -241,9 +255,11 @@ class Trainer(Generic[Batch]):
         with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
             self._kept = {key.removeprefix(CARRIED): value for key, value in tensors.items() if key.startswith(CARRIED)}
             if self._carried is not None:
+                self._kept = {name: value[self.ranks.rows(len(value))] for name, value in self._kept.items()}
                 self._carried.carry(self._kept)
             self._take(tensors)
-        self._cut_log()
+        if self.ranks.is_first:
+            self._cut_log()
 
     def _take(self, tensors: Mapping[str, Tensor]) -> None:
         """Take weights, averages and moments from a checkpoint's tensors."""
