@@ -14,6 +14,7 @@ import numpy as np
 
 from alpasim_plugin.alpasim.asl import AslReader
 from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, logging_pb2
+from alpasim_plugin.bounds import BODY_M
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.log.schema import EGO, increasing_times, read_camera, read_poses, read_trajectory, read_transform
 from alpasim_plugin.types import Actor, Box, LoggedImage, LoggedPlan, RolloutLog, Trajectory
@@ -143,7 +144,7 @@ def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> Rollout
         if poses:
             i = definition.actor_id
             track = _track(poses, f"{path}, poses of actor {i!r}")
-            actors[i] = Actor(i, definition.actor_label, _box(definition.aabb), track, is_static=i in got.static_ids)
+            actors[i] = Actor(i, definition.actor_label, _box(definition.aabb, path, i), track, is_static=i in got.static_ids)
     defined = {d.actor_id for d in definitions}
     seed = got.info.pop("seed")
     info = {
@@ -157,7 +158,7 @@ def _assemble(path: Path, got: _Collected, warnings: tuple[str, ...]) -> Rollout
     return RolloutLog(
         scene_id=session.scene_id,
         session_uuid=session.session_uuid,
-        ego_box=_box(definitions[0].aabb),
+        ego_box=_box(definitions[0].aabb, path, EGO),
         T_rig_box=read_transform(metadata.transform_ego_coords_rig_to_aabb, f"{path}, offset from rig to box"),
         ego=_track(got.poses[EGO], f"{path}, poses of {EGO}"),
         actors=actors,
@@ -180,9 +181,12 @@ def _track(poses: list[tuple[int, common_pb2.Pose]], what: str) -> Trajectory:
     return Trajectory(t_us, xyz, quat)
 
 
-def _box(aabb: common_pb2.AABB) -> Box:
+def _box(aabb: common_pb2.AABB, path: Path, actor: str) -> Box:
     """Return a box; sizes are float32 on the wire and shown with its seven digits, so that 4.855 stays 4.855."""
-    return Box(*(float(np.format_float_positional(np.float32(v))) for v in (aabb.size_x, aabb.size_y, aabb.size_z)))
+    box = Box(*(float(np.format_float_positional(np.float32(v))) for v in (aabb.size_x, aabb.size_y, aabb.size_z)))
+    for side in (box.length_m, box.width_m):
+        BODY_M.check(side, "reading a rollout log", f"{path}, box of actor {actor!r}")
+    return box
 
 
 def _bad(path: Path, found: str, do_this: str) -> InputError:

@@ -129,7 +129,7 @@ def kind_of(value: Any) -> str:
 
 
 def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
-    """Refuse depth beyond the bound and numbers that are not finite; level by level, so that depth costs no stack."""
+    """Refuse depth beyond the bound, numbers that are not finite and text that is none; level by level, so that depth costs no stack."""
     level, depth = [document], 0
     while level:
         depth += 1
@@ -137,11 +137,24 @@ def _check(document: Any, where: Path | str, doing: str, do_this: str) -> None:
             raise InputError(doing, str(where), f"nested deeper than {DEPTH.high:.0f} levels", do_this)
         below: list[Any] = []
         for node in level:
+            if type(node) is dict and not all(map(str.isascii, node)):
+                _check_text("".join(node), where, doing, do_this)
             for child in node.values() if type(node) is dict else node if type(node) is list else (node,):
                 kind = type(child)
                 if kind is dict or kind is list:
                     if child is not node:
                         below.append(child)
+                elif kind is str and not child.isascii():
+                    _check_text(child, where, doing, do_this)
                 elif kind is float and not math.isfinite(child):
                     raise InputError(doing, str(where), f"the number {child}, which JSON does not have", do_this)
         level = below
+
+
+def _check_text(text: str, where: Path | str, doing: str, do_this: str) -> None:
+    """Refuse half a surrogate pair, which JSON can escape and no file can be written with."""
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        found = f"the escape \\u{ord(text[error.start]):04x} alone, half a surrogate pair"
+        raise InputError(doing, str(where), found, do_this) from None

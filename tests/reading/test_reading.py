@@ -85,6 +85,7 @@ class Shape(TypedDict, total=False):
         ("{", "broken JSON"), ("[" * 100_000, "broken JSON"), ("[" * 100 + "]" * 100, "deeper than 64"), ("1" * 5000, "broken JSON"),
         ('{"count": NaN}', "nan"), ('{"count": 1e999}', "inf"), ("[1]", "the document: a list of 1"), ('{"count": "1"}', "count: the text"),
         ('{"count": 1.5}', "count: the value 1.5"), ('{"names": {"a": [1, [2]]}}', "names.a.1: a list of 1"), ("\ud800", "broken JSON"),
+        ('["\\ud800"]', "half a surrogate"), ('{"a\\udc00": 1}', "half a surrogate"),
     ],
 )  # fmt: skip
 def test_json_has_limits_and_a_shape(tmp_path: Path, text: str, found: str) -> None:
