@@ -69,6 +69,8 @@ class PixelSample:
         t: ``(B,)`` uniform in 0..1, times of the flow term.
         flow_frame: Frame of the flow term.
         perceptual_frames: Frames of the perceptual term.
+        corner: Row and column from which the perceptual term sees the frames. Its network halves the resolution four times; from a fixed
+            corner its grid would lie on the generator's, which then learns a pattern of period 4 that only this network prefers.
         t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
     """
 
@@ -81,6 +83,7 @@ class PixelSample:
     t: Tensor
     flow_frame: int
     perceptual_frames: Sequence[int]
+    corner: tuple[int, int]
     t_history: Tensor
 
 
@@ -138,8 +141,8 @@ def pixel_losses(
     temporal = moved.abs().mean() if objectives.temporal and frames > 1 else zero
     perceptual = zero
     if objectives.perceptual and distance is not None:
-        chosen = list(sample.perceptual_frames)
-        images = [x[:, chosen].flatten(0, 1).permute(0, 3, 1, 2) for x in (made, sample.truth)]
+        (top, left), chosen = sample.corner, list(sample.perceptual_frames)
+        images = [x[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2) for x in (made, sample.truth)]
         perceptual = distance(images[0], images[1]).mean()
     total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal + objectives.flow * flow
     return PixelLosses(total, picture, perceptual, temporal, flow, made, state.detached())

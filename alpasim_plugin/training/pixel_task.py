@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
+from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelGenerator, PixelState
 from alpasim_plugin.seeding import derive_seed, stream
 from alpasim_plugin.training.pixel_rollout import Distance, PixelSample, pixel_losses
 from alpasim_plugin.training.pixel_variants import PixelVariant
@@ -121,7 +121,8 @@ class PixelTask:
         frames = render.shape[1]
         seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
         t_history = torch.rand(whole[0], frames, generator=source)[slots]
-        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, int(rng.integers(frames)), seen, t_history)
+        flow_frame, top, left = int(rng.integers(frames)), *(int(rng.integers(_corners(side))) for side in render.shape[2:4])
+        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history)
         return NoisyBatch(sample, got.fresh)
 
     def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:
@@ -148,6 +149,11 @@ class PixelTask:
     def carry(self, tensors: Mapping[str, Tensor]) -> None:
         """Take a checkpoint's state."""
         self._state = PixelState(**tensors) if tensors else None
+
+
+def _corners(side: int) -> int:
+    """Return from how many places along a side the perceptual term may begin, so that at least a cell of its coarsest grid is left."""
+    return max(min(GRID_PX, side - GRID_PX + 1), 1)
 
 
 def _psnr_db(images: Tensor, truth: Tensor) -> Tensor:

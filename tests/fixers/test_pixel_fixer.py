@@ -74,7 +74,9 @@ def test_streaming_equals_the_rollout_of_the_training(bundle: Path, holes: str) 
     opacity = torch.from_numpy(np.stack([f.alpha for f in FRAMES if f.alpha is not None]))[None, ..., None]
     everywhere = np.arange(SIZE[0] * SIZE[1])
     eps = np.stack([pixel_noise("scene", 0, "front", 0, i, everywhere).reshape(*SIZE, 3) for i in range(len(FRAMES))])
-    sample = PixelSample(render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, (), torch.ones(1, 1))
+    sample = PixelSample(
+        render, render, sdmap, opacity, torch.from_numpy(eps)[None], render[:, 0], torch.ones(1), 0, (), (0, 0), torch.ones(1, 1)
+    )
     net = generator().requires_grad_(False)
     with torch.no_grad():
         whole = pixel_losses(
