@@ -75,7 +75,7 @@ class VideoReader:
         check_regular(self.path, doing, ARCHIVE_BYTES)
         self._av = load_av(doing)
         try:
-            self._container = self._av.open(str(self.path))
+            self._container = self._av.open(str(self.path), metadata_errors="replace")
         except (OSError, self._av.FFmpegError) as error:
             raise self._refusal(error.strerror or str(error)) from error
         try:
