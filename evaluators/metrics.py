@@ -40,8 +40,13 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
     "wrong_lane": _flag("the lanes under the ego centre run against it (by more than 120 degrees)"),
     "min_distance_to_lane_boundary_m": MetricInfo("m", "higher", "min", "gap to the border of the joined nearby lanes; 0 when not inside"),
     "dist_to_gt_trajectory": MetricInfo("m", "lower", "max", "distance of the ego centre from the recorded path"),
-    "route_distance_m": MetricInfo("m", "lower", "mean", "mean over the rollout of the distance from the recorded path", is_headline=True),
-    "lateral_bias_m": MetricInfo("m", "none", "mean", "mean signed distance from the recorded path, left of it positive"),
+    "lateral_distance_m": MetricInfo(
+        "m", "lower", "mean", "mean distance to the side of the recorded path, which goes straight on beyond its ends", is_headline=True
+    ),
+    "route_distance_m": MetricInfo(
+        "m", "lower", "mean", "the paper's: mean distance from the recorded path; driving past its end counts as distance"
+    ),
+    "lateral_bias_m": MetricInfo("m", "none", "mean", "mean signed distance to the side of the recorded path, left of it positive"),
     "dist_to_gt_location": MetricInfo("m", "lower", "max", "distance of the ego centre from where the recording is at that time"),
     "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached", is_headline=True, is_share=True),
     "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then", is_share=True),

@@ -15,7 +15,9 @@ import numpy as np
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.pictures import Pictures
+from alpasim_plugin.runtime.plan_motion import PlanMotion
 from alpasim_plugin.runtime.stages import StageTimes
 from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, Renderer, RenderRequest, RolloutLog, Scenario, Trajectory
 from alpasim_plugin.world.ego import ego_state_from_log
@@ -53,10 +55,12 @@ class Recorder:
         self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, session or f"{scenario.scene_id}/{seed}"))
         self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
         self._times = StageTimes()
+        self.plan_motion = PlanMotion(scenario.vehicle)
         self._frames: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
         self._last_query_us = -1
         self._steps = self._first_call = 0
+        self._passed = False
         self._writer: AslWriter | None = None
 
     def __enter__(self) -> Recorder:
@@ -132,8 +136,9 @@ class Recorder:
             self._log.controller_return(after)
             self._steps += 1
 
-    def finish(self) -> None:
+    def finish(self, path_end: PathEnd) -> None:
         """Close the log and write the per-frame facts."""
+        self._passed = path_end.passed
         with self.stage("log"):
             self._log.finish()
             write_facts(self.folder / FRAMES_NAME, self._frames)
@@ -155,6 +160,8 @@ class Recorder:
             "first_call_frames": self._first_call,
             "steps": self._steps,
             "frame_events": events,
+            "passed_path_end": self._passed,
+            "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
             "strip_t_us": [] if self._pictures is None else self._pictures.strip_us,

@@ -15,6 +15,7 @@ from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
 from alpasim_plugin.runtime.manifests import STEPS_NAME
+from alpasim_plugin.runtime.plan_motion import plan_table
 from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
@@ -65,6 +66,7 @@ def write_tables(
         "censoring": _by_policy(manifests, censoring),
         "failures": _failures(manifests),
         "fixers": _by_policy([m for m in manifests if m["status"] == "ok"], fixers),
+        "plans": _by_policy([m for m in manifests if m["status"] == "ok"], plan_table),
         "speed": _by_policy([m for m in manifests if m["status"] == "ok" and m.get("stage_ms")], _speeds),
         **more,
     }

@@ -10,15 +10,17 @@ if TYPE_CHECKING:
     from evaluators.report.fixers import fixer_lines as fixer_lines
     from evaluators.report.html import write_report as write_report
     from evaluators.report.junit import write_junit as write_junit
+    from evaluators.report.plans import plan_warnings as plan_warnings
     from evaluators.report.summary import write_summary_md as write_summary_md
     from evaluators.report.terminal import render_table as render_table
 
-__all__ = ["fixer_lines", "render_table", "write_junit", "write_report", "write_summary_md"]
+__all__ = ["fixer_lines", "plan_warnings", "render_table", "write_junit", "write_report", "write_summary_md"]
 
 __getattr__ = lazy_names(
     __name__,
     {
         "fixer_lines": ".fixers",
+        "plan_warnings": ".plans",
         "render_table": ".terminal",
         "write_junit": ".junit",
         "write_report": ".html",

@@ -20,7 +20,7 @@ from evaluators.report.strata import NOT_BESIDE, VALUES, Strata
 LETTER_PT, LINE_PT = 6.0, 12.0  # width and height of a letter of a name, points
 CHARACTER_IN = 0.075  # width of a tick label's character, inches: the page's font at 10 points
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
-ERRORS = ("collision_at_fault", "offroad", "route_distance_m")
+ERRORS = ("collision_at_fault", "offroad", "lateral_distance_m")
 
 
 @dataclass(frozen=True)

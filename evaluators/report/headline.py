@@ -14,6 +14,7 @@ from evaluators.report.certificate import certificate_caution
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
+from evaluators.report.plans import plan_warnings
 from evaluators.report.run_folder import Run
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
@@ -22,7 +23,8 @@ WORDS = {
     "collision_at_fault": "at-fault collisions",
     "collision_any": "collisions",
     "offroad": "off-road rollouts",
-    "route_distance_m": "distance to the logged path",
+    "lateral_distance_m": "distance to the side of the logged path",
+    "route_distance_m": "route distance",
     "progress": "progress",
 }
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
@@ -193,7 +195,7 @@ def _alone(run: Run, variant: str) -> str:
 
 
 def _cautions(run: Run) -> tuple[str, ...]:
-    said = fixer_cautions(run.summary)
+    said = [*fixer_cautions(run.summary), *(f"{line}." for line in plan_warnings(run.summary))]
     failed = [r for r in run.rollouts if not r.ok]
     if failed:
         classes: dict[str, int] = {}

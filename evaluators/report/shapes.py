@@ -142,6 +142,7 @@ class Summary(TypedDict, total=False):
     determinism: Determinism | None
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
+    plans: dict[str, dict[str, Any]]
 
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]

@@ -41,8 +41,8 @@ def test_undecided_is_never_called_equal(usual_run: Path) -> None:
 
 
 def test_worse_in_one_and_better_in_another_is_mixed(usual_run: Path) -> None:
-    metrics = {name: {"offroad": stats(0.25), "route_distance_m": stats(0.4, unit="m")} for name in ("clean", "3dgs")}
-    pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse"), "route_distance_m": pair(-0.2, -0.3, -0.1, "better")}}
+    metrics = {name: {"offroad": stats(0.25), "lateral_distance_m": stats(0.4, unit="m")} for name in ("clean", "3dgs")}
+    pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse"), "lateral_distance_m": pair(-0.2, -0.3, -0.1, "better")}}
     finding = find(with_summary(usual_run, metrics=metrics, paired=pairs))
     assert finding.tone == "mixed"
     assert "worse than clean in off-road rollouts and better in distance to the logged path" in finding.title
