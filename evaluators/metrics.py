@@ -6,6 +6,7 @@ which takes these facts from here, so a name cannot carry two units.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -97,6 +98,29 @@ def info(name: str) -> MetricInfo:
     raise EvaluatorError(
         "looking up a metric", f"name {name!r}", "no evaluator declares it", "name it in the evaluator's `metrics`, or check the spelling"
     )
+
+
+SIGNED = frozenset({"contact_x_m", "contact_y_m", "offroad_margin_m", "lateral_bias_m"})
+
+
+def value_range(name: str) -> tuple[float, float]:
+    """Return the least and the greatest value that a metric can have; infinite where it has no bound or is not ours.
+
+    Example:
+        >>> value_range("progress"), value_range("lateral_distance_m"), value_range("lateral_bias_m")
+        ((0.0, 1.0), (0.0, inf), (-inf, inf))
+    """
+    facts = info(name)
+    if facts.is_flag or facts.is_share:
+        return 0.0, 1.0
+    is_length_or_time = (name in OWN or _MIN_ADE_NAME.fullmatch(name) is not None) and facts.unit in ("m", "s")
+    return (0.0 if is_length_or_time and name not in SIGNED else -math.inf), math.inf
+
+
+def difference_range(name: str) -> tuple[float, float]:
+    """Return the least and the greatest difference of two values of a metric."""
+    low, high = value_range(name)
+    return low - high, high - low
 
 
 def declare(name: str, facts: MetricInfo) -> None:

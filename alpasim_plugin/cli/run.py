@@ -107,7 +107,7 @@ def run(
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
-    _print_result(result, as_json)
+    _print_result(result, as_json, video)
     if plan.undigested and not as_json:
         print(f"not reused by the next command: {', '.join(plan.undigested)} has no digest (--resume reuses its rollouts)")
     raise typer.Exit(result.exit_code)
@@ -180,7 +180,7 @@ def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -
         print(f"{key:>18}  {(', '.join(map(str, value)) or '-') if isinstance(value, list) else value}")
 
 
-def _print_result(result: RunResult, as_json: bool) -> None:
+def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
@@ -193,6 +193,9 @@ def _print_result(result: RunResult, as_json: bool) -> None:
         print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
     if result.n_failed:
         print(_failed_line(result), file=sys.stderr)
+    videos = len(list(result.root.glob("rollouts/*/*/*/*/front.mp4"))) if video != "none" else 0
+    if video != "none":
+        print(f"videos  {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts")
     print(f"repeat  {certificate_line(result.summary['determinism'])}")
     print(report_line(result.root))
 

@@ -18,6 +18,7 @@ from alpasim_plugin.errors import PolicyError, SimrunError
 from alpasim_plugin.parts import build, complete
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, STEPS_NAME, Remedy, RolloutState, inspect_rollout, write_manifest
+from alpasim_plugin.runtime.pictures import VIDEO_NAME
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
@@ -76,6 +77,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         "score_key": cell.score_key,
         "preset": options.preset,
         "stops_at_path_end": cell.stops_at_path_end,
+        "video": options.video,
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -113,13 +115,20 @@ def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str
 
 
 def find_rollout_state(
-    cell: Cell, root: Path, reuse_undigested: bool = False, full: bool = False, known: bool = False, retry: bool = False
+    cell: Cell,
+    root: Path,
+    reuse_undigested: bool = False,
+    full: bool = False,
+    known: bool = False,
+    retry: bool = False,
+    video: str = "none",
 ) -> tuple[Remedy, RolloutState]:
     """Return what a cell needs, and the rollout as it is found on disk.
 
     A rollout with another content key is driven again; so are those with a part that has no digest unless ``reuse_undigested`` is set, and
     failed ones, except where the policy is at fault: the same policy would fail again (``retry`` drives these too).
-    See `alpasim_plugin.runtime.manifests.inspect_rollout` for ``full`` and ``known``.
+    One that was driven without the ``video`` that is asked for now is driven again as well. See
+    `alpasim_plugin.runtime.manifests.inspect_rollout` for ``full`` and ``known``.
     """
     state = inspect_rollout(root, cell.folder.as_posix(), full, known)
     manifest = state.manifest
@@ -133,9 +142,17 @@ def find_rollout_state(
         return "none", state
     if manifest.get("passed_path_end") and manifest.get("stops_at_path_end") != cell.stops_at_path_end:
         return "drive", state  # the only rollouts that differ between presets that stop there and those that drive on
+    if _lacks_video(manifest, video):
+        return "drive", state
     if state.remedy == "none" and manifest.get("score_key") != cell.score_key:
         return "score", state
     return state.remedy, state
+
+
+def _lacks_video(manifest: Mapping[str, Any], video: str) -> bool:
+    """Tell whether a finished rollout was driven without the video that is asked for now."""
+    is_asked = video == "all" or (video == "failures" and bool(manifest.get("events")))
+    return is_asked and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def execute(
     todo: list[Cell] = []
     for cell in plan.cells:
         folder = cell.folder.as_posix()
-        remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry)
+        remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
         if state.damage:
             doing = "driving again" if remedy == "drive" else "scoring again"
             noticed(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")

@@ -52,12 +52,14 @@ def run_rollout(
     plans = PlanQueue(scenario.latency)
     state = LoopState.at_start(scenario, clock.n_steps)
     sensors = checked_sensors(policy)
+    watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
     cadence = make_cadence(clock, scenario, sensors, renderer.block)
     path_end = PathEnd(scenario)
     forecaster = Forecaster(scenario, controller, plans, actors, state)
-    rig = CameraRig(scenario, sensors, clock, cadence, forecaster, renderer.lookahead)
+    rig = CameraRig(scenario, sensors or watched, clock, cadence, forecaster, renderer.lookahead)
     reset_policy(policy, seed, scenario.route)
     recorder.start(clock, rig.specs)
+    seen = {} if watched else rig.specs
 
     for tick in clock.ticks():
         with recorder.stage("actors"):
@@ -67,12 +69,13 @@ def run_rollout(
         with recorder.rendering(renderer, len(requests)):
             frames = checked_frames(renderer, requests)
         for frame, request in zip(frames, requests, strict=True):
-            state.frames[frame.camera] = frame
+            if frame.camera in seen:
+                state.frames[frame.camera] = frame
             recorder.frame(frame, request)
         if path_end.ends_rollout(state.ego) or tick.is_last:
             break
         if cadence.queries_at(tick.t_us):
-            observation = state.observe(rig.specs)
+            observation = state.observe(seen)
             recorder.policy_query(observation, clock)
             began = time.perf_counter()
             with recorder.stage("policy"):

@@ -153,7 +153,7 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     """
     info = read_run_json(root)
     write_run_json(root, info | dict(more))
-    summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more)
+    summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
@@ -266,6 +266,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
                 }
                 for name, s in plan.scenarios.items()
             },
+            "bases": {spec.name: spec.base.name for spec in plan.renderers if spec.fixer is not None},
             "fixers": {spec.name: spec.fixer.as_dict() for spec in plan.renderers if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
             "metrics": declared(),

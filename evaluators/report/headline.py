@@ -14,6 +14,7 @@ from evaluators.report.certificate import certificate_caution
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
+from evaluators.report.pairs import pair_tables
 from evaluators.report.plans import plan_warnings
 from evaluators.report.run_folder import Run
 
@@ -40,6 +41,7 @@ class Point:
     text: str
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
+    baseline: str = ""  # what it is compared with; empty where with nothing
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,11 @@ class Finding:
     points: tuple[Point, ...] = ()
     cautions: tuple[str, ...] = ()
 
+    def name_of(self, point: Point) -> str:
+        """Name a point; with what it is compared where not all are with the same."""
+        several = len({one.baseline for one in self.points}) > 1
+        return f"{point.name} \u2212 {point.baseline}" if several and point.baseline else point.name
+
 
 def find(run: Run) -> Finding:
     """Derive the main finding of a run."""
@@ -59,10 +66,10 @@ def find(run: Run) -> Finding:
         return Finding("Nothing was run: the run folder holds no rollouts", "broken")
     if done == 0:
         return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run))
-    paired = {variant: pairs for variant, pairs in (run.summary.get("paired") or {}).items() if pairs}
-    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired.items())
+    paired = pair_tables(run.summary)
+    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired)
     if points:
-        title = "; ".join(_clause(point, _baseline(paired[point.name])) for point in points[:3])
+        title = "; ".join(_clause(point) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
         tones = {point.tone for point in points}
         order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
@@ -102,7 +109,8 @@ def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
     return "worse" if (difference > 0) == (direction == "lower") else "better"
 
 
-def _clause(point: Point, baseline: str) -> str:
+def _clause(point: Point) -> str:
+    baseline = point.baseline
     if point.tone == "worse":
         return f"{point.name} drives worse than {baseline} in {_listing(point.worse)}"
     if point.tone == "better":
@@ -141,7 +149,7 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     parts += [f"no difference at all in {_listing(same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    return Point(variant, tone, text or "no metric is valid in both members of any pair", worse, better)
+    return Point(variant, tone, text or "no metric is valid in both members of any pair", worse, better, _baseline(pairs))
 
 
 def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:

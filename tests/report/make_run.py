@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
 from evaluators.aggregate import aggregate, censoring, paired
+from evaluators.aggregate.paired import base_pairs
 from evaluators.report.flips import find_flips
 from evaluators.report.run_folder import read_run
 
@@ -322,6 +323,7 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         "preset": "paper",
         "metrics": aggregate(rows),
         "paired": paired(rows, baseline) if len(ran) > 1 else {},
+        "paired_with_base": base_pairs(rows, baseline, {"onefixer": "3dgs"}),
         "censoring": censoring(rows),
         "failures": {
             "n_failed": len(failed),
