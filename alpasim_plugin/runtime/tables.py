@@ -60,7 +60,8 @@ def write_tables(
         preset: Evaluator preset of the scores.
         baseline: Renderer that the others are compared with; None is the first.
         more: What the manifests do not tell, for the summary.
-        bases: Renderer with a fixer -> the renderer below it; where the run has both and the latter is not the baseline, they are paired too.
+        bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
+            baseline, the two are paired too.
     """
     rows = rollout_rows(manifests)
     metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))

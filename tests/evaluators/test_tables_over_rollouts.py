@@ -48,11 +48,11 @@ def test_clustered_interval_is_a_t_interval_on_scene_means():
     values = [[1.0, 2.0], [4.0, 5.0], [3.0, 9.0]]
     means = [1.5, 4.5, 6.0]
     low, high = stats.t.interval(0.95, 2, loc=np.mean(means), scale=stats.sem(means))
-    assert entry(values)["ci95_clustered"] == pytest.approx([low, high])
+    assert entry(values, "lateral_bias_m")["ci95_clustered"] == pytest.approx([low, high])
 
 
 def test_with_unequal_seeds_scenes_weigh_alike_in_the_clustered_interval():
-    found = entry([[1.0, 2.0, 3.0, None], [10.0]])
+    found = entry([[1.0, 2.0, 3.0, None], [10.0]], "lateral_bias_m")
     assert found["mean"] == pytest.approx(4.0)  # over rollouts
     assert np.mean(found["ci95_clustered"]) == pytest.approx(6.0)  # over scenes
     assert found["n_invalid"] == 1

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ import evaluators.report.html as html
 from alpasim_plugin.errors import InfrastructureError
 from evaluators.report import write_report
 from evaluators.report.charts import Curve, line_chart
+from evaluators.report.run_folder import read_run
 from tests.report.make_run import Plan, make_run
 
 VOID = {"meta", "link", "img", "input", "br", "wbr"}
@@ -93,7 +95,7 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path, usua
             assert (usual_run / unquote(address)).exists(), address
 
 
-def test_the_bar_and_the_headings_use_the_same_names(usual_run: Path) -> None:
+def test_the_bar_and_the_headings_use_the_same_names(usual_run: Path, usual_page: Page) -> None:
     text = (usual_run / "report.html").read_text()
     bar = dict(re.findall(r'<a href="#([a-z]+)">([^<(]+?)(?: \(\d+\))?</a>', text[text.index("<nav") : text.index("</nav>")]))
     headings = dict(re.findall(r'<section id="([a-z]+)">\s*<h2>([^<]+)</h2>', text))
@@ -102,7 +104,8 @@ def test_the_bar_and_the_headings_use_the_same_names(usual_run: Path) -> None:
 
 
 def test_hashes_have_the_width_of_their_column(usual_run: Path) -> None:
-    text = (usual_run / "report.html").read_text()
+    run = read_run(usual_run)
+    text = html.render_report(dataclasses.replace(run, info={**run.info, "weights": {"/a/long/path/to/generator.safetensors": "ab" * 32}}))
     weights = text[text.index("<h3>Weights</h3>") :]
     assert weights.startswith('<h3>Weights</h3><dl class="stacked">')  # name above hash: a long path leaves the hash no column
     assert ".columns dl.stacked { grid-template-columns: minmax(0, 1fr); }" in text

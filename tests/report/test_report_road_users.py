@@ -22,7 +22,7 @@ def users_of(scenario: Scenario, at_us: int) -> dict[str, tuple[str, str]]:
 
 def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way() -> None:
     scenario = load_scenario("smoke/lead_car")
-    (lead,) = [actor for actor in scenario.actors if not actor.is_static]
+    (lead,) = [actor for actor in scenario.actors if actor.actor_id == "lead"]
     early, late = (users_of(scenario, t)[f"{lead.label} {lead.actor_id}"] for t in (scenario.start_us, scenario.end_us))
     for (body, way), t_us in ((early, scenario.start_us), (late, scenario.end_us)):
         corners = np.array([[float(v) for v in pair.split(",")] for pair in body.rstrip("z").split()])
