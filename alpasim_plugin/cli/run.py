@@ -21,7 +21,8 @@ from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from alpasim_plugin.stopping import Stopped
 from evaluators import PRESETS
-from evaluators.report import fixer_lines, plan_warnings, render_table
+from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
+from evaluators.report.run_folder import read_run
 from scenarios.suite import expand
 
 FIXER_PREFIX = "fixer."
@@ -195,9 +196,13 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
         print(_failed_line(result), file=sys.stderr)
     videos = len(list(result.root.glob("rollouts/*/*/*/*/front.mp4"))) if video != "none" else 0
     if video != "none":
-        print(f"videos  {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts")
-    print(f"repeat  {certificate_line(result.summary['determinism'])}")
+        print(f"videos   {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts")
+    print(f"repeat   {certificate_line(result.summary['determinism'])}")
+    run = read_run(result.root)
+    for line in ending_lines(run):
+        print(line)
     print(report_line(result.root))
+    print(next_line(run))
 
 
 def _failed_line(result: RunResult) -> str:

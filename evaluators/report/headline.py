@@ -42,6 +42,7 @@ class Point:
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
     baseline: str = ""  # what it is compared with; empty where with nothing
+    lead: str = ""  # the one difference that says most, with its interval
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,26 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     parts += [f"no difference at all in {_listing(same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    return Point(variant, tone, text or "no metric is valid in both members of any pair", worse, better, _baseline(pairs))
+    return Point(
+        variant,
+        tone,
+        text or "no metric is valid in both members of any pair",
+        worse,
+        better,
+        _baseline(pairs),
+        _lead(run, variant, pairs, moved),
+    )
+
+
+def _lead(run: Run, variant: str, pairs: Mapping[str, Any], moved: Sequence[str]) -> str:
+    """Print the first difference that is shown; where none is, the one that is largest against its margin."""
+    shown = [m for m in moved if pairs[m].get("difference") in ("better", "worse")]
+
+    def size(metric: str) -> float:
+        return abs(float(pairs[metric]["diff"])) / max(finite(pairs[metric].get("margin")) or 0.0, 1e-3)
+
+    chosen = next(iter(shown), max(moved, key=size, default=None))
+    return "" if chosen is None else _difference(run, variant, chosen, pairs[chosen], brief=False)
 
 
 def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:

@@ -12,13 +12,14 @@ SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
 STEP = re.compile(r"^\s*- run: (.*)$", re.M)
 # What is not run from an empty folder, and why; the first rule that fits counts.
+NO_COMMAND = (r"──", r"--split test(?= |$)")  # a picture of the order of commands; a record from before there were two test splits
 NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"──", "a picture of the order of commands"),
     (r"gate --self-test", "eight minutes; tests/runtime/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda|--on h200", "needs weights of 4 GB, or a GPU"),
     (
         r"^train |^bench |FILE|fixer\.weights\.bundle",
-        "trains or measures for minutes to days, or needs what such a command made; parsed only",
+        "trains or measures for minutes to days, or needs what that made",
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
     (r"--images folder/", "needs the reader's own pictures"),
