@@ -48,6 +48,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "preview", "preview", "EPILOG",
         "Draw a scenario before it is driven: map, road users over time, and the camera along the recorded drive.",
     ),
+    "new": ("new", "new", "EPILOG", "Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."),
     "refine": ("refine", "refine", "EPILOG", "Refine a video with a fixer, block by block, at any length in constant memory."),
     "fork": ("fork", "fork", "FORK_EPILOG", "Continue a logged rollout from an instant on with another renderer, policy or seed."),
     "probe": (

@@ -110,12 +110,11 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     own = "\n".join(re.findall(r"^```python\n(.*?)^```", parts, re.S | re.M))
     (folder / "my_parts.py").write_text(own)
     (folder / "weights.npz").write_bytes(b"weights")
-    policy = own[own.index("class Straight") :].replace("class Straight", "class MyPolicy", 1) + "\n\nMine = MyPolicy\n"
-    head = own[: own.index("class ")]
-    (folder / "my_policy.py").write_text(f"{head}\n\n{policy}")
+    policy = f"{own}\n\nMine = MyPolicy = Straight\n"
+    (folder / "my_policy.py").write_text(policy)
     (folder / "my_package").mkdir()
     (folder / "my_package" / "__init__.py").touch()
-    (folder / "my_package" / "my_module.py").write_text(f"{head}\n\n{policy}")
+    (folder / "my_package" / "my_module.py").write_text(policy)
     (folder / "drive.csv").write_text("\n".join(f"{100_000 * i},{0.5 * i},0" for i in range(26)))
     (folder / "scenario.yaml").write_text(
         "version: 1\nroad: {segments: [{kind: straight, length_m: 120}]}\ntiming: {duration_us: 1200000}\n"
@@ -133,6 +132,8 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def shortened(words: tuple[str, ...]) -> list[str]:
     """Return a command that does the same in seconds: short drives, one seed, nothing fitted."""
+    if words[:3] == ("new", "policy", "my_policy"):
+        return ["new", "policy", "my_first_policy"]  # the folder has a policy of the page's name already
     args = ["scenario.yaml" if word == "SCENARIO" else word.replace("suites/urban", "suites/smoke") for word in words]
     if args[0] not in VERBS or args[0] == "run":
         fitting = [] if any("drive.csv" in word for word in args) else list(SHORT)
