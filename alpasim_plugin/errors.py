@@ -68,10 +68,15 @@ class FixerError(InfrastructureError):
     failure_class: ClassVar[str] = "fixer"
 
 
-class PolicyError(InfrastructureError):
-    """A policy raised, or returned a plan that breaks its contract."""
+class PolicyError(SimrunError):
+    """A policy raised, or broke its contract: a fault of what is under test, not of the machine."""
 
     failure_class: ClassVar[str] = "policy"
+
+    @property
+    def is_final(self) -> bool:
+        """Tell whether another try must end in the same way: yes, unless a file, memory or a package was missing."""
+        return not isinstance(self.__cause__, OSError | MemoryError | ImportError)
 
 
 class EvaluatorError(SimrunError):

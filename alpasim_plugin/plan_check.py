@@ -1,12 +1,34 @@
-"""What is wrong with a plan, in a sentence. A policy may return anything; nothing here assumes more than that it is an object."""
+"""What is wrong with a plan or with sensors, in a sentence. A policy may return anything; nothing here assumes more than an object."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.types import SensorSpec
+
 ARRAYS = ("times_us", "xy", "yaw")
+UNITS = ((100.0, "centimetres"), (1000.0, "millimetres"), (0.001, "kilometres"), (3.28, "feet"), (3.6, "km/h taken for m/s"))
+
+
+def unit_guess(ratio: float) -> str:
+    """Name the unit in which lengths come out ``ratio`` times as large as in metres; empty where none fits.
+
+    Example:
+        >>> unit_guess(97.0), unit_guess(1.1)
+        ('centimetres', '')
+    """
+    fits = [(abs(ratio / factor - 1.0), unit) for factor, unit in UNITS if 0.7 <= ratio / factor <= 1.3]
+    return min(fits)[1] if fits else ""
+
+
+def sensors_problem(sensors: Any) -> str:
+    """Say why ``sensors`` of a policy is not a sequence of `SensorSpec`; empty if it is one."""
+    if isinstance(sensors, Sequence) and all(isinstance(sensor, SensorSpec) for sensor in sensors):
+        return ""
+    return f"sensors is {sensors!r:.80}, not a tuple of SensorSpec (alpasim_plugin.types)"
 
 
 def shape_problem(plan: Any, min_rows: int = 1) -> str:

@@ -244,6 +244,7 @@ class BackgroundFile:
 
     path: str
     T_world_file: F64  # (4, 4), may scale
+    keep_road: bool = False  # whether the built road is drawn with it
 
 
 @dataclass(frozen=True)
@@ -284,6 +285,8 @@ class Scenario:
     notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
     alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
     source_part: str | None = None  # the source that read the log, as named; None: a built road
+    varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # key of the scenario file -> (as written, as drawn by the seed)
+    stop_at_path_end: bool = True  # a rollout ends where the recorded path does, unless the recorded car stands there
 
     @property
     def scene(self) -> Scene:

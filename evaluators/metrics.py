@@ -6,6 +6,7 @@ which takes these facts from here, so a name cannot carry two units.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -40,8 +41,13 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
     "wrong_lane": _flag("the lanes under the ego centre run against it (by more than 120 degrees)"),
     "min_distance_to_lane_boundary_m": MetricInfo("m", "higher", "min", "gap to the border of the joined nearby lanes; 0 when not inside"),
     "dist_to_gt_trajectory": MetricInfo("m", "lower", "max", "distance of the ego centre from the recorded path"),
-    "route_distance_m": MetricInfo("m", "lower", "mean", "mean over the rollout of the distance from the recorded path", is_headline=True),
-    "lateral_bias_m": MetricInfo("m", "none", "mean", "mean signed distance from the recorded path, left of it positive"),
+    "lateral_distance_m": MetricInfo(
+        "m", "lower", "mean", "mean distance to the side of the recorded path, which goes straight on beyond its ends", is_headline=True
+    ),
+    "route_distance_m": MetricInfo(
+        "m", "lower", "mean", "the paper's: mean distance from the recorded path; driving past its end counts as distance"
+    ),
+    "lateral_bias_m": MetricInfo("m", "none", "mean", "mean signed distance to the side of the recorded path, left of it positive"),
     "dist_to_gt_location": MetricInfo("m", "lower", "max", "distance of the ego centre from where the recording is at that time"),
     "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached", is_headline=True, is_share=True),
     "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then", is_share=True),
@@ -92,6 +98,29 @@ def info(name: str) -> MetricInfo:
     raise EvaluatorError(
         "looking up a metric", f"name {name!r}", "no evaluator declares it", "name it in the evaluator's `metrics`, or check the spelling"
     )
+
+
+SIGNED = frozenset({"contact_x_m", "contact_y_m", "offroad_margin_m", "lateral_bias_m"})
+
+
+def value_range(name: str) -> tuple[float, float]:
+    """Return the least and the greatest value that a metric can have; infinite where it has no bound or is not ours.
+
+    Example:
+        >>> value_range("progress"), value_range("lateral_distance_m"), value_range("lateral_bias_m")
+        ((0.0, 1.0), (0.0, inf), (-inf, inf))
+    """
+    facts = info(name)
+    if facts.is_flag or facts.is_share:
+        return 0.0, 1.0
+    is_length_or_time = (name in OWN or _MIN_ADE_NAME.fullmatch(name) is not None) and facts.unit in ("m", "s")
+    return (0.0 if is_length_or_time and name not in SIGNED else -math.inf), math.inf
+
+
+def difference_range(name: str) -> tuple[float, float]:
+    """Return the least and the greatest difference of two values of a metric."""
+    low, high = value_range(name)
+    return low - high, high - low
 
 
 def declare(name: str, facts: MetricInfo) -> None:

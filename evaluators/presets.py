@@ -65,6 +65,8 @@ class Preset:
     stop_after: tuple[str, ...] = ("collision_any", "offroad")  # rows after the first event are dropped
     stop_beyond_gt_m: float | None = None  # rows after the first one this far from the recorded path are dropped
     drop_black: bool = False  # a black image in a scored row removes the rollout
+    # The loop, not the scores: whether a rollout ends where the recorded path ends, if its scenario says so. AlpaSim drives on.
+    stop_at_path_end: bool = True
 
     def __post_init__(self) -> None:
         if self.roundness > 0 and (self.contact == "between_steps" or self.offroad_rule == "margin"):
@@ -105,6 +107,7 @@ PRESETS: dict[str, Preset] = {
         honour_valid=False,
         stop_beyond_gt_m=4.0,
         drop_black=True,
+        stop_at_path_end=False,
     ),
     "strict": Preset(name="strict", contact="between_steps", seam_m=0.1, offroad_rule="margin", missing_road="error"),
 }

@@ -1,5 +1,7 @@
 """The drive against the recorded one: distance from its path, from its position at the time, and progress along it.
 
+Beyond the ends of that path the lateral distance is measured from its straight continuation: driving on is no error.
+
 The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved to the box centre with the log's
 rig-to-box pose. All distances are in plan view. The paper's route distance is the mean over the scored steps of the distance to that path.
 """
@@ -17,6 +19,7 @@ from evaluators.base import relevant, series, with_preset
 from evaluators.footprint import ego_footprints, held, origin_of
 from evaluators.presets import Preset
 
+DIRECTION_M = 1.0
 _MAX_CELLS = 2_000_000  # points x segments handled at once
 
 
@@ -60,6 +63,33 @@ def left_of(path: F64, s: F64, points: F64) -> F64:
     offset = points - path[segment]
     along = steps[segment]
     return np.asarray(np.sign(along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]))
+
+
+def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
+    """Return ``(T,)`` the distance of points from a path that goes straight on at both ends, NaN where the path has no direction.
+
+    Args:
+        path: ``(N, 2)`` vertices.
+        s: ``(T,)`` arc length of the nearest point of the path.
+        points: ``(T, 2)``.
+        distance_m: ``(T,)`` distance from the path itself.
+
+    The direction at an end is that of the path's last `DIRECTION_M` metres: a recording that stops leaves vertices too near for one.
+    """
+    at = arc_lengths(path)
+    length_m = float(at[-1])
+    if length_m < DIRECTION_M:
+        return np.full(len(points), np.nan)
+    out = np.array(distance_m)
+    inner = (np.interp(DIRECTION_M, at, path[:, 0]), np.interp(DIRECTION_M, at, path[:, 1]))
+    outer = tuple(np.interp(length_m - DIRECTION_M, at, path[:, axis]) for axis in (0, 1))
+    for end, inside, is_there in ((path[0], inner, s <= 0.0), (path[-1], outer, s >= length_m * (1 - 1e-12))):
+        away = end - np.asarray(inside)
+        away = away / np.hypot(*away)
+        offset = points - end
+        beyond = is_there & (offset @ away > 0.0)
+        out[beyond] = np.abs(away[0] * offset[beyond, 1] - away[1] * offset[beyond, 0])
+    return out
 
 
 def progress_so_far(path: F64, points: F64) -> F64:
@@ -107,6 +137,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
     there = held(interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3], preset)[:, :2] - origin[:2]
     away_m = np.hypot(*(ego - there).T)
     share = s / length_m if length_m > 0 else np.full(len(s), np.nan)
+    no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     no_length = "the recorded path has no length"
     outside = "the recording does not cover this time"
     engaged = relevant(rollout)
@@ -130,9 +161,14 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
     ]
     if preset.aliases:
         return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
-    side = left_of(path, s, ego)
-    bias = series("lateral_bias_m", t_us, side * distance_m, np.isfinite(side), "the recorded path has no direction")
-    return [*out, series("route_distance_m", t_us, distance_m), bias]
+    aside_m = beside(path, s, ego, distance_m)
+    has_side = np.isfinite(aside_m)
+    return [
+        *out,
+        series("lateral_distance_m", t_us, aside_m, has_side, no_direction),
+        series("route_distance_m", t_us, distance_m),
+        series("lateral_bias_m", t_us, left_of(path, s, ego) * aside_m, has_side, no_direction),
+    ]
 
 
 def driven(ego: F64, first: int) -> F64:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.errors import PolicyError, SimrunError
 from alpasim_plugin.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.types import (
     F64,
@@ -144,10 +144,14 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
         latency_limit_ms: Longest acceptable median time of a policy query.
 
     Raises:
-        InputError: The name is unknown, or what it names is not a policy.
+        InputError: The name is unknown, or its module cannot be imported.
     """
     scenario = canned_scenario() if scenario is None else scenario
-    policy = make_policy(policy, scenario) if isinstance(policy, str) else policy
+    if isinstance(policy, str):
+        try:
+            policy = make_policy(policy, scenario)
+        except PolicyError as error:
+            return Report((Check("made", False, f"{error.doing} failed: {error.found}"),), (), (0.0, 0.0))
     cameras = {camera.name: camera for camera in scenario.cameras}
     sentence = sensors_fault(policy.sensors, cameras)
     if sentence:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.plan_check import shape_problem
-from alpasim_plugin.types import F64, Plan, SensorSpec
+from alpasim_plugin.plan_check import sensors_problem, shape_problem, unit_guess
+from alpasim_plugin.types import F64, Plan
 
 MIN_HORIZON_S, MAX_STEP_S = 2.0, 0.5
 FIRST_POSE_M = 0.5
@@ -15,10 +16,11 @@ FIRST_POSE_M = 0.5
 Fault = Callable[[Sequence[Plan], Sequence[int], F64], str]
 
 
-def sensors_fault(sensors: object, known: Collection[str]) -> str:
+def sensors_fault(sensors: Any, known: Collection[str]) -> str:
     """Check that a policy's sensors are a sequence of `SensorSpec` and name cameras that exist."""
-    if not isinstance(sensors, Sequence) or not all(isinstance(sensor, SensorSpec) for sensor in sensors):
-        return f"sensors is {sensors!r:.80}, not a tuple of SensorSpec (alpasim_plugin.types)"
+    found = sensors_problem(sensors)
+    if found:
+        return found
     unknown = [sensor.camera for sensor in sensors if sensor.camera not in known]
     return f"the policy asks for cameras {unknown}; the scenario has {sorted(known)}" if unknown else ""
 
@@ -85,10 +87,8 @@ def unit_fault(plan: Plan) -> str:
     distance = float(np.hypot(x, y))
     if 4.0 <= distance <= 14.0 and x > abs(y):
         return ""
-    guess = "a car does between 4 and 14 m, forwards"
-    for factor, unit in ((100.0, "centimetres"), (1000.0, "millimetres"), (0.001, "kilometres"), (3.28, "feet")):
-        if 0.7 <= distance / (10.0 * factor) <= 1.3:
-            guess = f"it looks like {unit}"
+    unit = unit_guess(distance / 10.0)
+    guess = f"it looks like {unit}" if unit else "a car does between 4 and 14 m, forwards"
     if 4.0 <= distance <= 14.0:
         guess = "it runs backwards, x is forward" if -x > abs(y) else "it runs sideways, x is forward and y is left"
     return f"at 10 m/s on a free straight the plan advances {distance:.2f} in the first second: {guess}"

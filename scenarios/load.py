@@ -38,9 +38,10 @@ from scenarios.library import shipped_names
 from scenarios.schema import ScenarioSpec, VehicleSpec
 from scenarios.schema_road import SHIPPED
 from scenarios.sources import detect, read_log, source_digest
-from scenarios.variation import draw, jitter
+from scenarios.variation import differences, draw, jitter
 
 DOING = "reading a scenario"
+AS_WRITTEN = 0  # the scene seed that jitters nothing
 
 
 def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = (), source: str | None = None) -> Scenario:
@@ -49,7 +50,8 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     Args:
         path_or_name: Scenario YAML, Argoverse 2 log folder, CommonRoad XML, Cosmos-Drive-Dreams folder, or a name such as
             ``smoke/straight``.
-        seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id.
+        seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id. Seed 0 is the
+            file as written, but for its ``variations`` and ``samples``.
         overrides: ``key=value`` with dotted keys, applied before validation.
         source: Who reads a recorded log, as `alpasim_plugin.parts.resolve` takes it; None finds the source that recognises the path.
 
@@ -67,14 +69,15 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
     if seed is not None:
         document = apply_overrides(document, [f"seed={int(seed)}"], DOING)
-    spec = validate(ScenarioSpec, document, DOING)
+    written = spec = validate(ScenarioSpec, document, DOING)
     scene_id = spec.scene_id or _default_id(path)
     fixed = tuple(text.partition("=")[0].strip() for text in overrides)
     document = draw(document, spec, scene_id, spec.seed, fixed)
     spec = validate(ScenarioSpec, document, DOING)
     _check_actors(document, spec)
-    spec = jitter(spec, scene_id, spec.seed, fixed)
+    spec = jitter(spec, scene_id, spec.seed, fixed) if spec.seed != AS_WRITTEN else spec
     scenario = _from_log(document, spec, scene_id) if spec.log is not None else _from_road(document, spec, scene_id)
+    scenario = replace(scenario, varied=differences(written, spec))
     if spec.seed != own_seed:
         scenario = replace(scenario, scene_id=f"{scenario.scene_id}-seed{spec.seed}")
     check_scenario(scenario, document.path)
@@ -148,6 +151,7 @@ def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenari
         scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
         _rates(spec), start, last_us(spec), spec.timing.warmup_us, Latency(**spec.latency.model_dump()),
         _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, scene_id),
+        stop_at_path_end=spec.timing.stop_at_path_end,
     )  # fmt: skip
 
 
@@ -184,6 +188,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
         _rates(spec), start, end, spec.timing.warmup_us, Latency(**spec.latency.model_dump()), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
         _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map, kind,
+        spec.timing.stop_at_path_end,
     )  # fmt: skip
 
 
@@ -244,7 +249,7 @@ def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None
         raise document.error(
             DOING, ("background", "transform"), "no inverse, or a last row other than 0 0 0 1", "give rotation, scale and shift"
         )
-    return BackgroundFile(str(path), matrix)
+    return BackgroundFile(str(path), matrix, spec.background.keep_road)
 
 
 def code_digest_of(scenario: Scenario) -> str | None:
@@ -259,9 +264,9 @@ def code_digest_of(scenario: Scenario) -> str | None:
 def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: str = "") -> str:
     """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of every data file.
 
-    Words for people and the places where data files lie do not matter.
+    Words for people, the places where data files lie, and where a rollout ends do not matter: they do not change the scene.
     """
-    content = spec.model_dump(mode="json", exclude={"description", "tags"})
+    content = spec.model_dump(mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}})
     if spec.log is not None:
         _, _, key = spec.log.recorded
         content["log"][key] = "given by its content"

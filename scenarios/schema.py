@@ -100,6 +100,9 @@ class TimingSpec(Part):
     warmup_us: Annotated[int, within(b.TIME_US)] = Field(
         default=500_000, description="The log is forced for so long after the first frame."
     )
+    stop_at_path_end: bool = Field(
+        default=True, description="A rollout ends where the recorded path ends, unless the recorded car stands there."
+    )
 
 
 class LatencySpec(Part):
@@ -161,6 +164,7 @@ class BackgroundSpec(Part):
     transform: tuple[tuple[float, float, float, float], ...] | None = Field(
         default=None, min_length=4, max_length=4, description="4 x 4 matrix from the file's frame to the world, row by row; may scale."
     )
+    keep_road: bool = Field(default=False, description="Draw the built road with the file; otherwise the file replaces road and houses.")
 
 
 class VehicleSpec(Part):
@@ -180,7 +184,7 @@ class VehicleSpec(Part):
 
 
 class JitterSpec(Part):
-    """Ranges within which scenes of different seeds differ; 0 switches a term off. Uniform, relative unless the name has a unit."""
+    """Ranges within which scenes of other seeds than 0 differ from the file; 0 switches a term off. Uniform, relative unless in a unit."""
 
     length: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of element lengths.")
     curvature: float = Field(default=0.1, ge=0, le=0.5, description="Relative change of curvatures.")
@@ -221,7 +225,9 @@ class ScenarioSpec(Part):
     )
     description: str = Field(default="", description="One sentence.")
     tags: tuple[str, ...] = Field(default=(), max_length=int(b.LISTED.high), description="Keywords.")
-    seed: int = Field(default=0, ge=0, le=int(b.SEED.high), description="Scene seed: geometry, textures, scripted actors.")
+    seed: int = Field(
+        default=0, ge=0, le=int(b.SEED.high), description="Scene seed; 0: the numbers are used as written, others jitter them."
+    )
     road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
     log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
     ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
@@ -236,7 +242,7 @@ class ScenarioSpec(Part):
     degradation: DegradationSpec = Field(default=DegradationSpec(), description="Degradation of the renderer 3dgs.")
     background: BackgroundSpec | None = Field(default=None, description="A Gaussian file as background.")
     vehicle: VehicleSpec | None = Field(default=None, description="The ego vehicle; none: the log's own, or the default one.")
-    jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of different seeds differ.")
+    jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of other seeds than 0 differ from the file.")
     variations: dict[str, RangeSpec | ChoiceSpec] = Field(
         default={}, description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed."
     )

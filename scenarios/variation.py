@@ -1,4 +1,4 @@
-"""Seeds make scenes: declared variations, explicit samples, and jitter of the numbers of a scenario file.
+"""Seeds make scenes: declared variations, explicit samples, and, for other seeds than 0, jitter of the numbers of a scenario file.
 
 Every drawn number has its own stream, keyed by scene, seed and the number's key path, so adding an actor does not change the others.
 """
@@ -59,6 +59,24 @@ def jitter(spec: ScenarioSpec, scene_id: str, seed: int, fixed: tuple[str, ...] 
     update = {"road": walk(spec.road, ("road",), "road"), "ego": walk(spec.ego, ("ego",), "ego")}
     update["actors"] = walk(spec.actors, ("actors",), "actors")
     return spec.model_copy(update=update)
+
+
+def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[Any, Any]]:
+    """Return every key whose value the scene seed has changed, dotted, with the value as written (None: absent) and as drawn."""
+    before, after = _flat(written, ()), _flat(drawn, ())
+    return {key: (before.get(key), value) for key, value in after.items() if before.get(key) != value}
+
+
+def _flat(part: Any, loc: tuple[str | int, ...]) -> dict[str, Any]:
+    """Return dotted keys and plain values of a specification; actors go by their ids."""
+    if isinstance(part, Part):
+        names = set(type(part).model_fields) - ({"jitter", "variations", "samples"} if not loc else set())
+        pairs: list[tuple[str | int, Any]] = [(name, getattr(part, name)) for name in type(part).model_fields if name in names]
+    elif isinstance(part, tuple) and part and isinstance(part[0], Part):
+        pairs = [(getattr(item, "id", i), item) for i, item in enumerate(part)]
+    else:
+        return {".".join(map(str, loc)): part}
+    return {key: value for name, item in pairs for key, value in _flat(item, (*loc, name)).items()}
 
 
 def _by_id(key: str, ids: dict[str, str]) -> str:

@@ -63,4 +63,4 @@ def test_an_error_shows_its_four_parts_one_a_line() -> None:
 
 
 def test_exit_codes_tell_the_cause() -> None:
-    assert [e.exit_code for e in (InputError, InfrastructureError, RendererError, PolicyError, EvaluatorError)] == [2, 4, 4, 4, 5]
+    assert [e.exit_code for e in (InputError, InfrastructureError, RendererError, PolicyError, EvaluatorError)] == [2, 4, 4, 2, 5]

@@ -20,7 +20,7 @@ Examples:
 
 - `simrun check-policy my_policy.py:Mine --scenario smoke/curve`
 
-Exit codes: 0 every check passed; 1 the policy breaks its contract; 2 it cannot be found; 4 it could not be made.
+Exit codes: 0 every check passed; 1 the policy breaks its contract, or could not be made; 2 it cannot be found.
 """
 
 

@@ -56,7 +56,16 @@ def compare(
         else compare_runs(found[0], found[1], baseline, margins, EVERY_MISSING)
     )
     if as_json:
-        print(json.dumps({"runs": [str(run) for run in runs], "notes": list(result.notes), "paired": result.paired}))
+        print(
+            json.dumps(
+                {
+                    "runs": [str(run) for run in runs],
+                    "notes": list(result.notes),
+                    "paired": result.paired,
+                    "paired_with_base": result.with_base,
+                }
+            )
+        )
         return
     _print(result, [*HEADLINE, *margins] if not every else None)
 
@@ -64,9 +73,8 @@ def compare(
 def _print(result: Comparison, only: Sequence[str] | None) -> None:
     for note in result.notes:
         print(f"note: {note}")
-    rows = [row for row in pair_rows({"paired": result.paired}) if only is None or row.metric in only]
-    for variant, entries in result.paired.items():
-        mine = [row for row in rows if row.variant == variant]
+    for variant, entries in (*result.paired.items(), *result.with_base.items()):
+        mine = [row for row in pair_rows({"paired": {variant: entries}}) if only is None or row.metric in only]
         baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
         print(f"\n{variant} minus {baseline}")
         for line in [*_table(mine, entries), *_missing(entries)]:

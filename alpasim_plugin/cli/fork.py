@@ -74,7 +74,7 @@ def fork(
             print("continuation      equal to the log, bit for bit")
         elif after is not None:
             print(f"continuation      differs first in {after['component']} at step {after['step']} ({after['what']})")
-    print(f"report  {root / 'report.html'}")
+    print(f"report   {root / 'report.html'}")
     raise typer.Exit(result.exit_code)
 
 

@@ -27,7 +27,8 @@ Examples:
 
 - `simrun gate --self-test`
 
-Exit codes: 0 pass, 1 regression, 2 bad input or another baseline, 3 undecided, 4 rollouts could not be run, 5 could not be scored.
+Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken policy, 3 undecided, 4 rollouts could not be run,
+5 could not be scored.
 """
 
 

@@ -44,6 +44,11 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "Drive a policy through painted situations and name every breach of its contract: shapes, frames, units, time, determinism.",
     ),
     "doctor": ("doctor", "doctor", "EPILOG", "Test each part on a small case and report what works, what does not, and what to do."),
+    "preview": (
+        "preview", "preview", "EPILOG",
+        "Draw a scenario before it is driven: map, road users over time, and the camera along the recorded drive.",
+    ),
+    "new": ("new", "new", "EPILOG", "Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."),
     "refine": ("refine", "refine", "EPILOG", "Refine a video with a fixer, block by block, at any length in constant memory."),
     "fork": ("fork", "fork", "FORK_EPILOG", "Continue a logged rollout from an instant on with another renderer, policy or seed."),
     "probe": (

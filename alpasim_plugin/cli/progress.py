@@ -13,6 +13,8 @@ from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.plan import RunPlan
 from evaluators.report.numbers import plural
 
+SHOWN_CHANGES, SHOWN_SCENES = 4, 5
+
 
 class Silent:
     """Say nothing."""
@@ -105,7 +107,28 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> str:
     )
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
     line = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}".replace("\u00a0", " ") + f" -> {root}"
-    return "\n".join([line, *fixer_labels(plan)])
+    return "\n".join([line, *fixer_labels(plan), *varied_lines(plan), *background_lines(plan)])
+
+
+def background_lines(plan: RunPlan) -> list[str]:
+    """Return what the planning has noted about scenes with a background file: where it stands, and what it replaces."""
+    return [f"{name}: {note}" for name, s in plan.scenarios.items() if s.background for note in s.notes if note.startswith("background ")]
+
+
+def varied_lines(plan: RunPlan) -> list[str]:
+    """Return one line per scene whose numbers are not those in its file: what the scene seed has made of them."""
+    lines = []
+    for name, scenario in list(plan.scenarios.items()):
+        changes = [f"{key} {_value(old)} -> {_value(new)}" for key, (old, new) in scenario.varied.items()]
+        if changes:
+            more = f", and {len(changes) - SHOWN_CHANGES} more in run.json" if len(changes) > SHOWN_CHANGES else ""
+            lines.append(f"{name}: scene seed {scenario.seed} varies {', '.join(changes[:SHOWN_CHANGES])}{more}")
+    hidden = len(lines) - SHOWN_SCENES
+    return lines if hidden <= 0 else [*lines[:SHOWN_SCENES], f"{plural(hidden, 'more scene')} with varied numbers: see run.json"]
+
+
+def _value(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def fixer_labels(plan: RunPlan) -> list[str]:

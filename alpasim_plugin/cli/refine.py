@@ -17,11 +17,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
+from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
 from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_video
 from alpasim_plugin.stopping import Stopped
 from alpasim_plugin.types import Fixer
 
 LINE_EVERY_S = 10.0
+LARGE_CHANGE_DB = 30.0
 SCENE = "video"  # key of the noise, the same for every file: a renamed video gives the same result
 PREFIX = "fixer."
 
@@ -47,6 +49,7 @@ def refine(
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
     threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
     compare: Annotated[Path | None, typer.Option("--compare", help="Also write input and result side by side.")] = None,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Take whatever the fixer makes, however much it changes.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace results that exist.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the summary.")] = False,
@@ -69,7 +72,7 @@ def refine(
     files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
     try:
         with frame_progress(quiet or as_json) as show:
-            summary = refine_video(files, session, show)
+            summary = refine_video(files, session, show, None if anyway or opacity or sdmap else ChangeLimit())
     except Stopped as stop:
         stop.kept = "nothing was written; the same command starts again"
         raise
@@ -77,6 +80,24 @@ def refine(
         print(json.dumps({"input": str(source), "output": str(out), "compare": compare and str(compare), **asdict(summary)}))
     else:
         print(describe(summary, out))
+        for line in warnings(summary):
+            print(line, file=sys.stderr)
+
+
+def warnings(summary: RefineSummary) -> list[str]:
+    """Say what was found on a video that the fixer does not know, or may not know."""
+    if summary.refused_psnr_db is not None:
+        kept = summary.events.get(UNLIKE, 0)
+        return [
+            f"warning: {summary.fixer} changes this video too much for a repair: PSNR {summary.refused_psnr_db:.1f} dB against a frame",
+            "that was given as reliable. It was trained on another kind of picture.",
+            f"{kept} of {summary.frames} frames of the result are the input's own.",
+            "--opacity tells it what is reliable; --anyway takes what it makes.",
+        ]
+    if summary.psnr_db is not None and summary.psnr_db < LARGE_CHANGE_DB:
+        said = f"PSNR {summary.psnr_db:.1f} dB, mean {summary.mean_levels:.1f} grey levels"
+        return [f"warning: the fixer changed this video by much ({said}): compare with --compare before you use the result"]
+    return []
 
 
 def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
@@ -130,9 +151,23 @@ def frame_progress(silent: bool) -> Iterator[Callable[[int, int | None], None]]:
             nonlocal last
             now = time.perf_counter()
             speed = f"{done / (now - begin):.1f} frames/s"
+            left_s = None if claimed is None else (claimed - done) * (now - begin) / done
             bar.update(task, completed=done, total=claimed, speed=speed)
             if not silent and not terminal and now - last > LINE_EVERY_S:
                 last = now
-                print(f"refined {done}{'' if claimed is None else f'/{claimed}'} frames, {speed}", file=sys.stderr, flush=True)
+                of = "" if claimed is None else f"/{claimed}"
+                print(f"refined {done}{of} frames, {speed}{time_left(left_s)}", file=sys.stderr, flush=True)
 
         yield show
+
+
+def time_left(seconds: float | None) -> str:
+    """Say how long it will take from here; empty where the length of the video is not known.
+
+    Example:
+        >>> time_left(42.0), time_left(600.0), time_left(None)
+        (', about 42 s left', ', about 10 min left', '')
+    """
+    if seconds is None:
+        return ""
+    return f", about {seconds:.0f} s left" if seconds < 120 else f", about {seconds / 60:.0f} min left"

@@ -23,7 +23,7 @@ EPILOG = "Example: `simrun report runs/us101`"
 def report_line(root: Path) -> str:
     """Return the line that says where a run's report is, or how to get it."""
     page = root / "report.html"
-    return f"report  {shlex.quote(str(page))}" if page.exists() else f"report  not written; simrun report {shlex.quote(str(root))}"
+    return f"report   {shlex.quote(str(page))}" if page.exists() else f"report   not written; simrun report {shlex.quote(str(root))}"
 
 
 def report(
@@ -40,4 +40,4 @@ def report(
         print(json.dumps({"report": str(page), "summary": summary}))
     else:
         Console().print(render_table(summary))
-        print(f"report  {page}")
+        print(f"report   {page}")

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.bounds import SEED, SEEDS
-from alpasim_plugin.cli.progress import fixer_labels, make_progress
+from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_progress, varied_lines
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
@@ -21,7 +21,8 @@ from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from alpasim_plugin.stopping import Stopped
 from evaluators import PRESETS
-from evaluators.report import fixer_lines, render_table
+from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
+from evaluators.report.run_folder import read_run
 from scenarios.suite import expand
 
 FIXER_PREFIX = "fixer."
@@ -75,6 +76,7 @@ def run(
     time_limit: Annotated[
         float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a rollout may take; one that hangs is ended and reported.")
     ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Drive again also rollouts that failed by the policy's own fault.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Resolve and print the plan, run nothing.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
@@ -102,11 +104,11 @@ def run(
         return
     progress, command = make_progress(quiet or as_json), ["simrun", *sys.argv[1:]]
     try:
-        result = execute_run(plan, root, workers, command, progress, resume, certify, report, wait=wait, limit_s=time_limit)
+        result = execute_run(plan, root, workers, command, progress, resume, certify, report, wait=wait, limit_s=time_limit, retry=retry)
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
-    _print_result(result, as_json)
+    _print_result(result, as_json, video)
     if plan.undigested and not as_json:
         print(f"not reused by the next command: {', '.join(plan.undigested)} has no digest (--resume reuses its rollouts)")
     raise typer.Exit(result.exit_code)
@@ -165,6 +167,7 @@ def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -
         "fixers": fixer_labels(plan),
         "policies": [spec.name for spec in plan.policies],
         "seeds": list(plan.seeds),
+        "varied": {name: {key: list(pair) for key, pair in s.varied.items()} for name, s in plan.scenarios.items() if s.varied},
         "never_reused": list(plan.undigested),
         "camera_frames": int(frames * per_cell),
         "workers": threads.workers,
@@ -173,20 +176,41 @@ def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -
     if as_json:
         print(json.dumps(facts))
         return
+    facts["varied"], facts["backgrounds"] = varied_lines(plan), background_lines(plan)
     for key, value in facts.items():
         print(f"{key:>18}  {(', '.join(map(str, value)) or '-') if isinstance(value, list) else value}")
 
 
-def _print_result(result: RunResult, as_json: bool) -> None:
+def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
     Console().print(render_table(result.summary, headline_only=True))
     for line in fixer_lines(result.summary):
         print(line)
+    for line in plan_warnings(result.summary):
+        print(f"warning  {line}")
     for cell in result.summary["failures"]["cells"][:5]:
         print(f"failed: {cell['path']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
     if result.n_failed:
-        print(f"{result.n_failed} of {result.n_rollouts} rollouts failed; the same command runs them again", file=sys.stderr)
-    print(f"repeat  {certificate_line(result.summary['determinism'])}")
+        print(_failed_line(result), file=sys.stderr)
+    videos = len(list(result.root.glob("rollouts/*/*/*/*/front.mp4"))) if video != "none" else 0
+    if video != "none":
+        print(f"videos   {videos} of {result.n_rollouts} rollouts have a front.mp4 below {result.root}/rollouts")
+    print(f"repeat   {certificate_line(result.summary['determinism'])}")
+    run = read_run(result.root)
+    for line in ending_lines(run):
+        print(line)
     print(report_line(result.root))
+    print(next_line(run))
+
+
+def _failed_line(result: RunResult) -> str:
+    """Say how many rollouts failed, and whether the same command would try them again."""
+    said = f"{result.n_failed} of {result.n_rollouts} rollouts failed"
+    by_policy = result.summary["failures"]["by_class"].get("policy", 0)
+    if not by_policy:
+        return f"{said}; the same command runs them again"
+    whose = "all" if by_policy == result.n_failed else f"{by_policy} of them"
+    cure = "simrun check-policy tests the policy; after a change of it the same command runs them again"
+    return f"{said}, {whose} by the policy's own fault; {cure}"

@@ -29,7 +29,8 @@ def build(spec: PartSpec, **known: Any) -> Any:
         known: What the factory may ask for by naming a parameter so; `alpasim_plugin.parts.kinds` lists the names by kind.
 
     Raises:
-        InputError: The import fails, the factory asks for something else, or what it makes lacks a required member.
+        InputError: The import fails, the factory asks for something else, or what it makes lacks a required member; for a policy the
+            last two are a `PolicyError`.
         SimrunError: The factory raised; the error class is that of the part's kind.
     """
     kind = KINDS[spec.kind]
@@ -56,13 +57,13 @@ def complete(part: T, interface: Any, what: str = "") -> T:
         what: The part for messages.
 
     Raises:
-        InputError: A required member is missing.
+        InputError: A required member is missing; of a policy it is a `PolicyError`, since only the loop finds it out.
     """
     required, optional = _members(interface)
     missing = [name for name in required if not hasattr(part, name)]
     if missing:
         kind = interface.__name__.lower()
-        raise InputError(
+        raise _misfit(kind)(
             f"making a {kind}",
             what or type(part).__name__,
             f"a {type(part).__name__} without {', '.join(missing)}",
@@ -73,6 +74,11 @@ def complete(part: T, interface: Any, what: str = "") -> T:
             value = dict(default) if isinstance(default, Mapping) else default
             setattr(part, name, MethodType(value, part) if inspect.isfunction(value) else value)
     return part
+
+
+def _misfit(kind: str) -> type[SimrunError]:
+    """Return the error of a part that does not have its kind's form: a policy is what is under test, so the fault is its own."""
+    return PolicyError if kind == "policy" else InputError
 
 
 def _members(interface: Any) -> tuple[list[str], dict[str, Any]]:
@@ -89,7 +95,7 @@ def _arguments(factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any
     """Choose what a factory asks for by the names of its parameters.
 
     Raises:
-        InputError: It has a parameter without default that is none of them.
+        InputError: It has a parameter without default that is none of them (of a policy: `PolicyError`).
     """
     try:
         parameters = inspect.signature(factory).parameters.values()
@@ -99,7 +105,7 @@ def _arguments(factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any
     positional = [p.name for p in parameters if p.kind is inspect.Parameter.POSITIONAL_ONLY and p.default is inspect.Parameter.empty]
     unknown = positional + [p.name for p in named if p.name not in known and p.default is inspect.Parameter.empty]
     if unknown:
-        raise InputError(
+        raise _misfit(spec.kind)(
             f"making a {spec.kind}",
             f"{spec.kind} {spec.name!r}",
             f"its factory asks for {', '.join(unknown)}",

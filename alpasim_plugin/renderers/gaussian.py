@@ -15,10 +15,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.files.formats import read_gaussians
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.rasterize import Backend
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
@@ -28,6 +27,7 @@ from alpasim_plugin.gaussians.scene.nodes import SceneNode
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
 from alpasim_plugin.geometry import interpolate, inverse
+from alpasim_plugin.renderers.background import read_background
 from alpasim_plugin.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.world.ground import height_at
 
@@ -179,14 +179,7 @@ def _build(scenario: Scenario) -> SceneGraph:
     graph = build_scene(scenario, partial(height_at, scenario.ground))
     if scenario.background is None:
         return graph
-    cloud, report = read_gaussians(scenario.background.path)
-    if report.n_kept == 0:
-        raise RendererError(
-            "loading a background",
-            scenario.background.path,
-            str(report),
-            "give a file with at least one drawable Gaussian",
-        )
+    cloud, _ = read_background(scenario.background, scenario.ego_log.xyz)
     return with_background(graph, cloud, scenario.background.T_world_file)
 
 

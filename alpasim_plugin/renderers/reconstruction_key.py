@@ -21,7 +21,7 @@ BUILD = "alpasim_plugin.renderers.reconstruction_build"  # what it imports decid
 _NO_MATTER = frozenset(
     {
         "source", "rates", "start_us", "end_us", "warmup_us", "latency", "degradation", "world_origin", "content_hash", "notes",
-        "alpasim_map", "behaviour", "path", "source_part",
+        "alpasim_map", "behaviour", "path", "source_part", "stop_at_path_end", "varied",
     }
 )  # fmt: skip
 

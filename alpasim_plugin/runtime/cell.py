@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ import cv2
 
 from alpasim_plugin.atomic import disk_error
 from alpasim_plugin.control import Controller
-from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.errors import PolicyError, SimrunError
 from alpasim_plugin.parts import build, complete
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, STEPS_NAME, Remedy, RolloutState, inspect_rollout, write_manifest
+from alpasim_plugin.runtime.pictures import VIDEO_NAME
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
@@ -75,12 +76,14 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         "rollout_key": cell.rollout_key,
         "score_key": cell.score_key,
         "preset": options.preset,
+        "stops_at_path_end": cell.stops_at_path_end,
+        "video": options.video,
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MANIFEST, *DRIVEN, *DERIVED):  # the manifest first: without it nothing is trusted
             (folder / name).unlink(missing_ok=True)
-        scenario = _scenario(cell.ref)
+        scenario = replace(_scenario(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr():
             parts = builder(cell, options, scenario, threads)
             with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
@@ -90,7 +93,8 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"
     except SimrunError as error:
-        manifest |= {"status": "failed", "error": error.as_dict(), "traceback": traceback.format_exc()}
+        final = isinstance(error, PolicyError) and error.is_final
+        manifest |= {"status": "failed", "error": error.as_dict(), "final": final, "traceback": traceback.format_exc()}
     except OSError as error:
         failure = disk_error(folder, error)
         manifest |= {"status": "failed", "error": failure.as_dict(), "traceback": traceback.format_exc()}
@@ -111,22 +115,44 @@ def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str
 
 
 def find_rollout_state(
-    cell: Cell, root: Path, reuse_undigested: bool = False, full: bool = False, known: bool = False
+    cell: Cell,
+    root: Path,
+    reuse_undigested: bool = False,
+    full: bool = False,
+    known: bool = False,
+    retry: bool = False,
+    video: str = "none",
 ) -> tuple[Remedy, RolloutState]:
     """Return what a cell needs, and the rollout as it is found on disk.
 
-    A rollout with another content key is driven again; so are failed ones, and those with a part that has no digest unless
-    ``reuse_undigested`` is set. See `alpasim_plugin.runtime.manifests.inspect_rollout` for ``full`` and ``known``.
+    A rollout with another content key is driven again; so are those with a part that has no digest unless ``reuse_undigested`` is set, and
+    failed ones, except where the policy is at fault: the same policy would fail again (``retry`` drives these too).
+    One that was driven without the ``video`` that is asked for now is driven again as well. See
+    `alpasim_plugin.runtime.manifests.inspect_rollout` for ``full`` and ``known``.
     """
     state = inspect_rollout(root, cell.folder.as_posix(), full, known)
     manifest = state.manifest
-    if manifest is None or manifest.get("rollout_key") != cell.rollout_key or manifest["status"] != "ok":
+    if manifest is None or manifest.get("rollout_key") != cell.rollout_key:
+        return "drive", state
+    if manifest["status"] != "ok" and (retry or not manifest.get("final")):
         return "drive", state
     if cell.undigested and not reuse_undigested:
+        return "drive", state
+    if manifest["status"] != "ok":
+        return "none", state
+    if manifest.get("passed_path_end") and manifest.get("stops_at_path_end") != cell.stops_at_path_end:
+        return "drive", state  # the only rollouts that differ between presets that stop there and those that drive on
+    if _lacks_video(manifest, video):
         return "drive", state
     if state.remedy == "none" and manifest.get("score_key") != cell.score_key:
         return "score", state
     return state.remedy, state
+
+
+def _lacks_video(manifest: Mapping[str, Any], video: str) -> bool:
+    """Tell whether a finished rollout was driven without the video that is asked for now."""
+    is_asked = video == "all" or (video == "failures" and bool(manifest.get("events")))
+    return is_asked and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:

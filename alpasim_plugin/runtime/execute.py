@@ -50,6 +50,7 @@ class HowToRun:
         threads: Workers, and threads of each.
         reuse_undigested: Also reuse rollouts with parts that have no digest.
         full: Read every file of a finished rollout before it is reused, even if size and time are as written.
+        retry: Drive again also what failed by the policy's own fault.
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
     """
 
@@ -57,6 +58,7 @@ class HowToRun:
     reuse_undigested: bool = False
     full: bool = False
     limit_s: float | None = None
+    retry: bool = False
 
 
 def execute(
@@ -79,7 +81,7 @@ def execute(
     todo: list[Cell] = []
     for cell in plan.cells:
         folder = cell.folder.as_posix()
-        remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known)
+        remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
         if state.damage:
             doing = "driving again" if remedy == "drive" else "scoring again"
             noticed(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")

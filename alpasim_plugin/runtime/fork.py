@@ -108,7 +108,7 @@ def _fork(past: LoggedRollout, change: Change, root: Path, video: Literal["none"
 
 def _check(past: LoggedRollout, change: Change, root: Path) -> None:
     scenario = past.scenario
-    length_us = scenario.end_us - scenario.start_us
+    length_us = int(past.manifest["steps"]) * scenario.rates.control_us
     if not 0 <= change.after_us < length_us:
         found = f"the rollout lasts {length_us * 1e-6:g} s"
         raise InputError(DOING, f"--at {change.after_us * 1e-6:g}", found, "choose an instant within it, in seconds after the first frame")

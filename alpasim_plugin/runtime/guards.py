@@ -9,8 +9,11 @@ import numpy as np
 
 from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
 from alpasim_plugin.pixels import is_black
-from alpasim_plugin.plan_check import plan_problem
-from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest
+from alpasim_plugin.plan_check import plan_problem, sensors_problem
+from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec
+
+CHECK = "simrun check-policy finds all faults of a policy"
+TRACEBACK = "see the traceback in the rollout's manifest"
 
 
 def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> list[Frame]:
@@ -27,9 +30,7 @@ def checked_frames(renderer: Renderer, requests: Sequence[RenderRequest]) -> lis
     except SimrunError:
         raise
     except Exception as error:
-        raise RendererError(
-            "rendering a frame", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
-        ) from error
+        raise RendererError("rendering a frame", name, f"{type(error).__name__}: {error}", TRACEBACK) from error
     if len(frames) != len(requests):
         raise RendererError(
             "rendering a frame", name, f"{len(frames)} frames for {len(requests)} requests", "return one frame for each request"
@@ -55,6 +56,32 @@ def _checked(renderer: str, frame: Frame, request: RenderRequest) -> Frame:
     return frame
 
 
+def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:
+    """Return the policy's sensors.
+
+    Raises:
+        PolicyError: They are not a sequence of `SensorSpec`.
+    """
+    found = sensors_problem(policy.sensors)
+    if found:
+        raise PolicyError("reading a policy's sensors", type(policy).__name__, found, CHECK)
+    return policy.sensors
+
+
+def reset_policy(policy: Policy, seed: int, route: Route) -> None:
+    """Begin a rollout.
+
+    Raises:
+        PolicyError: The policy raised.
+    """
+    try:
+        policy.reset(seed, route)
+    except SimrunError:
+        raise
+    except Exception as error:  # whatever a foreign policy raises
+        raise PolicyError("resetting a policy", type(policy).__name__, f"{type(error).__name__}: {error}", TRACEBACK) from error
+
+
 def checked_plan(policy: Policy, observation: Observation) -> Plan:
     """Query the policy and check its plan.
 
@@ -67,10 +94,8 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
     except SimrunError:
         raise
     except Exception as error:
-        raise PolicyError(
-            "querying the policy", name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest"
-        ) from error
+        raise PolicyError("querying the policy", name, f"{type(error).__name__}: {error}", TRACEBACK) from error
     found = plan_problem(plan, observation.t_us)
     if found:
-        raise PolicyError("querying the policy", name, found, "simrun check-policy finds all faults of a policy")
+        raise PolicyError("querying the policy", name, found, CHECK)
     return plan

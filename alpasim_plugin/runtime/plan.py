@@ -11,6 +11,7 @@ from typing import Literal
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
 from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.types import Scenario
 from evaluators import resolve_evaluators
 from evaluators.presets import preset
@@ -47,6 +48,7 @@ class Cell:
     evaluators: tuple[PartSpec, ...]
     rollout_key: str  # digest of everything that determines the log
     score_key: str  # digest of rollout_key and of everything that determines the scores
+    stops_at_path_end: bool = True  # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
     undigested: tuple[str, ...] = ()  # parts without a digest (remote services): the rollout is reused on request only
 
     @property
@@ -134,6 +136,8 @@ def make_plan(
                 f"both have the scene id {scenario.scene_id!r}",
                 "give one of them another id, or name it once",
             )
+        note = background_note(scenario)
+        scenario = replace(scenario, notes=(*scenario.notes, note)) if note else scenario
         scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
     cells = [
         _cell(scenario, origin[scene_id], renderer, policy, moving[policy.name], seed, scoring, options)
@@ -164,7 +168,8 @@ def _cell(
     loop = own_code_digest("alpasim_plugin.runtime.rollout")
     rollout_key = digest([loop, scenario.content_hash, content, seed, options.images, options.device])
     undigested = tuple(what for what, known in content.items() if known is None)
-    cell = Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, "", undigested)
+    stops = scenario.stop_at_path_end and preset(options.preset).stop_at_path_end
+    cell = Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, "", stops, undigested)
     return replace(cell, score_key=score_key(rollout_key, options.preset, evaluators))
 
 

@@ -6,7 +6,7 @@ import hashlib
 import tempfile
 import uuid
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -15,9 +15,23 @@ import numpy as np
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.pictures import Pictures
+from alpasim_plugin.runtime.plan_motion import PlanMotion
 from alpasim_plugin.runtime.stages import StageTimes
-from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, Renderer, RenderRequest, RolloutLog, Scenario, Trajectory
+from alpasim_plugin.types import (
+    F64,
+    CameraSpec,
+    EgoState,
+    Frame,
+    Observation,
+    Renderer,
+    RenderRequest,
+    RolloutLog,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+)
 from alpasim_plugin.world.ego import ego_state_from_log
 
 LOG_NAME, FRAMES_NAME = "rollout.asl", "frames.jsonl"
@@ -53,10 +67,13 @@ class Recorder:
         self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, session or f"{scenario.scene_id}/{seed}"))
         self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
         self._times = StageTimes()
+        self.plan_motion = PlanMotion(scenario.vehicle)
         self._frames: list[dict[str, Any]] = []
         self._pictures: Pictures | None = None
+        self._only_watched = False
         self._last_query_us = -1
         self._steps = self._first_call = 0
+        self._passed = False
         self._writer: AslWriter | None = None
 
     def __enter__(self) -> Recorder:
@@ -72,8 +89,18 @@ class Recorder:
 
     def rendering(self, renderer: Renderer, frames: int) -> AbstractContextManager[None]:
         """Time the rendering of ``frames`` frames; stages that the renderer reports are timed under their own names."""
+        if self._only_watched:
+            return nullcontext()
         self._first_call = self._first_call or frames
         return self._times.measure("render", frames, lambda: renderer.stage_ms)
+
+    def watch(self, scenario: Scenario) -> tuple[SensorSpec, ...]:
+        """Return the camera to render for a policy without one: the scenario's first if a video is kept, else none.
+
+        Its frames go into the pictures alone: neither the log nor times nor scores depend on whether somebody watches.
+        """
+        self._only_watched = self._keep_frames and bool(scenario.cameras)
+        return (SensorSpec(scenario.cameras[0].name),) if self._only_watched else ()
 
     # --- in the loop's order ----------------------------------------------------------------------------------------
 
@@ -83,7 +110,7 @@ class Recorder:
             self._pictures = Pictures(clock, next(iter(cameras)), self._keep_frames)
         header = header_from_scenario(self._scenario, self._session, self._seed, clock.n_steps, self._versions)
         self._writer = AslWriter(self.folder / LOG_NAME, header)
-        self._writer.begin(list(cameras.values()))
+        self._writer.begin([] if self._only_watched else list(cameras.values()))
 
     def poses(self, ego: EgoState, actors: Mapping[str, F64]) -> None:
         """Log the true poses of the ego and the actors."""
@@ -92,6 +119,10 @@ class Recorder:
 
     def frame(self, frame: Frame, request: RenderRequest) -> None:
         """Log one camera frame."""
+        if self._only_watched:
+            if self._pictures is not None:
+                self._pictures.add(frame)
+            return
         with self.stage("log"):
             if self._images != "none":
                 self._log.render_request([request], self._images)
@@ -132,8 +163,9 @@ class Recorder:
             self._log.controller_return(after)
             self._steps += 1
 
-    def finish(self) -> None:
+    def finish(self, path_end: PathEnd) -> None:
         """Close the log and write the per-frame facts."""
+        self._passed = path_end.passed
         with self.stage("log"):
             self._log.finish()
             write_facts(self.folder / FRAMES_NAME, self._frames)
@@ -155,6 +187,8 @@ class Recorder:
             "first_call_frames": self._first_call,
             "steps": self._steps,
             "frame_events": events,
+            "passed_path_end": self._passed,
+            "plan_motion": self.plan_motion.facts(),
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
             "strip_t_us": [] if self._pictures is None else self._pictures.strip_us,

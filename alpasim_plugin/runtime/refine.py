@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.refine import StreamStats, refine_frames
+from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.picture_folder import PictureFolderReader, PictureFolderWriter
 from alpasim_plugin.log.video_reader import TimedFrame, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
@@ -78,6 +78,8 @@ class RefineSummary:
         psnr_db: Result against source, None where they are equal; before the file's compression.
         mean_levels, max_levels: Their absolute difference in grey levels.
         events: Number of frames that a guard replaced by the unrefined ones, by event.
+        refused_psnr_db: Where the fixer changed a frame beyond the limit, that frame's PSNR against the source; from there on the source's
+            frames were written as they are.
         audio_left_out: Whether the source has sound; the result has none.
     """
 
@@ -95,11 +97,15 @@ class RefineSummary:
     mean_levels: float
     max_levels: int
     events: Mapping[str, int]
+    refused_psnr_db: float | None
     audio_left_out: bool
 
 
 def refine_video(
-    files: RefineFiles, make_fixer: Callable[[], Fixer], on_frames: Callable[[int, int | None], None] | None = None
+    files: RefineFiles,
+    make_fixer: Callable[[], Fixer],
+    on_frames: Callable[[int, int | None], None] | None = None,
+    limit: ChangeLimit | None = None,
 ) -> RefineSummary:
     """Refine a video file.
 
@@ -107,6 +113,7 @@ def refine_video(
         files: The files to read and write.
         make_fixer: Creates the fixer's session; called after the files are checked.
         on_frames: Called after every block with the frames done and the number that the container states.
+        limit: How much the fixer may change a frame; beyond it this and all later frames pass through as they are.
 
     Raises:
         InputError: Files that cannot be read or do not match, or results that exist already.
@@ -128,7 +135,7 @@ def refine_video(
             writers[role] = _writer(path, readers["input"])
             stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
-        for block in refine_frames(_joined(readers, timing), fixer):
+        for block in refine_frames(_joined(readers, timing), fixer, limit):
             for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
                 writers["output"].write(fixed.rgb, timed.time, timed.duration)
                 if "compare" in writers:
@@ -154,6 +161,7 @@ def refine_video(
         mean_levels=difference.mean_levels,
         max_levels=difference.max_levels,
         events=dict(stats.events),
+        refused_psnr_db=stats.refused_psnr_db,
         audio_left_out=source.audio,
     )
 

@@ -10,9 +10,10 @@ from alpasim_plugin.parts import complete
 from alpasim_plugin.runtime.cadence import make_cadence
 from alpasim_plugin.runtime.cameras import CameraRig
 from alpasim_plugin.runtime.forecast import Forecaster
-from alpasim_plugin.runtime.guards import checked_frames, checked_plan
+from alpasim_plugin.runtime.guards import checked_frames, checked_plan, checked_sensors, reset_policy
 from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState
+from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.types import Controller, Policy, Renderer, Scenario
 from alpasim_plugin.world.actors import make_actors
@@ -28,7 +29,8 @@ def run_rollout(
 ) -> Recorder:
     """Drive one scenario once and return its recorder.
 
-    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then the loop is closed.
+    Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then the loop is closed. It ends at
+    ``end_us``, or, if the scenario says so, where the ego passes the end of the recorded path (`alpasim_plugin.runtime.path_end`).
 
     Args:
         scenario: The scenario.
@@ -49,11 +51,15 @@ def run_rollout(
     actors = make_actors(scenario)
     plans = PlanQueue(scenario.latency)
     state = LoopState.at_start(scenario, clock.n_steps)
-    cadence = make_cadence(clock, scenario, policy.sensors, renderer.block)
+    sensors = checked_sensors(policy)
+    watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
+    cadence = make_cadence(clock, scenario, sensors, renderer.block)
+    path_end = PathEnd(scenario)
     forecaster = Forecaster(scenario, controller, plans, actors, state)
-    rig = CameraRig(scenario, policy.sensors, clock, cadence, forecaster, renderer.lookahead)
-    policy.reset(seed, scenario.route)
+    rig = CameraRig(scenario, sensors or watched, clock, cadence, forecaster, renderer.lookahead)
+    reset_policy(policy, seed, scenario.route)
     recorder.start(clock, rig.specs)
+    seen = {} if watched else rig.specs
 
     for tick in clock.ticks():
         with recorder.stage("actors"):
@@ -65,16 +71,18 @@ def run_rollout(
         if frames:
             plans.frames(tick.t_us, renderer.stage_ms)
         for frame, request in zip(frames, requests, strict=True):
-            state.frames[frame.camera] = frame
+            if frame.camera in seen:
+                state.frames[frame.camera] = frame
             recorder.frame(frame, request)
-        if tick.is_last:
+        if path_end.ends_rollout(state.ego) or tick.is_last:
             break
         if cadence.queries_at(tick.t_us):
-            observation = state.observe(rig.specs)
+            observation = state.observe(seen)
             recorder.policy_query(observation, clock)
             began = time.perf_counter()
             with recorder.stage("policy"):
                 plan = checked_plan(policy, observation)
+            recorder.plan_motion.add(plan, state.ego)
             plan_world, *samples = state.to_world(plan)
             plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
             recorder.policy_plan(plan_world, samples)
@@ -82,5 +90,5 @@ def run_rollout(
         with recorder.stage("control"):
             forced = state.advance(controller, active, tick.t_us + clock.rates.control_us)
         recorder.control_step(before, active, state.ego, forced)
-    recorder.finish()
+    recorder.finish(path_end)
     return recorder

@@ -99,6 +99,7 @@ def execute_run(
     wait: bool = False,
     full: bool = False,
     limit_s: float | None = None,
+    retry: bool = False,
 ) -> RunResult:
     """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
 
@@ -114,6 +115,7 @@ def execute_run(
         wait: Wait for a process that writes the folder; otherwise refuse.
         full: Read every file of a finished rollout before it is reused, even if size and time are as written.
         limit_s: Seconds that one rollout may take.
+        retry: Drive again also what failed by the policy's own fault.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
@@ -132,7 +134,7 @@ def execute_run(
             manifest["reused"] = reused
             progress.rollout_done(manifest, reused)
 
-        how = HowToRun(threads, resume, full, limit_s)
+        how = HowToRun(threads, resume, full, limit_s, retry)
         manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
         pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
         determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
@@ -151,7 +153,7 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     """
     info = read_run_json(root)
     write_run_json(root, info | dict(more))
-    summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more)
+    summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
@@ -254,6 +256,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
                     },
                     "content_hash": s.content_hash,
                     "seed": s.seed,
+                    "varied": {key: list(values) for key, values in s.varied.items()},
                     "duration_s": (s.end_us - s.start_us) * 1e-6,
                     "rates": asdict(s.rates),
                     "latency": asdict(s.latency),
@@ -263,6 +266,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
                 }
                 for name, s in plan.scenarios.items()
             },
+            "bases": {spec.name: spec.base.name for spec in plan.renderers if spec.fixer is not None},
             "fixers": {spec.name: spec.fixer.as_dict() for spec in plan.renderers if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
             "metrics": declared(),

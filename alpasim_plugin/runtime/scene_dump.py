@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.geometry import yaw_from_quat
 from alpasim_plugin.types import F64, Actor, LaneMap, Scenario, Scene, Trajectory, Vehicle
+
+ACTOR_STEP_US = 250_000
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,31 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:
             "width_m": scenario.vehicle.box.width_m,
             "rear_axle_to_centre_m": scenario.vehicle.rear_axle_to_centre_m,
         },
-        "actors": [{"id": a.actor_id, "label": a.label, "static": a.is_static} for a in scenario.actors],
+        "actors": [_actor(scenario, actor) for actor in scenario.actors],
+    }
+
+
+def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> dict[str, Any]:
+    """Return what a drawing needs of a road user: its size, and its track every `ACTOR_STEP_US` while the scene runs."""
+    track = actor.track
+    is_timed = scenario.end_us > scenario.start_us  # a scene that logs are scored against need not say when it runs
+    inside = np.flatnonzero((track.t_us >= scenario.start_us) & (track.t_us <= scenario.end_us)) if is_timed else np.arange(len(track))
+    if actor.is_static:
+        inside = inside[:1] if len(inside) else np.array([0])
+    step = max(1, round(ACTOR_STEP_US / max(1.0, float(np.median(np.diff(track.t_us)))))) if len(track) > 1 else 1
+    keep = np.unique(np.concatenate([inside[::step], inside[-1:]]))
+    yaw = yaw_from_quat(track.quat[keep])
+    return {
+        "id": actor.actor_id,
+        "label": actor.label,
+        "static": actor.is_static,
+        "reacts": actor.behaviour.kind != "replay",
+        "length_m": actor.box.length_m,
+        "width_m": actor.box.width_m,
+        "t_us": track.t_us[keep].tolist(),
+        "x_m": np.round(track.xyz[keep, 0], 2).tolist(),
+        "y_m": np.round(track.xyz[keep, 1], 2).tolist(),
+        "yaw_rad": np.round(yaw, 3).tolist(),
     }
 
 

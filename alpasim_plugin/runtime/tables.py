@@ -15,9 +15,13 @@ from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
 from alpasim_plugin.runtime.manifests import STEPS_NAME
+from alpasim_plugin.runtime.plan_motion import plan_table
 from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_table
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
+from evaluators.aggregate.paired import base_pairs
+
+NO_BASES: Mapping[str, str] = {}
 
 
 def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -41,7 +45,12 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_tables(
-    root: Path, manifests: Sequence[dict[str, Any]], preset: str, baseline: str | None, more: Mapping[str, Any]
+    root: Path,
+    manifests: Sequence[dict[str, Any]],
+    preset: str,
+    baseline: str | None,
+    more: Mapping[str, Any],
+    bases: Mapping[str, str] = NO_BASES,
 ) -> dict[str, Any]:
     """Write rollouts.parquet, steps.parquet and summary.json and return the summary.
 
@@ -51,6 +60,8 @@ def write_tables(
         preset: Evaluator preset of the scores.
         baseline: Renderer that the others are compared with; None is the first.
         more: What the manifests do not tell, for the summary.
+        bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
+            baseline, the two are paired too.
     """
     rows = rollout_rows(manifests)
     metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
@@ -62,9 +73,11 @@ def write_tables(
         "preset": preset,
         "metrics": _by_policy(rows, aggregate),
         "paired": _by_policy(rows, lambda some: _pairs(some, baseline)),
+        "paired_with_base": _by_policy(rows, lambda some: base_pairs(some, _baseline(some, baseline), bases)),
         "censoring": _by_policy(manifests, censoring),
         "failures": _failures(manifests),
         "fixers": _by_policy([m for m in manifests if m["status"] == "ok"], fixers),
+        "plans": _by_policy([m for m in manifests if m["status"] == "ok"], plan_table),
         "speed": _by_policy([m for m in manifests if m["status"] == "ok" and m.get("stage_ms")], _speeds),
         **more,
     }
@@ -83,10 +96,16 @@ def _by_policy(rows: Sequence[dict[str, Any]], table: Callable[[Sequence[dict[st
 
 
 def _pairs(rows: Sequence[dict[str, Any]], baseline: str | None) -> dict[str, Any]:
+    chosen = _baseline(rows, baseline)
+    return {} if chosen is None else dict(paired(rows, chosen))
+
+
+def _baseline(rows: Sequence[dict[str, Any]], baseline: str | None) -> str | None:
+    """Return the renderer that the others are compared with; None where there is nothing to compare."""
     renderers = list(dict.fromkeys(row["renderer"] for row in rows))
     if len(renderers) < 2:
-        return {}
-    return dict(paired(rows, baseline if baseline is not None and baseline in renderers else renderers[0]))
+        return None
+    return baseline if baseline is not None and baseline in renderers else str(renderers[0])
 
 
 def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:

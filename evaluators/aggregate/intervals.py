@@ -8,7 +8,7 @@ coverage of each is in docs/experiments/interval-coverage.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,18 @@ class Interval:
     def bounds(self) -> list[float] | None:
         """Give [low, high] or None."""
         return None if self.low is None or self.high is None else [self.low, self.high]
+
+
+def within(interval: Interval, low: float, high: float) -> Interval:
+    """Cut an interval to the values that are possible; what it covers does not change, since nothing true lies outside.
+
+    Example:
+        >>> within(Interval(0.97, 0.66, 1.28), 0.0, 1.0).bounds
+        [0.66, 1.0]
+    """
+    if interval.low is None or interval.high is None:
+        return interval
+    return replace(interval, low=min(max(interval.low, low), high), high=max(min(interval.high, high), low))
 
 
 def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:

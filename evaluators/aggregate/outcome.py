@@ -6,18 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Cause = Literal["pass", "regression", "undecided", "infrastructure", "evaluator"]
+Cause = Literal["pass", "regression", "policy", "undecided", "infrastructure", "evaluator"]
 
-EXIT_CODES: dict[Cause, int] = {"pass": 0, "regression": 1, "undecided": 3, "infrastructure": 4, "evaluator": 5}
+EXIT_CODES: dict[Cause, int] = {"pass": 0, "regression": 1, "policy": 2, "undecided": 3, "infrastructure": 4, "evaluator": 5}
 WORDS: dict[Cause, str] = {
     "pass": "PASS",
     "regression": "FAIL",
+    "policy": "POLICY FAILURE",
     "undecided": "UNDECIDED",
     "infrastructure": "INFRASTRUCTURE FAILURE",
     "evaluator": "EVALUATOR FAILURE",
 }
 # Where causes meet, the first one found here decides: numbers from an incomplete run may mislead either way.
-SEVERITY: tuple[Cause, ...] = ("evaluator", "infrastructure", "regression", "undecided", "pass")
+SEVERITY: tuple[Cause, ...] = ("evaluator", "infrastructure", "policy", "regression", "undecided", "pass")
 
 
 @dataclass(frozen=True)
@@ -68,4 +69,5 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
         return Outcome("pass")
     causes = ", ".join(f"{name} {count}" for name, count in by_class.items())
     said = f"{n_failed} of {n} rollouts could not be run or scored ({causes})"
-    return Outcome("evaluator" if set(by_class) == {"evaluator"} else "infrastructure", (said,))
+    alone: Cause | None = next((cause for cause in ("evaluator", "policy") if set(by_class) == {cause}), None)
+    return Outcome(alone or "infrastructure", (said,))

@@ -13,11 +13,11 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, I64, Bool
-from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, t_bounds, t_interval
+from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, t_bounds, t_interval, within
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
 from evaluators.aggregate.rows import Cell, RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
 from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
-from evaluators.metrics import info
+from evaluators.metrics import difference_range, info
 
 LISTED = 50  # missing cells named per metric; the count is always whole
 NO_PAIR = "no scene-seed cell has this metric on both sides"
@@ -54,6 +54,25 @@ def paired(
         renderer: {name: compare(side, split[baseline], name, baseline, chosen[name], listed) for name in names}
         for renderer, side in split.items()
         if renderer != baseline
+    }
+
+
+def base_pairs(rows: Sequence[Row], baseline: str | None, bases: Mapping[str, str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Compare every renderer with a fixer with the renderer below it: what the fixer itself does.
+
+    Args:
+        rows: As for `aggregate`, of one policy.
+        baseline: What the others are compared with already; a fixer over it is left out here.
+        bases: Renderer with a fixer -> the renderer below it.
+
+    Returns:
+        RENDERER -> METRIC -> what `compare` gives; without those whose base was not driven.
+    """
+    split, names = by_renderer(rows), metric_names(rows)
+    chosen = {name: base for name, base in bases.items() if name in split and base in split and base != baseline and name != baseline}
+    return {
+        name: {metric: compare(split[name], split[base], metric, base, default_margin(metric)) for metric in names}
+        for name, base in chosen.items()
     }
 
 
@@ -100,6 +119,7 @@ def compare(here: RendererRows, there: RendererRows, metric: str, baseline: str,
         gained, lost = int(np.sum((pairs.mine > 0) & (pairs.base == 0))), int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
         entry["cells"] = {"only_here": gained, "only_baseline": lost, "p_value": sign_test(gained, lost)}
     interval = flag_interval(delta, pairs.scenes) if facts.is_flag else t_interval(means, "scenes")
+    interval = within(interval, *difference_range(metric))
     entry["diff"], entry["ci95"], entry["method"] = interval.centre, interval.bounds, interval.method or None
     if interval.reason:
         return entry | {"reason": interval.reason}

@@ -10,9 +10,9 @@ import numpy as np
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
 from evaluators.aggregate.bootstrap import cluster_bootstrap
-from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, normal_half_width, wilson_rate
+from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, normal_half_width, wilson_rate, within
 from evaluators.aggregate.rows import RendererRows, Row, by_renderer, metric_names
-from evaluators.metrics import info
+from evaluators.metrics import info, value_range
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
@@ -61,7 +61,7 @@ def _entry(side: RendererRows, metric: str) -> dict[str, Any]:
     entry["ci95"], why = normal_half_width(values)
     if why:
         entry["ci95_reason"] = why
-    interval = clustered(values, scenes, facts.is_flag)
+    interval = within(clustered(values, scenes, facts.is_flag), *value_range(metric))
     entry["ci95_clustered"], entry["ci95_clustered_method"] = interval.bounds, interval.method or None
     entry["design_effect"] = design_effect(values, scenes)
     if interval.reason:

@@ -20,6 +20,7 @@ ROUNDING = 1e-12  # differences that vary by no more than this, relative, are eq
 MARGINS = {
     "progress": 0.02,
     "progress_rel": 0.02,
+    "lateral_distance_m": 0.1,
     "route_distance_m": 0.1,
     "lateral_bias_m": 0.1,
     "dist_to_gt_trajectory": 0.25,

@@ -24,11 +24,13 @@ class Comparison:
     Attributes:
         paired: VARIANT -> METRIC -> what `evaluators.aggregate.paired.compare` gives; a variant is RENDERER, or RENDERER/POLICY where there
             are several policies.
+        with_base: The same of renderers with a fixer against the renderer below it, where that is not the baseline.
         notes: What a reader must know, such as policies that were paired although their names differ.
     """
 
     paired: Mapping[str, Mapping[str, Mapping[str, Any]]]
     notes: tuple[str, ...] = field(default=())
+    with_base: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
 
 def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED) -> Comparison:
@@ -44,7 +46,9 @@ def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, 
         raise InputError(DOING, f"baseline {name!r}", f"{run.folder} does not have it", f"choose one of {', '.join(known) or 'none'}")
     if len(known) < 2:
         raise InputError(DOING, str(run.folder), f"only one renderer, {name}", "name a second run, or run two renderers")
-    return Comparison(_pairs(rows, rows, {other: name for other in known if other != name}, "", margins, listed))
+    bases = {one: base for one, base in (run.info.get("bases") or {}).items() if one in known and base in known and name not in (one, base)}
+    found = _pairs(rows, rows, {other: name for other in known if other != name}, "", margins, listed)
+    return Comparison(found, with_base={} if baseline is not None else _pairs(rows, rows, bases, "", margins, listed))
 
 
 def compare_runs(

@@ -7,18 +7,24 @@ from typing import TYPE_CHECKING
 from alpasim_plugin.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from evaluators.report.ending import ending_lines as ending_lines
+    from evaluators.report.ending import next_line as next_line
     from evaluators.report.fixers import fixer_lines as fixer_lines
     from evaluators.report.html import write_report as write_report
     from evaluators.report.junit import write_junit as write_junit
+    from evaluators.report.plans import plan_warnings as plan_warnings
     from evaluators.report.summary import write_summary_md as write_summary_md
     from evaluators.report.terminal import render_table as render_table
 
-__all__ = ["fixer_lines", "render_table", "write_junit", "write_report", "write_summary_md"]
+__all__ = ["ending_lines", "fixer_lines", "next_line", "plan_warnings", "render_table", "write_junit", "write_report", "write_summary_md"]
 
 __getattr__ = lazy_names(
     __name__,
     {
+        "ending_lines": ".ending",
         "fixer_lines": ".fixers",
+        "next_line": ".ending",
+        "plan_warnings": ".plans",
         "render_table": ".terminal",
         "write_junit": ".junit",
         "write_report": ".html",

@@ -17,6 +17,7 @@ import shapely
 
 from evaluators.report.events import Event, events_of
 from evaluators.report.numbers import fixed
+from evaluators.report.road_users import RoadUser, corners, road_users
 from evaluators.report.run_folder import Rollout, Series
 
 F64 = npt.NDArray[np.float64]
@@ -79,6 +80,8 @@ class SceneView:
     bar_label: str
     north_deg: float
     offset: OffsetChart | None
+    road_users: tuple[RoadUser, ...] = ()
+    road_users_at: str = ""  # when the road users are drawn
 
     @property
     def is_wide(self) -> bool:
@@ -177,6 +180,7 @@ def scene_view(
     marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout)) for r in rollouts for e in events_of(r, series)]
     bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
     lanes = content.get("lanes") or []
+    at_us, at_text = _moment(rollouts, series)
     return SceneView(
         scene=scene,
         source=str(content.get("source") or ""),
@@ -194,7 +198,28 @@ def scene_view(
         bar_label=f"{bar_m:.0f}\u00a0m",
         north_deg=round(frame.north_deg, 1),
         offset=_offset_chart(rollouts, series, variant_of, label),
+        road_users=tuple(road_users(content, at_us, log, lambda xy, closed: _seen(xy, closed, frame))),
+        road_users_at=at_text,
     )
+
+
+def _moment(rollouts: Sequence[Rollout], series: Series) -> tuple[int, str]:
+    """Return when road users are drawn: at the scene's first event, else half way through."""
+    times = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
+    if not times:
+        return 0, ""
+    start_us = min(int(t[0]) for t in times)
+    firsts = [(e.t_s, e.what) for r in rollouts for e in events_of(r, series) if e.t_s is not None]
+    if firsts:
+        t_s, what = min(firsts)
+        return start_us + round(t_s * 1e6), f"at {fixed(t_s, 1)}\u00a0s, when the first {what} happens"
+    middle_us = (start_us + max(int(t[-1]) for t in times)) // 2
+    return middle_us, f"at {fixed((middle_us - start_us) * 1e-6, 1)}\u00a0s, half way"
+
+
+def _seen(xy: F64, closed: bool, frame: _Frame) -> str:
+    units = frame.units(xy)
+    return path_data(units, closed, tolerance=0.0 if closed else 1.5) if frame.sees(units) else ""
 
 
 def _driven(own: Mapping[str, tuple[Any, F64]]) -> F64 | None:
@@ -251,9 +276,8 @@ def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: V
     at = frame.units(centre)[0]
     footprint = ""
     if event.yaw_rad is not None and vehicle.get("length_m"):
-        half, wide = vehicle["length_m"] / 2, vehicle["width_m"] / 2
-        corners = np.array([[-half, -wide], [half, -wide], [half, wide], [-half, wide]])
-        footprint = path_data(frame.units(corners @ turn + centre), closed=True, tolerance=0.0)
+        box = corners(centre[0], event.yaw_rad, vehicle["length_m"], vehicle["width_m"])
+        footprint = path_data(frame.units(box), closed=True, tolerance=0.0)
     where = f"x {fixed(centre[0, 0], 1)}, y {fixed(centre[0, 1], 1)}\u00a0m"
     return Mark(variant, event.kind, f"{label}: {event.what} {when}, {where}", round(at[0]), round(at[1]), footprint)
 

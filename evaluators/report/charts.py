@@ -20,6 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from evaluators.report.events import events_of
+from evaluators.report.numbers import LEAST_SPAN
 from evaluators.report.run_folder import Rollout, Series
 
 N_COLOURS = 8
@@ -101,7 +102,7 @@ def line_chart(curves: Sequence[Curve], x_label: str, y_label: str, y_top: float
             axes.plot(curve.x, curve.y, color=colour, linestyle=DASHES[curve.dash % len(DASHES)], label=curve.label)
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
-        axes.set_ylim(bottom=0.0, top=y_top)
+        axes.set_ylim(bottom=0.0, top=max(axes.get_ylim()[1], LEAST_SPAN["m"]) if y_top is None else y_top)
         axes.margins(x=0.01)
         axes.tick_params(length=0)
         return themed_svg(figure)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,14 +13,15 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from evaluators.report.charts import GRID, INK, MUTED, N_COLOURS, RC, SIZE_IN, VARIANT, Chart, new_axes, themed_svg
 from evaluators.report.headline import WORDS
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
-from evaluators.report.numbers import finite, interval
+from evaluators.report.numbers import LEAST_SPAN, finite, interval
+from evaluators.report.pairs import pair_tables
 from evaluators.report.run_folder import Run
 from evaluators.report.strata import NOT_BESIDE, VALUES, Strata
 
 LETTER_PT, LINE_PT = 6.0, 12.0  # width and height of a letter of a name, points
 CHARACTER_IN = 0.075  # width of a tick label's character, inches: the page's font at 10 points
 MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
-ERRORS = ("collision_at_fault", "offroad", "route_distance_m")
+ERRORS = ("collision_at_fault", "offroad", "lateral_distance_m")
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,14 @@ def forest(run: Run, variants: Mapping[str, int]) -> list[Chart]:
         run: The run.
         variants: Key of ``summary.json`` -> colour.
     """
-    lines: dict[str, list[_Line]] = {}
-    for variant, pairs in (run.summary.get("paired") or {}).items():
+    lines: dict[tuple[str, str], list[_Line]] = {}
+    for variant, pairs in pair_tables(run.summary):
         for metric in ordered(pairs):
             found = _line(metric, variants.get(variant, 0), pairs[metric] or {})
             if found is not None and metric in HEADLINE:
-                lines.setdefault(found[0], []).append(found[1])
-    return [_forest_chart(unit, some) for unit, some in lines.items()]
+                lines.setdefault((str(pairs[metric].get("baseline") or "the baseline"), found[0]), []).append(found[1])
+    several = len({baseline for baseline, _ in lines}) > 1
+    return [_forest_chart(unit, baseline, several, some) for (baseline, unit), some in lines.items()]
 
 
 def _line(metric: str, variant: int, entry: Mapping[str, Any]) -> tuple[str, _Line] | None:
@@ -63,7 +65,7 @@ def _line(metric: str, variant: int, entry: Mapping[str, Any]) -> tuple[str, _Li
     return ("points" if scale == 100.0 else unit), _Line(metric, variant, turned[0], min(turned[1:]), max(turned[1:]), margin)
 
 
-def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
+def _forest_chart(unit: str, baseline: str, several: bool, lines: Sequence[_Line]) -> Chart:
     metrics = list(dict.fromkeys(line.metric for line in lines))
     variants = sorted({line.variant for line in lines})
     gap = 1.0 / (len(variants) + 1)
@@ -81,14 +83,16 @@ def _forest_chart(unit: str, lines: Sequence[_Line]) -> Chart:
             margin = max(line.margin for line in lines if line.metric == metric)
             if margin > 0.0:
                 axes.plot([margin, margin], [row - 0.42, row + 0.42], color=MUTED, linewidth=1.0, linestyle=(0, (2.0, 2.0)))
+        _no_magnifying(axes.get_xlim, axes.set_xlim, unit)
         axes.set_yticks(range(len(metrics)), names)
         axes.set_ylim(len(metrics) - 0.5, -0.5)
         axes.tick_params(length=0)
         axes.spines["left"].set_visible(False)
         worse_in = "percentage points" if unit == "points" else unit or "no unit"
-        axes.set_xlabel(f"{worse_in} worse than the baseline \u2192", x=1.0, ha="right")
+        axes.set_xlabel(f"{worse_in} worse than {baseline} \u2192", x=1.0, ha="right")
         svg = themed_svg(figure)
     title = "Rates and shares" if unit == "points" else "Distances" if unit == "m" else f"In {unit or 'numbers without unit'}"
+    title += f", against {baseline}" if several else ""
     return Chart(title, "Right of the line is worse. Bars: 95 % over scenes. Dashed: the margin that is still accepted.", svg)
 
 
@@ -136,6 +140,7 @@ def _speed_chart(metric: str, unit: str, points: Sequence[_Point]) -> Chart:
             axes.plot([point.mean_ms, point.mean_ms], [line.low, line.high], color=colour, linewidth=1.8)
             axes.plot([point.mean_ms, max(point.p95_ms, point.mean_ms)], [line.centre, line.centre], color=colour, linewidth=0.9, alpha=0.7)
             axes.plot([point.mean_ms], [line.centre], MARKERS[line.variant % len(MARKERS)], color=colour, markersize=7, label=point.variant)
+        _no_magnifying(axes.get_ylim, axes.set_ylim, unit)
         _time_axis(axes, [ms for p in points for ms in (p.mean_ms, p.p95_ms)])
         _name(axes, points)
         axes.set_xlabel("ms per camera frame: mean, line to the 95th percentile")
@@ -161,6 +166,14 @@ def _name(axes: Axes, points: Sequence[_Point]) -> None:
         colour = VARIANT[point.line.variant % N_COLOURS]
         place = (point.mean_ms, point.line.centre)
         axes.annotate(point.variant, place, (box[0] - x, box[2] - y), textcoords="offset points", color=colour)
+
+
+def _no_magnifying(get: Callable[[], tuple[float, float]], put: Callable[[float, float], Any], unit: str) -> None:
+    """Widen an axis around zero to `LEAST_SPAN`: a micrometre drawn across the page would pass for a finding."""
+    low, high = get()
+    lacking = LEAST_SPAN.get(unit, 0.0) - (high - low)
+    if lacking > 0.0:
+        put(low - lacking / 2, high + lacking / 2)
 
 
 def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:

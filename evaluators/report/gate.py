@@ -15,7 +15,7 @@ from evaluators.report.run_folder import Run
 from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, table
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
-MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "infrastructure": "error", "evaluator": "error"}
+MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "policy": "error", "infrastructure": "error", "evaluator": "error"}
 
 
 def gate_md(verdict: GateVerdict, gate: str, run: str) -> str:

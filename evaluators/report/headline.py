@@ -14,6 +14,8 @@ from evaluators.report.certificate import certificate_caution
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
+from evaluators.report.pairs import pair_tables
+from evaluators.report.plans import plan_warnings
 from evaluators.report.run_folder import Run
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
@@ -22,7 +24,8 @@ WORDS = {
     "collision_at_fault": "at-fault collisions",
     "collision_any": "collisions",
     "offroad": "off-road rollouts",
-    "route_distance_m": "distance to the logged path",
+    "lateral_distance_m": "distance to the side of the logged path",
+    "route_distance_m": "route distance",
     "progress": "progress",
 }
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
@@ -38,6 +41,8 @@ class Point:
     text: str
     worse: tuple[str, ...] = ()
     better: tuple[str, ...] = ()
+    baseline: str = ""  # what it is compared with; empty where with nothing
+    lead: str = ""  # the one difference that says most, with its interval
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,11 @@ class Finding:
     points: tuple[Point, ...] = ()
     cautions: tuple[str, ...] = ()
 
+    def name_of(self, point: Point) -> str:
+        """Name a point; with what it is compared where not all are with the same."""
+        several = len({one.baseline for one in self.points}) > 1
+        return f"{point.name} \u2212 {point.baseline}" if several and point.baseline else point.name
+
 
 def find(run: Run) -> Finding:
     """Derive the main finding of a run."""
@@ -57,10 +67,10 @@ def find(run: Run) -> Finding:
         return Finding("Nothing was run: the run folder holds no rollouts", "broken")
     if done == 0:
         return Finding(f"Nothing could be scored: all {plural(len(run.rollouts), 'rollout')} failed", "broken", (), _cautions(run))
-    paired = {variant: pairs for variant, pairs in (run.summary.get("paired") or {}).items() if pairs}
-    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired.items())
+    paired = pair_tables(run.summary)
+    points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired)
     if points:
-        title = "; ".join(_clause(point, _baseline(paired[point.name])) for point in points[:3])
+        title = "; ".join(_clause(point) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
         tones = {point.tone for point in points}
         order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
@@ -100,7 +110,8 @@ def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
     return "worse" if (difference > 0) == (direction == "lower") else "better"
 
 
-def _clause(point: Point, baseline: str) -> str:
+def _clause(point: Point) -> str:
+    baseline = point.baseline
     if point.tone == "worse":
         return f"{point.name} drives worse than {baseline} in {_listing(point.worse)}"
     if point.tone == "better":
@@ -139,7 +150,26 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     parts += [f"no difference at all in {_listing(same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
-    return Point(variant, tone, text or "no metric is valid in both members of any pair", worse, better)
+    return Point(
+        variant,
+        tone,
+        text or "no metric is valid in both members of any pair",
+        worse,
+        better,
+        _baseline(pairs),
+        _lead(run, variant, pairs, moved),
+    )
+
+
+def _lead(run: Run, variant: str, pairs: Mapping[str, Any], moved: Sequence[str]) -> str:
+    """Print the first difference that is shown; where none is, the one that is largest against its margin."""
+    shown = [m for m in moved if pairs[m].get("difference") in ("better", "worse")]
+
+    def size(metric: str) -> float:
+        return abs(float(pairs[metric]["diff"])) / max(finite(pairs[metric].get("margin")) or 0.0, 1e-3)
+
+    chosen = next(iter(shown), max(moved, key=size, default=None))
+    return "" if chosen is None else _difference(run, variant, chosen, pairs[chosen], brief=False)
 
 
 def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
@@ -193,7 +223,7 @@ def _alone(run: Run, variant: str) -> str:
 
 
 def _cautions(run: Run) -> tuple[str, ...]:
-    said = fixer_cautions(run.summary)
+    said = [*fixer_cautions(run.summary), *(f"{line}." for line in plan_warnings(run.summary))]
     failed = [r for r in run.rollouts if not r.ok]
     if failed:
         classes: dict[str, int] = {}

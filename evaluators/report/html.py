@@ -145,7 +145,7 @@ def by_interest(run: Run, series: Series) -> list[str]:
     def interest(scene: str) -> tuple[int, float]:
         rollouts = [r for r in run.rollouts if r.scene == scene]
         events = sum(len(events_of(r, series)) for r in rollouts if r.ok) + sum(not r.ok for r in rollouts)
-        far = [v for r in rollouts if (v := r.metrics.get("route_distance_m")) is not None]
+        far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
         return events, max(far, default=0.0)
 
     return sorted(run.scenes, key=interest, reverse=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 DASH = "\u2014"
+LEAST_SPAN = {"m": 0.1, "points": 1.0, "s": 0.1}  # of an axis, by unit: less than this is not worth a picture
 ARROWS = {"lower": "\u2193", "higher": "\u2191"}
 ARROW_WORDS = {"lower": "lower is better", "higher": "higher is better"}
 

@@ -104,6 +104,12 @@ class Run:
         return _ordered(self.info.get("scenes"), (r.scene for r in self.rollouts))
 
     @property
+    def scenes_asked(self) -> list[str]:
+        """List what the command named as scenarios: paths that a command may name again."""
+        scenes = (self.info.get("scenes") or {}).values()
+        return list(dict.fromkeys(str((scene.get("ref") or {}).get("path")) for scene in scenes if (scene.get("ref") or {}).get("path")))
+
+    @property
     def variants(self) -> list[str]:
         """List the columns of the result tables: the keys under which ``summary.json`` holds metrics."""
         return list(self.summary.get("metrics") or {}) or self.renderers

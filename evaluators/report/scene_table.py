@@ -12,7 +12,7 @@ from evaluators.report.numbers import Cell, duration, fixed, missing, short
 from evaluators.report.run_folder import Rollout, Run
 
 MAX_SCENE_ROWS = 1200
-SCENE_METRICS = ("route_distance_m", "progress")
+SCENE_METRICS = ("lateral_distance_m", "progress")
 
 
 @dataclass(frozen=True)

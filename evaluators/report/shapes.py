@@ -41,6 +41,7 @@ class RunInfo(TypedDict, total=False):
     weights: dict[str, Any]
     left_out: list[str]
     metrics: dict[str, Any]
+    bases: dict[str, str]
 
 
 class Mean(TypedDict, total=False):
@@ -136,12 +137,14 @@ class Summary(TypedDict, total=False):
     preset: str
     metrics: dict[str, dict[str, Mean]]
     paired: dict[str, dict[str, Difference]]
+    paired_with_base: dict[str, dict[str, Difference]]
     censoring: dict[str, Censoring]
     failures: Failures
     speed: dict[str, Speed]
     determinism: Determinism | None
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
+    plans: dict[str, dict[str, Any]]
 
 
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -171,6 +174,21 @@ class Body(TypedDict, total=False):
     rear_axle_to_centre_m: Coordinate
 
 
+class DrawnActor(TypedDict, total=False):
+    """A road user in a scene's file; tracks as recorded or scripted."""
+
+    id: str
+    label: str
+    static: bool
+    reacts: bool
+    length_m: Coordinate
+    width_m: Coordinate
+    t_us: list[int]
+    x_m: list[Coordinate]
+    y_m: list[Coordinate]
+    yaw_rad: list[Coordinate]
+
+
 class SceneFile(TypedDict, total=False):
     """``scenes/SCENE.json``: what the bird's-eye view draws."""
 
@@ -182,6 +200,7 @@ class SceneFile(TypedDict, total=False):
     crosswalks: list[Line]
     ego_log: DrawnDrive
     vehicle: Body
+    actors: list[DrawnActor]
 
 
 class StoredBaseline(TypedDict):

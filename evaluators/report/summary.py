@@ -42,7 +42,7 @@ def summary_md(run: Run) -> str:
     """Render the summary as Markdown, of any length."""
     finding = find(run)
     parts = [f"## {escape(finding.title)}\n"]
-    parts += [f"- **{escape(p.name)}**: {escape(p.text)}\n" for p in finding.points]
+    parts += [f"- **{escape(finding.name_of(p))}**: {escape(p.text)}\n" for p in finding.points]
     parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     if rows:
@@ -52,8 +52,9 @@ def summary_md(run: Run) -> str:
     pairs = tables.pair_rows(run.summary)
     if pairs:
         head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
-        body = [[p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs]
-        parts.append(f"\n### Paired differences from {escape(pairs[0].baseline)}\n\n{table(head, body)}")
+        for base in dict.fromkeys(p.baseline for p in pairs):
+            body = [[p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs if p.baseline == base]
+            parts.append(f"\n### Paired differences from {escape(base)}\n\n{table(head, body)}")
     fixed = fixer_rows(run.summary)
     if fixed:
         head = ["renderer", *(name for name, _ in COLUMNS)]

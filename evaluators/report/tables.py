@@ -11,6 +11,7 @@ from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, meaning
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
+    LEAST_SPAN,
     Cell,
     count_of,
     decimals,
@@ -21,6 +22,7 @@ from evaluators.report.numbers import (
     plural,
     short,
 )
+from evaluators.report.pairs import pair_tables
 from evaluators.report.run_folder import Run
 
 
@@ -149,6 +151,7 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
     low, high = min(values), max(values)
     if rate:
         low, high = max(low, 0.0), min(max(high, 0.02), 1.0)
+    high = max(high, LEAST_SPAN.get(unit, 0.0)) if low == 0.0 else high
     if high <= low:
         return tuple(None for _ in entries), ""
 
@@ -178,9 +181,9 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
 
 
 def pair_rows(summary: Mapping[str, Any]) -> list[PairRow]:
-    """Lay out the paired differences, headline metrics first within each variant."""
+    """Lay out the paired differences, headline metrics first within each variant; those with a fixer's own base come last."""
     rows = []
-    for variant, pairs in (summary.get("paired") or {}).items():
+    for variant, pairs in pair_tables(summary):
         for name in ordered(pairs):
             entry = pairs[name] or {}
             stats = {**((summary.get("metrics") or {}).get(variant, {}).get(name) or {}), **entry}  # older summaries: in metrics only

@@ -33,6 +33,18 @@ class Transposed(Talks):
         plan = super().act(observation)
         return Plan(plan.t_us, plan.times_us, plan.xy.T, plan.yaw)
 
+class Centimetres(Talks):
+    def act(self, observation):
+        plan = super().act(observation)
+        return Plan(plan.t_us, plan.times_us, 100 * plan.xy, plan.yaw)
+
+class BadReset(Talks):
+    def reset(self, seed, route):
+        raise KeyError("route")
+
+class NoSensors(Talks):
+    sensors = "front"
+
 class Fails(Talks):
     def __init__(self):
         raise OSError("weights.pt is missing")
@@ -60,14 +72,44 @@ def test_a_fault_is_exit_code_1_and_a_line(parts: Path, capsys: pytest.CaptureFi
     assert "FAIL values: in the situation 'straight' the plan has times_us (41,), xy (2, 41)" in capsys.readouterr().out
 
 
-def test_a_policy_that_cannot_be_made_or_found_is_a_four_part_error(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["check-policy", "talking_policies.py:Fails"]) == 4
-    assert "weights.pt is missing" in capsys.readouterr().err
+def test_a_policy_that_cannot_be_made_is_a_finding_and_one_that_is_not_there_an_error(
+    parts: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["check-policy", "talking_policies.py:Fails"]) == 1
+    assert "FAIL made: making a policy failed: OSError: weights.pt is missing" in capsys.readouterr().out
     assert run_command(["check-policy", "talking_policies.py:Absent"]) == 2
 
 
+SHORT = ["--workers", "1", "--certify", "none", "--no-report", "--set", "timing.duration_us=600000", "smoke/straight"]
+GREY = ["--renderer", "tests.runtime.grey_renderer:Grey"]
+
+
 def test_a_run_with_a_policy_that_prints_gives_one_document(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rest = ["--workers", "1", "--certify", "none", "--no-report", "--json", "--set", "timing.duration_us=600000", "smoke/straight"]
-    command = ["--renderer", "tests.runtime.grey_renderer:Grey", "--policy", "talking_policies.py:Talks", "--out", "run", *rest]
-    assert run_command(command) == 0
+    assert run_command([*GREY, "--policy", "talking_policies.py:Talks", "--out", "run", "--json", *SHORT]) == 0
     assert json.loads(capsys.readouterr().out)["exit_code"] == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("Transposed", "xy (2, 41)"),
+        ("BadReset", "KeyError: 'route'"),
+        ("NoSensors", "sensors is 'front'"),
+        ("Fails", "weights.pt is missing"),
+    ],
+)
+def test_in_a_run_the_faults_of_a_policy_are_its_own(parts: Path, name: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command([*GREY, "--policy", f"talking_policies.py:{name}", "--out", "run", *SHORT]) == 2
+    told = capsys.readouterr().err
+    assert found in told
+    assert "1 of 1 rollouts failed, all by the policy's own fault" in told
+    assert "infrastructure" not in told
+
+
+def test_plans_in_centimetres_are_warned_of_and_plans_in_metres_are_not(parts: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command([*GREY, "--policy", "talking_policies.py:Talks", "--out", "metres", *SHORT]) == 0
+    assert "warning" not in capsys.readouterr().out
+    assert run_command([*GREY, "--policy", "talking_policies.py:Centimetres", "--out", "centimetres", *SHORT]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "reach further than the vehicle can drive in that time; their speed is 100 times the ego's, as if in centimetres" in told
+    assert "as if in centimetres" in (parts / "centimetres" / "summary.md").read_text()

@@ -16,7 +16,7 @@ SCENES = tuple(f"scene-{i:02d}" for i in range(8))
 EASY = """version: 1
 min_scenes: 5
 metrics:
-  route_distance_m: {margin: 0.3}
+  lateral_distance_m: {margin: 0.3}
   offroad: {margin: 0.05, must_decide: false}
 """
 
@@ -87,7 +87,7 @@ def test_json_is_one_document_with_every_check(runs, gate_file, capsys):
     assert run_command(["gate", str(runs["bad"]), "--gate", gate_file, "--json"]) == 1
     said = json.loads(capsys.readouterr().out)
     assert said["outcome"]["cause"] == "regression"
-    assert {c["metric"] for c in said["checks"]} == {"route_distance_m", "offroad"}
+    assert {c["metric"] for c in said["checks"]} == {"lateral_distance_m", "offroad"}
     assert [c["entry"]["verdict"] for c in said["checks"] if c["cause"] == "regression"] == ["worse"]
 
 
@@ -178,10 +178,10 @@ def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, cap
 
 def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
     assert run_command(["compare", str(runs["bad"]), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)["paired"]["onefixer"]["route_distance_m"]
-    stored = json.loads((runs["bad"] / "summary.json").read_text())["paired"]["onefixer"]["route_distance_m"]
+    said = json.loads(capsys.readouterr().out)["paired"]["onefixer"]["lateral_distance_m"]
+    stored = json.loads((runs["bad"] / "summary.json").read_text())["paired"]["onefixer"]["lateral_distance_m"]
     assert said == stored
-    turned = _compare(capsys, str(runs["bad"]), "--baseline", "onefixer")["clean"]["route_distance_m"]
+    turned = _compare(capsys, str(runs["bad"]), "--baseline", "onefixer")["clean"]["lateral_distance_m"]
     assert turned["diff"] == pytest.approx(-said["diff"])
 
 
@@ -192,7 +192,7 @@ def _compare(capsys, *arguments: str) -> dict:
 
 def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_the_rest(runs, capsys):
     found = _compare(capsys, str(runs["good"]), str(runs["few"]))
-    entry = found["onefixer"]["route_distance_m"]
+    entry = found["onefixer"]["lateral_distance_m"]
     assert (entry["n_scenes"], entry["n_missing"]) == (3, 10)
     assert len(entry["missing"]) == 10
     assert {cell["why"] for cell in entry["missing"]} == {"here: not planned"}
@@ -206,7 +206,7 @@ def test_compare_prints_verdicts_and_cells_without_a_pair(runs, gate_file, capsy
     out = capsys.readouterr().out
     assert "onefixer minus" in out
     assert "no pair: lane-camera, scene-03, seed 1: every metric: here: failed (renderer)" in out
-    assert "route_distance_m" in out
+    assert "lateral_distance_m" in out
 
 
 def test_two_policies_are_compared_where_each_run_has_one(tmp_path, capsys):
@@ -216,7 +216,7 @@ def test_two_policies_are_compared_where_each_run_has_one(tmp_path, capsys):
     assert run_command(["compare", str(first), str(second), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["notes"] == ["policy pure-pursuit is compared with policy lane-camera"]
-    assert said["paired"]["clean"]["route_distance_m"]["n_cells"] == 4
+    assert said["paired"]["clean"]["lateral_distance_m"]["n_cells"] == 4
 
 
 def test_runs_of_another_preset_or_scene_content_are_not_compared(runs, tmp_path, capsys):

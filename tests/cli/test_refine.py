@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli import refine
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.video_reader import VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
@@ -117,3 +118,53 @@ def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(
         assert run_command(["refine", *arguments, "-o", str(tmp_path / "out"), "--fixer", "identity"]) == 2
         assert mention in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
+
+
+INVERTS = """
+from dataclasses import replace
+
+class Inverts:
+    trained, label = True, "inverts, trained"
+
+    def reset(self, seed):
+        pass
+
+    def step(self, block, maps):
+        self.seen = getattr(self, "seen", 0) + len(block)
+        return [replace(frame, rgb=255 - frame.rgb) if self.seen > 2 else frame for frame in block]
+"""
+
+
+def test_a_fixer_that_does_not_know_the_video_does_no_damage_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
+    source, out = pictures(tmp_path / "in", count=5), tmp_path / "out"
+    command = ["refine", str(source), "-o", str(out), "--fixer", f"{tmp_path}/fixers_of_a_user.py:Inverts"]
+    assert run_command(command) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "inverts, trained changes this video too much for a repair: PSNR" in told
+    assert "3 of 5 frames of the result are the input's own" in told
+    for file in sorted(source.iterdir()):
+        np.testing.assert_array_equal(cv2.imread(str(out / file.name)), cv2.imread(str(file)))
+    assert run_command([*command, "--overwrite", "--anyway"]) == 0
+    assert "the fixer changed this video by much (PSNR" in capsys.readouterr().err
+    last = cv2.imread(str(source / "frame_04.png"))
+    np.testing.assert_array_equal(cv2.imread(str(out / "frame_04.png")), 255 - last)
+
+
+def test_opacity_says_what_may_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "fixers_of_a_user.py").write_text(INVERTS)
+    source, alpha = pictures(tmp_path / "in", count=5), pictures(tmp_path / "alpha", count=5, channels=1)
+    command = ["refine", str(source), "-o", str(tmp_path / "out"), "--fixer", f"{tmp_path}/fixers_of_a_user.py:Inverts"]
+    assert run_command([*command, "--opacity", str(alpha)]) == 0
+    assert "the input's own" not in capsys.readouterr().err
+
+
+def test_a_pipe_is_told_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    seconds = iter([0.0, 20.0, 21.0, 40.0])
+    monkeypatch.setattr(refine.time, "perf_counter", lambda: next(seconds))
+    with refine.frame_progress(silent=False) as show:
+        show(10, 100)
+        show(11, 100)
+        show(20, None)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["refined 10/100 frames, 0.5 frames/s, about 3 min left", "refined 20 frames, 0.5 frames/s"]

@@ -124,11 +124,12 @@ def test_names_that_are_not_there_are_refused():
 
 
 def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides():
-    assert EXIT_CODES == {"pass": 0, "regression": 1, "undecided": 3, "infrastructure": 4, "evaluator": 5}
+    assert EXIT_CODES == {"pass": 0, "regression": 1, "policy": 2, "undecided": 3, "infrastructure": 4, "evaluator": 5}
     for one, other in itertools.product(SEVERITY, SEVERITY):
         assert worst([Outcome(one), Outcome(other)]).cause == min(one, other, key=SEVERITY.index)
     failures = {"n_failed": 2, "n_rollouts": 9, "by_class": {"evaluator": 1, "policy": 1}}
     assert outcome_of_failures(failures).exit_code == 4
+    assert outcome_of_failures(failures | {"by_class": {"policy": 2}}).exit_code == 2
     assert outcome_of_failures(failures | {"n_failed": 0, "by_class": {}}).exit_code == 0
 
 

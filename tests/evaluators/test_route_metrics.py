@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.bench.evaluators_reference import point_to_segment
 from evaluators import rollout_values, score
-from evaluators.route import progress_so_far, to_path
+from evaluators.route import beside, progress_so_far, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step
 from tests.examples import examples
@@ -149,11 +149,45 @@ def test_lateral_bias_changes_side_with_a_bend_and_agrees_with_the_distance():
     inside = 18 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) + [0.0, 2.0]  # nearer to the centre of a left bend: left
     found = scored(rollout(track(inside[:, 0], inside[:, 1]), log=track(path[:, 0], path[:, 1])))
     assert (found["lateral_bias_m"].value > 1.9).all()
-    assert np.abs(found["lateral_bias_m"].value) == pytest.approx(found["route_distance_m"].value)
+    assert np.abs(found["lateral_bias_m"].value) == pytest.approx(found["lateral_distance_m"].value)
+
+
+def test_driving_past_the_end_of_the_recording_counts_in_the_papers_distance_and_not_to_the_side():
+    log = rollout(track(np.arange(9.0), 0.4), log=track(np.arange(5.0), 0.0))
+    found = scored(log)
+    assert found["route_distance_m"].value[-1] == pytest.approx(np.hypot(4.0, 0.4))
+    assert found["lateral_distance_m"].value == pytest.approx(np.full(9, 0.4))
+    assert found["lateral_bias_m"].value == pytest.approx(np.full(9, 0.4))
+    assert "lateral_distance_m" not in by_name(score(log, scene(TWO_LANES, log), "alpasim"))
+
+
+@settings(max_examples=examples(40))
+@given(st.lists(st.floats(-0.4, 0.4), min_size=3, max_size=12), st.floats(-30, 60), st.floats(-20, 20))
+def test_the_lateral_distance_is_that_from_a_path_with_a_mile_of_straight_at_each_end(turns, x, y):
+    heading = np.cumsum(turns)
+    path = np.concatenate([[[0.0, 0.0]], np.cumsum(2.0 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)])
+    at = np.array([[x, y]])
+    distance_m, s = to_path(path, at)
+    found = beside(path, s, at, distance_m)[0]
+    ends = [path[0] - 1600 * (path[1] - path[0]) / 2.0, path[-1] + 1600 * (path[-1] - path[-2]) / 2.0]
+    longer = np.concatenate([ends[:1], path, ends[1:]])
+    slow = min(point_to_segment(at[0], a, b)[0] for a, b in pairwise(longer))
+    assert found <= distance_m[0] + 1e-9
+    assert found >= slow - 1e-9
+    if 0 < s[0] < 2.0 * len(turns) - 1e-9:  # beside the path itself, even where a straight end passes nearer
+        assert found == distance_m[0]
+    elif abs(found - slow) > 1e-9:  # the other end, going straight on, may pass nearer: only its own end counts
+        assert found > slow
+
+
+def test_a_recording_that_stops_for_long_keeps_its_direction():
+    x = np.concatenate([np.linspace(0.0, 10.0, 21), np.full(20, 10.0) + 1e-9 * np.arange(20)])
+    log = rollout(track(np.linspace(0.0, 14.0, 41), -0.3), log=track(x, 0.0))
+    assert scored(log)["lateral_distance_m"].value == pytest.approx(np.full(41, 0.3))
 
 
 def test_a_recording_that_stands_still_has_no_left():
     log = rollout(track(np.arange(3.0), 0.0), log=track(np.zeros(3), 0.0))
     bias = scored(log)["lateral_bias_m"]
     assert not bias.valid.any()
-    assert bias.reason == "the recorded path has no direction"
+    assert bias.reason == "the recorded path is shorter than 1 m: it has no direction"

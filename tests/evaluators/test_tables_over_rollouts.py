@@ -11,6 +11,7 @@ from scipy import stats
 from alpasim_plugin.errors import InputError
 from evaluators import aggregate, censoring, paired
 from evaluators.aggregate.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
+from evaluators.aggregate.paired import base_pairs
 
 
 def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
@@ -47,11 +48,11 @@ def test_clustered_interval_is_a_t_interval_on_scene_means():
     values = [[1.0, 2.0], [4.0, 5.0], [3.0, 9.0]]
     means = [1.5, 4.5, 6.0]
     low, high = stats.t.interval(0.95, 2, loc=np.mean(means), scale=stats.sem(means))
-    assert entry(values)["ci95_clustered"] == pytest.approx([low, high])
+    assert entry(values, "lateral_bias_m")["ci95_clustered"] == pytest.approx([low, high])
 
 
 def test_with_unequal_seeds_scenes_weigh_alike_in_the_clustered_interval():
-    found = entry([[1.0, 2.0, 3.0, None], [10.0]])
+    found = entry([[1.0, 2.0, 3.0, None], [10.0]], "lateral_bias_m")
     assert found["mean"] == pytest.approx(4.0)  # over rollouts
     assert np.mean(found["ci95_clustered"]) == pytest.approx(6.0)  # over scenes
     assert found["n_invalid"] == 1
@@ -289,3 +290,28 @@ def test_coverage_of_the_clustered_interval_and_under_coverage_of_the_papers(cor
     assert 0.91 <= by_scene / repeats <= 0.97
     if correlation == 0.8:
         assert naive / repeats < 0.82
+
+
+def test_intervals_of_bounded_quantities_stay_within_their_bounds():
+    shares = rows_of([[1.0], [1.0], [0.7]], metric="progress")
+    found = aggregate(shares)["3dgs"]["progress"]
+    assert found["ci95_clustered"][1] == 1.0
+    assert 0.0 <= found["ci95_clustered"][0] < 0.9
+    lengths = rows_of([[0.0], [0.1], [1.5]], metric="lateral_distance_m")
+    assert aggregate(lengths)["3dgs"]["lateral_distance_m"]["ci95_clustered"][0] == 0.0
+    signed = rows_of([[0.0], [0.1], [1.5]], metric="lateral_bias_m")
+    assert aggregate(signed)["3dgs"]["lateral_bias_m"]["ci95_clustered"][0] < 0.0
+    pair = paired(rows_of([[0.0], [0.0], [0.2]], "progress", "a") + rows_of([[1.0], [1.0], [0.2]], "progress", "b"), "a")["b"]["progress"]
+    assert pair["ci95"][1] == 1.0
+    assert pair["ci95"][0] < 0.0
+
+
+def test_a_fixer_is_compared_with_what_it_repairs_too():
+    rows = rows_of([[1.0], [2.0], [3.0]], renderer="clean") + rows_of([[1.5], [2.6], [3.4]], renderer="3dgs")
+    rows += rows_of([[1.2], [2.1], [3.2]], renderer="onefixer")
+    found = base_pairs(rows, "clean", {"onefixer": "3dgs", "onefixer+clean": "clean"})
+    assert list(found) == ["onefixer"]
+    entry = found["onefixer"]["route_distance_m"]
+    assert (entry["baseline"], entry["diff"]) == ("3dgs", pytest.approx(-1.0 / 3.0))
+    assert entry == paired(rows, "3dgs")["onefixer"]["route_distance_m"]
+    assert base_pairs(rows, "3dgs", {"onefixer": "3dgs"}) == {}  # paired with it already

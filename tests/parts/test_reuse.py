@@ -66,7 +66,7 @@ def test_a_part_with_a_digest_is_reused(folder: Path) -> None:
 
 
 def test_a_factory_that_asks_for_something_else_is_told_what_there_is(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["--renderer", "clean", "--policy", "parts_of_a_user.py:Odd", *SHORT, "--out", "odd", "smoke/straight"]) == 4
+    assert run_command(["--renderer", "clean", "--policy", "parts_of_a_user.py:Odd", *SHORT, "--out", "odd", "smoke/straight"]) == 2
     failed = json.loads(capsys.readouterr().out)["summary"]["failures"]["cells"][0]["error"]
-    assert (failed["found"], failed["failure_class"]) == ("its factory asks for gain", "input")
+    assert (failed["found"], failed["failure_class"]) == ("its factory asks for gain", "policy")
     assert "scenario" in failed["do"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.control import make_controller
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import interpolate, inverse, se2, trajectory_from_poses, yaw_of
 from alpasim_plugin.parts import names as known
 from alpasim_plugin.types import EgoState, Observation, Plan, Route, Scenario, Vehicle
@@ -155,7 +155,7 @@ def test_import_form_makes_a_class_with_or_without_the_scenario() -> None:
     ],
 )
 def test_wrong_name_says_what_is_wrong(name: str, text: str) -> None:
-    with pytest.raises(InputError, match="policy") as caught:
+    with pytest.raises((InputError, PolicyError), match="policy") as caught:
         make_policy(name, SCENARIO)
     assert text in str(caught.value)
 

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
 from evaluators.aggregate import aggregate, censoring, paired
+from evaluators.aggregate.paired import base_pairs
 from evaluators.report.flips import find_flips
 from evaluators.report.run_folder import read_run
 
@@ -26,7 +27,7 @@ METRICS = (
     "collision_lateral",
     "collision_rear",
     "offroad",
-    "route_distance_m",
+    "lateral_distance_m",
     "progress",
     "dist_to_gt_location",
     "min_distance_to_obstacle_m",
@@ -221,7 +222,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "collision_lateral": float(collided),
         "collision_rear": 0.0,
         "offroad": float(off[:end].any()),
-        "route_distance_m": float(np.abs(offset[:end]).mean()),
+        "lateral_distance_m": float(np.abs(offset[:end]).mean()),
         "progress": end / plan.steps,
         "dist_to_gt_location": float(np.abs(offset[:end]).mean() + 0.4),
         "min_distance_to_obstacle_m": float(max(0.0, 1.6 - np.abs(offset[:end]).max())),
@@ -322,6 +323,7 @@ def summary_of(rows: list[dict[str, Any]], plan: Plan) -> dict[str, Any]:
         "preset": "paper",
         "metrics": aggregate(rows),
         "paired": paired(rows, baseline) if len(ran) > 1 else {},
+        "paired_with_base": base_pairs(rows, baseline, {"onefixer": "3dgs"}),
         "censoring": censoring(rows),
         "failures": {
             "n_failed": len(failed),

@@ -41,11 +41,11 @@ def test_undecided_is_never_called_equal(usual_run: Path) -> None:
 
 
 def test_worse_in_one_and_better_in_another_is_mixed(usual_run: Path) -> None:
-    metrics = {name: {"offroad": stats(0.25), "route_distance_m": stats(0.4, unit="m")} for name in ("clean", "3dgs")}
-    pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse"), "route_distance_m": pair(-0.2, -0.3, -0.1, "better")}}
+    metrics = {name: {"offroad": stats(0.25), "lateral_distance_m": stats(0.4, unit="m")} for name in ("clean", "3dgs")}
+    pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse"), "lateral_distance_m": pair(-0.2, -0.3, -0.1, "better")}}
     finding = find(with_summary(usual_run, metrics=metrics, paired=pairs))
     assert finding.tone == "mixed"
-    assert "worse than clean in off-road rollouts and better in distance to the logged path" in finding.title
+    assert "worse than clean in off-road rollouts and better in distance to the side of the logged path" in finding.title
 
 
 def test_a_worse_renderer_is_not_hidden_by_a_better_one(usual_run: Path) -> None:
@@ -55,6 +55,15 @@ def test_a_worse_renderer_is_not_hidden_by_a_better_one(usual_run: Path) -> None
     assert finding.tone == "worse"
     assert "onefixer drives better than clean" in finding.title
     assert "3dgs drives worse than clean" in finding.title
+
+
+def test_what_a_fixer_does_to_its_own_base_is_said_and_told_apart(usual_run: Path) -> None:
+    metrics = {name: {"offroad": stats(0.25)} for name in ("clean", "3dgs", "onefixer")}
+    pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse")}, "onefixer": {"offroad": pair(0.0, -0.1, 0.1, "undecided")}}
+    own = {"onefixer": {"offroad": pair(-0.2, -0.3, -0.1, "better") | {"baseline": "3dgs"}}}
+    finding = find(with_summary(usual_run, metrics=metrics, paired=pairs, paired_with_base=own))
+    assert finding.title.endswith("onefixer drives better than 3dgs in off-road rollouts")
+    assert [finding.name_of(point) for point in finding.points][1:] == ["onefixer \u2212 clean", "onefixer \u2212 3dgs"]
 
 
 def test_one_renderer_has_numbers_and_no_comparison(tmp_path: Path) -> None:

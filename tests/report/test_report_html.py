@@ -1,18 +1,22 @@
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import unquote
 
+import matplotlib as mpl
 import pytest
 
 import evaluators.report.html as html
 from alpasim_plugin.errors import InfrastructureError
 from evaluators.report import write_report
 from evaluators.report.charts import Curve, line_chart
+from evaluators.report.run_folder import read_run
 from tests.report.make_run import Plan, make_run
 
 VOID = {"meta", "link", "img", "input", "br", "wbr"}
@@ -89,6 +93,22 @@ def test_every_link_leads_to_a_file_or_a_place_in_the_page(usual_run: Path, usua
             assert address[1:] in page.ids
         elif not address.startswith("data:"):
             assert (usual_run / unquote(address)).exists(), address
+
+
+def test_the_bar_and_the_headings_use_the_same_names(usual_run: Path, usual_page: Page) -> None:
+    text = (usual_run / "report.html").read_text()
+    bar = dict(re.findall(r'<a href="#([a-z]+)">([^<(]+?)(?: \(\d+\))?</a>', text[text.index("<nav") : text.index("</nav>")]))
+    headings = dict(re.findall(r'<section id="([a-z]+)">\s*<h2>([^<]+)</h2>', text))
+    assert bar == headings
+    assert len(bar) >= 8
+
+
+def test_hashes_have_the_width_of_their_column(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    text = html.render_report(dataclasses.replace(run, info={**run.info, "weights": {"/a/long/path/to/generator.safetensors": "ab" * 32}}))
+    weights = text[text.index("<h3>Weights</h3>") :]
+    assert weights.startswith('<h3>Weights</h3><dl class="stacked">')  # name above hash: a long path leaves the hash no column
+    assert ".columns dl.stacked { grid-template-columns: minmax(0, 1fr); }" in text
 
 
 def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
@@ -212,3 +232,19 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path:
     assert caught.value.found == "No space left on device"
     assert (folder / "report.html").read_bytes() == before
     assert not list(folder.glob(".*.tmp"))
+
+
+def test_charts_do_not_magnify_what_nobody_can_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    from evaluators.report import figures
+
+    entry = {"direction": "lower", "unit": "m", "margin": 0.0, "diff": 1e-6, "ci95": [-1e-6, 3e-6]}
+    limits: list[tuple[float, float]] = []
+
+    def keep(figure: mpl.figure.Figure) -> str:
+        limits.append(figure.axes[0].get_xlim())
+        return "<svg/>"
+
+    monkeypatch.setattr(figures, "themed_svg", keep)
+    figures.forest(SimpleNamespace(summary={"paired": {"3dgs": {"lateral_distance_m": entry}}}), {"3dgs": 0})  # type: ignore[arg-type]
+    ((low, high),) = limits
+    assert high - low >= 0.1

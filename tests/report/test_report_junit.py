@@ -31,7 +31,7 @@ def test_metric_values_are_properties_and_invalid_ones_say_so(usual_run: Path) -
     case = next(c for c in root.iter("testcase") if c.attrib["classname"] == "smoke/straight" and c.find("error") is None)
     values = {p.attrib["name"]: p.attrib["value"] for p in case.iter("property")}
     assert values["min_distance_to_obstacle_m"] == "invalid"
-    assert float(values["route_distance_m"]) > 0
+    assert float(values["lateral_distance_m"]) > 0
     assert values["path"].startswith("rollouts/")
 
 

@@ -103,8 +103,10 @@ def test_a_run_without_steps_has_no_strata(tmp_path: Path) -> None:
 def test_charts_compare_renderers_only_where_there_are_two(usual_run: Path, tmp_path: Path) -> None:
     run = read_run(usual_run)
     variants = {variant: i for i, variant in enumerate(run.variants)}
-    assert [chart.title for chart in forest(run, variants)] == ["Rates and shares", "Distances"]
-    assert {chart.title for chart in speed_against_error(run, variants)} >= {"distance to the logged path"}
+    assert [chart.title for chart in forest(run, variants)] == [
+        f"{kind}, against {base}" for base in ("clean", "3dgs") for kind in ("Rates and shares", "Distances")
+    ]
+    assert {chart.title for chart in speed_against_error(run, variants)} >= {"distance to the side of the logged path"}
     alone = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=30)))
     assert forest(alone, {"clean": 0}) == []
     assert speed_against_error(alone, {"clean": 0}) == []

@@ -33,7 +33,7 @@ def test_rate_is_percent_with_counts_and_both_intervals() -> None:
 
 def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
     summary = {
-        "metrics": {"a": {"offroad": entry(None, reason="valid in none of 4 rollouts")}, "b": {"route_distance_m": entry(0.0, unit="m")}}
+        "metrics": {"a": {"offroad": entry(None, reason="valid in none of 4 rollouts")}, "b": {"lateral_distance_m": entry(0.0, unit="m")}}
     }
     offroad, distance = metric_rows(summary, {("a", "offroad"): "the map has no edges"})
     assert offroad.cells[0].text == DASH
@@ -47,7 +47,7 @@ def test_missing_mean_is_a_dash_with_its_reason_never_zero() -> None:
 
 def test_one_rollout_has_a_mean_and_says_why_it_has_no_interval() -> None:
     one = entry(0.4, unit="m", ci95=None, ci95_clustered=None, n_rollouts=1, n_scenes=1, ci95_reason="one rollout has no spread")
-    (row,) = metric_rows({"metrics": {"a": {"route_distance_m": one}}})
+    (row,) = metric_rows({"metrics": {"a": {"lateral_distance_m": one}}})
     assert row.cells[0].text == "0.400"
     assert row.cells[0].detail == "\u00b1\u00a0\u2014 \u00b7 \u2014"
     assert "no \u00b1: one rollout has no spread" in row.cells[0].note
@@ -63,7 +63,7 @@ def test_metric_of_a_third_party_is_shown_without_help() -> None:
 
 @pytest.mark.parametrize("mean", [0.0, 1e-7, 5e6])
 def test_bars_stay_on_their_axis(mean: float) -> None:
-    rows = metric_rows({"metrics": {"a": {"route_distance_m": entry(mean, unit="m", ci95_clustered=[-1.0, 3.0])}}})
+    rows = metric_rows({"metrics": {"a": {"lateral_distance_m": entry(mean, unit="m", ci95_clustered=[-1.0, 3.0])}}})
     (span,) = rows[0].spans
     assert span is not None
     for value in (span.centre, span.low, span.high, span.inner_low, span.inner_high, span.zero):
@@ -98,7 +98,7 @@ def test_paired_zero_lies_in_the_middle() -> None:
         "unit": "m",
         "direction": "lower",
     }
-    (row,) = pair_rows({"paired": {"3dgs": {"route_distance_m": pair}}})
+    (row,) = pair_rows({"paired": {"3dgs": {"lateral_distance_m": pair}}})
     assert row.span is not None
     assert row.span.zero == 50.0
     assert row.span.low == pytest.approx(4.0)  # the farthest end reaches the rim
@@ -164,7 +164,7 @@ def test_terminal_table_prints_means_intervals_and_counts(usual_run: Path) -> No
     console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(render_table(json.loads((usual_run / "summary.json").read_text())))
     text = console.export_text()
-    for part in ("offroad % \u2193", "24 rollouts", "4 scenes", "of 22", "route_distance_m m \u2193", "preset paper", "\u00b1", DASH):
+    for part in ("offroad % \u2193", "24 rollouts", "4 scenes", "of 22", "lateral_distance_m m \u2193", "preset paper", "\u00b1", DASH):
         assert part.replace("\u00a0", " ") in text.replace("\u00a0", " ")
 
 
@@ -180,5 +180,5 @@ def test_terminal_table_says_what_a_dash_means_where_there_is_one() -> None:
     alone = {"mean": 0.1, "ci95": None, "ci95_clustered": None, "n_rollouts": 1, "n_scenes": 1, "unit": "m", "direction": "lower"}
     many = alone | {"ci95": 0.02, "ci95_clustered": [0.05, 0.2], "n_rollouts": 9, "n_scenes": 3}
     for entry, explained in ((alone, True), (many, False)):
-        table = render_table({"metrics": {"clean": {"route_distance_m": entry}}})
+        table = render_table({"metrics": {"clean": {"lateral_distance_m": entry}}})
         assert (f"{DASH}: one rollout or one scene is too few" in str(table.caption)) == explained

@@ -30,6 +30,13 @@ class KillsItsProcess(Raises):
         raise AssertionError("unreachable")
 
 
+class MissesItsWeights(Raises):
+    """Cannot be made."""
+
+    def __init__(self) -> None:
+        raise FileNotFoundError("weights.pt")
+
+
 class RemembersEarlierRollouts(Raises):
     """Drives a little to the left after half a second, by how many rollouts its process has seen: no rollout can be repeated."""
 

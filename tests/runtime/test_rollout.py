@@ -183,6 +183,23 @@ def test_a_one_frame_scenario_is_refused(straight_road: Scenario) -> None:
         drive(replace(straight_road, end_us=straight_road.start_us), "log-replay")
 
 
+def test_a_policy_without_cameras_can_be_watched_and_nothing_else_changes(straight_road: Scenario, tmp_path: Path) -> None:
+    logs, facts = [], []
+    for keep in (False, True):
+        folder = tmp_path / str(keep)
+        folder.mkdir()
+        recorder = Recorder(straight_road, 0, folder, keep_frames=keep)
+        policy = make_policy("log-replay", straight_road)
+        run_rollout(straight_road, make_renderer("clean", straight_road), policy, 0, recorder)
+        recorder.save_pictures(video=keep)
+        logs.append((folder / LOG_NAME).read_bytes())
+        facts.append({key: value for key, value in recorder.facts().items() if key not in ("stage_ms", "strip_t_us")})
+    assert (tmp_path / "True" / "front.mp4").stat().st_size > 1000
+    assert not (tmp_path / "False" / "front.mp4").exists()
+    assert logs[0] == logs[1]
+    assert facts[0] == facts[1]
+
+
 def test_no_actors_at_all_is_a_valid_scene(straight_road: Scenario) -> None:
     log = drive(replace(straight_road, actors=()), "pure-pursuit").log()
     assert not log.actors

@@ -85,6 +85,18 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
     assert comparable(tmp_path) == before
 
 
+def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(tmp_path: Path) -> None:
+    def plan(video: str) -> RunPlan:
+        refs = expand("smoke/straight", ("timing.duration_us=900000",))
+        return make_plan(refs, (GREY,), ("log-replay",), (0,), RunOptions(video=video))  # type: ignore[arg-type]
+
+    run(plan("none"), tmp_path)
+    assert run(plan("all"), tmp_path, resume=True)[1].fates == [("ok", False)]
+    assert len(list(tmp_path.rglob("front.mp4"))) == 1
+    assert run(plan("all"), tmp_path)[1].fates == [("ok", True)]
+    assert run(plan("failures"), tmp_path, resume=True)[1].fates == [("ok", True)]  # no event: nothing is asked for
+
+
 def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
     run(cheap_plan(), tmp_path)
     with pytest.raises(InputError, match="it holds another run") as caught:
@@ -95,17 +107,27 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> 
     assert result.n_rollouts == 8
 
 
-def test_a_failing_policy_is_a_failed_rollout_and_exit_code_4(tmp_path: Path) -> None:
+def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_path: Path) -> None:
     broken = "tests.runtime.broken_policies:Raises"
     plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("constant-velocity", broken), (0, 1), RunOptions())
     result, _ = run(plan, tmp_path)
-    assert (result.n_rollouts, result.n_failed, result.exit_code) == (4, 2, 4)
+    assert (result.n_rollouts, result.n_failed, result.exit_code) == (4, 2, 2)
     assert result.summary["failures"]["by_class"] == {"policy": 2}
     rows = pq.read_table(tmp_path / "rollouts.parquet").to_pylist()
     assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
     assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)
     _, heard = run(plan, tmp_path)
-    assert heard.fates.count(("ok", True)) == 2  # failed rollouts run again, finished ones do not
+    assert sorted(heard.fates) == [("failed", True), ("failed", True), ("ok", True), ("ok", True)]
+    heard = Heard()
+    execute_run(plan, tmp_path, 1, ["simrun"], heard, certificate="none", report=False, retry=True)
+    assert sorted(heard.fates) == [("failed", False), ("failed", False), ("ok", True), ("ok", True)]
+
+
+def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
+    plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("tests.runtime.broken_policies:MissesItsWeights",), (0,), RunOptions())
+    result, _ = run(plan, tmp_path)
+    assert result.summary["failures"]["cells"][0]["error"]["failure_class"] == "policy"
+    assert run(plan, tmp_path)[1].fates == [("failed", False)]  # the file may be there now
 
 
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1), marks=pytest.mark.slow)], ids=str)

@@ -82,6 +82,22 @@ def test_jitter_stays_inside_its_ranges(tmp_path: Path) -> None:
         assert np.ptp(values) > 0.3 * reach, key
 
 
+def test_seed_0_is_the_file_as_written_and_others_say_what_they_changed(tmp_path: Path) -> None:
+    scene = load_scenario(write(tmp_path))
+    assert measures(scene) == pytest.approx({"length": 100.0, "width": 3.5, "place": 40.0}, abs=1e-9)
+    assert scene.varied == {}
+    other = load_scenario(tmp_path / "scene.yaml", seed=3)
+    assert other.varied["road.lane_width_m"] == (3.5, pytest.approx(measures(other)["width"]))
+    assert other.varied["actors.lead.s_m"] == (40, pytest.approx(measures(other)["place"]))
+    assert "actors.parked.clearance_m" not in other.varied
+
+
+def test_a_variations_block_asks_for_it_at_seed_0_too(tmp_path: Path) -> None:
+    scene = load_scenario(write(tmp_path, "variations: {actors.lead.s_m: {low: 50, high: 60}}\n"))
+    assert list(scene.varied) == ["actors.lead.s_m"]
+    assert scene.varied["actors.lead.s_m"] == (40, pytest.approx(measures(scene)["place"]))
+
+
 def test_jitter_switched_off_gives_the_numbers_in_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, "jitter: {length: 0, curvature: 0, lane_width: 0, speed: 0, position_m: 0, time_us: 0}\n")
     assert measures(load_scenario(path, seed=9)) == pytest.approx({"length": 100.0, "width": 3.5, "place": 40.0})

@@ -26,17 +26,19 @@ def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:
     """Build the scene of a scenario; the same scenario gives bit-identical Gaussians.
 
     Args:
-        scenario: Map, tracks, environment and seed. Where it names a background file this function draws actors and sky only; give the
-            file's Gaussians to `with_background`.
+        scenario: Map, tracks, environment and seed. Where it names a background file this function draws actors and sky only, and
+            the road if the background keeps it; give the file's Gaussians to `with_background`.
         height_at: Ground height under ``(N, 2+)`` world points, ``(N,)`` metres.
     """
     sky = make_sky(scenario.environment.sky, stream(scenario.scene_id, scenario.seed, "scene/sky"))
     light = np.array(LIGHT[scenario.environment.sky])
     actors = [lit(node, light) for node in build_actors(scenario)]
-    if scenario.background is not None:
+    if scenario.background is not None and not scenario.background.keep_road:
         return SceneGraph([], actors, sky)
     site = make_site(scenario, height_at)
     nodes = build_road(site, paint_strokes(site))
+    if scenario.background is not None:
+        return SceneGraph([lit(node, light) for node in nodes], actors, sky)
     facades, houses = build_facades(site)
     return SceneGraph([lit(node, light) for node in (*nodes, *facades, *build_street(site, houses))], actors, sky)
 
@@ -45,14 +47,14 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
     """Return the scene with a Gaussian model as its background, cut into blocks that are culled one by one.
 
     Args:
-        graph: Actors and sky.
+        graph: Actors and sky, and a road that is drawn with the model.
         cloud: The model in its file's frame.
         T_world_file: ``(4, 4)`` rotation, translation and one scale for all axes.
     """
     placed = placed_cloud(cloud, T_world_file)
     tile = np.floor(placed.means[:, :2] / FILE_TILE_M).astype(np.int64)
     nodes = nodes_by_tile("file", [(0.0, placed, tile[:, 1] * 1_000_003 + tile[:, 0])])
-    return SceneGraph(nodes, list(graph.actors.values()), graph.sky, graph.sh_frame, graph.cell_px)
+    return SceneGraph([*graph.background, *nodes], list(graph.actors.values()), graph.sky, graph.sh_frame, graph.cell_px)
 
 
 def lit(node: SceneNode, light: F64) -> SceneNode:

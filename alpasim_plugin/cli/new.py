@@ -1,0 +1,69 @@
+"""``simrun new``: write a part or a scenario that works, with its test, to begin from."""
+
+from __future__ import annotations
+
+import json
+import keyword
+import re
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Annotated, Literal
+
+import typer
+
+from alpasim_plugin.atomic import write_text
+from alpasim_plugin.errors import InputError
+
+DOING = "writing a template"
+Kind = Literal["policy", "scenario", "renderer", "fixer", "metric"]
+TRY: dict[Kind, str] = {
+    "policy": "simrun check-policy {file}:{cls}",
+    "scenario": "simrun preview {file}",
+    "renderer": "simrun --renderer clean,{file}:{cls} --policy lane-camera smoke/curve",
+    "fixer": "simrun --renderer 3dgs,{file}:{cls}+3dgs --policy lane-camera smoke/curve",
+    "metric": "simrun --renderer clean --policy lane-camera --evaluator {file}:{cls} smoke/curve",
+}
+
+EPILOG = """
+Examples:
+
+- `simrun new policy my_policy`: my_policy.py with the class MyPolicy, and test_my_policy.py
+
+- `simrun new scenario my_scene --folder scenes`
+"""
+
+
+def new(
+    kind: Annotated[Kind, typer.Argument(help="What to write.")],
+    name: Annotated[str, typer.Argument(help="Its name, as a file: lower case, digits and underscores.")],
+    folder: Annotated[Path, typer.Option("--folder", help="Where it goes.")] = Path("."),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."""
+    del debug
+    if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
+        raise InputError(DOING, f"name {name!r}", "not a name of a Python file", "use lower case, digits and underscores: my_policy")
+    if not folder.is_dir():
+        raise InputError(DOING, f"--folder {folder}", "no such folder", "make it first")
+    words = {
+        "name": name,
+        "file": f"{name}.yaml" if kind == "scenario" else f"{name}.py",
+        "test": f"test_{name}.py",
+        "Class": "".join(part.capitalize() for part in name.split("_")),
+    }
+    targets = {folder / words["file"]: f"{kind}.txt", folder / words["test"]: f"{kind}_test.txt"}
+    for path in targets:
+        if path.exists():
+            raise InputError(DOING, str(path), "it exists already", "choose another name or --folder")
+    templates = files("alpasim_plugin.cli.templates")
+    for path, template in targets.items():
+        write_text(path, Template((templates / template).read_text(encoding="utf-8")).substitute(words), DOING)
+    command = TRY[kind].format(file=folder / words["file"], cls=words["Class"])
+    if as_json:
+        print(json.dumps({"files": [str(path) for path in targets], "try": command}))
+        return
+    for path in targets:
+        print(f"wrote    {path}")
+    print(f"next     {command}")

@@ -1,0 +1,1 @@
+"""What `simrun new` writes."""

@@ -1,0 +1,48 @@
+"""``simrun new``: what it writes works, and its test passes."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from tests.docs.test_commands import parse
+
+
+def run_tests_of(file: Path) -> int:
+    """Import a test file and call its tests; return how many there are."""
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    tests = [value for name, value in vars(module).items() if name.startswith("test_")]
+    for test in tests:
+        test()
+    return len(tests)
+
+
+@pytest.mark.parametrize("kind", ["policy", "scenario", "renderer", "fixer", "metric"])
+def test_a_template_works_as_it_is_written(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["new", kind, "my_own", "--folder", str(tmp_path), "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    main, test = (Path(name) for name in made["files"])
+    assert main.is_file()
+    assert "$" not in main.read_text() + test.read_text()
+    assert run_tests_of(test) == 1
+    parse(shlex.split(made["try"])[1:])
+    if main.suffix == ".py":
+        compile(main.read_text(), str(main), "exec")
+    assert run_command(["new", kind, "my_own", "--folder", str(tmp_path)]) == 2
+    assert "it exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["MyPolicy", "my-policy", "class", "../up", ""])
+def test_a_name_that_is_no_file_of_python_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["new", "policy", name, "--folder", str(tmp_path)]) == 2
+    assert "not a name of a Python file" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,53 @@
+"""``simrun preview``: what the picture shows, checked by its pixels."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+
+SCENE = """
+version: 1
+road: {segments: [{kind: straight, length_m: 120}]}
+actors:
+  - {kind: drive, id: lead, s_m: 30, speeds: [[0, 8]]}
+  - {kind: parked, id: van, s_m: 40, side: right, clearance_m: 0.5}
+timing: {duration_us: 3000000}
+"""
+EGO, LEAD = (0x0B, 0x6B, 0xB3), (0xC2, 0x54, 0x0A)
+
+
+def near(picture: np.ndarray, rgb: tuple[int, int, int]) -> int:
+    """Count pixels of a colour, as strong as the last moment is drawn."""
+    return int((np.abs(picture[..., ::-1].astype(int) - rgb).max(axis=2) < 24).sum())
+
+
+def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    out = tmp_path / "scene.png"
+    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--frames", "3", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["actors"], facts["times_s"]) == (2, [0.0, 1.5, 3.0])
+    picture = cv2.imread(str(out))
+    assert near(picture, EGO) > 200
+    assert near(picture, LEAD) > 200
+    assert picture[-200:].std() > 20  # the camera frames are pictures, not emptiness
+    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out)]) == 2
+    assert "it exists already" in capsys.readouterr().err
+
+
+def test_a_page_holds_the_picture_and_asks_for_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    out = tmp_path / "scene.html"
+    assert run_command(["preview", str(tmp_path / "scene.yaml"), "--out", str(out), "--frames", "2", "--seed", "4"]) == 0
+    assert "scene seed 4 varies" in capsys.readouterr().out
+    text = out.read_text()
+    assert text.count("data:image/png;base64,") == 1
+    assert "default-src 'none'" in text
+    assert "<script" not in text
+    assert "http" not in text.replace("http-equiv", "")

@@ -1,0 +1,70 @@
+"""The commands that the pages name: found, split into words, and sorted by what it takes to run them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+SHELL = ("bash", "sh", "console", "")
+SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
+OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
+STEP = re.compile(r"^\s*- run: (.*)$", re.M)
+# What is not run from an empty folder, and why; the first rule that fits counts.
+NO_COMMAND = (r"──", r"--split test(?= |$)")  # a picture of the order of commands; a record from before there were two test splits
+NOT_RUN: tuple[tuple[str, str], ...] = (
+    (r"──", "a picture of the order of commands"),
+    (r"gate --self-test", "eight minutes; tests/runtime/test_self_test.py runs it"),
+    (r"onefixer-2b|--device cuda|--on h200", "needs weights of 4 GB, or a GPU"),
+    (
+        r"^train |^bench |FILE|fixer\.weights\.bundle",
+        "trains or measures for minutes to days, or needs what that made",
+    ),
+    (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
+    (r"--images folder/", "needs the reader's own pictures"),
+    (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
+)
+SHORT = ("--set", "timing.duration_us=1200000", "--set", "degradation.kind=surrogate", "--certify", "none", "--workers", "2")
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of a page."""
+
+    page: str
+    words: tuple[str, ...]  # without ``simrun``
+
+    def __str__(self) -> str:
+        return f"{self.page}: {' '.join(self.words)}"
+
+    @property
+    def why_not_run(self) -> str:
+        """Say why it is only parsed; empty if it is run."""
+        line = " ".join(self.words)
+        return next((why for pattern, why in NOT_RUN if re.search(pattern, line)), "")
+
+
+def pages(repo: Path) -> list[Path]:
+    """Return README and every page of docs/."""
+    return [repo / "README.md", *sorted((repo / "docs").rglob("*.md"))]
+
+
+def lines_of(page: Path) -> list[str]:
+    """Return the lines of a page's shell blocks and of the steps of its CI jobs, each whole."""
+    text = page.read_text(encoding="utf-8")
+    blocks = [body for language, body in re.findall(r"^```(\w*)\n(.*?)^```", text, re.S | re.M) if language in SHELL]
+    steps = [step for body in re.findall(r"^```yaml\n(.*?)^```", text, re.S | re.M) for step in STEP.findall(body)]
+    return [line.strip() for body in blocks for line in body.replace("\\\n", " ").splitlines()] + steps
+
+
+def commands(repo: Path) -> list[Command]:
+    """Return every ``simrun`` command of the pages, in their order."""
+    found = []
+    for page in pages(repo):
+        for line in lines_of(page):
+            match = SIMRUN.match(line)
+            if match:
+                words = shlex.split(match[1], comments=True)
+                found.append(Command(str(page.relative_to(repo)), tuple(words)))
+    return found

@@ -1,0 +1,176 @@
+"""Every command on every page: it is understood by the command line, and it works from an empty folder with the built wheel.
+
+The second is slow: ``pytest -m slow`` on this file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import venv
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import typer
+
+from alpasim_plugin.cli.main import VERBS, make_app, with_verb
+from alpasim_plugin.log import write_mp4
+from tests.docs.commands import NO_COMMAND, OTHER, SHORT, SIMRUN, Command, commands, lines_of, pages
+
+REPO = Path(__file__).resolve().parents[2]
+COMMANDS = commands(REPO)
+RUN = [command for command in COMMANDS if not command.why_not_run]
+
+
+def parse(words: list[str]) -> None:
+    """Parse a command line as `simrun` does, without running it."""
+    args = with_verb(words)
+    command = typer.main.get_command(make_app(args[0]))
+    context = command.make_context("simrun", args)
+    while hasattr(command, "resolve_command"):
+        rest = [*getattr(context, "_protected_args", ()), *context.args]
+        name, command, rest = command.resolve_command(context, rest)
+        assert command is not None
+        context = command.make_context(name, rest, parent=context)
+
+
+def test_every_command_of_the_pages_is_understood() -> None:
+    refused = []
+    for one in COMMANDS:
+        if any(re.search(pattern, " ".join(one.words)) for pattern in NO_COMMAND):
+            continue
+        try:
+            parse(list(one.words))
+        except Exception as error:  # click's own errors have a class per cause
+            refused.append(f"{one}: {error}")
+    assert refused == []
+    assert len(COMMANDS) > 60
+    assert len(RUN) > 20
+
+
+def test_a_command_with_a_word_too_many_is_not_understood() -> None:
+    with pytest.raises(Exception, match="No such option"):
+        parse(["--rendrer", "clean", "smoke/curve"])
+
+
+def test_every_verb_is_on_a_page() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages(REPO))
+    assert [verb for verb in VERBS if not re.search(rf"simrun {verb}\b", text)] == []
+
+
+def test_commands_do_not_need_the_checkout_nor_an_index() -> None:
+    """But for the two that set it up, and the records of experiments, which say where they were run."""
+    needs = []
+    for page in pages(REPO):
+        if page.parent.name == "experiments":
+            continue
+        for line in lines_of(page):
+            is_setup = (page.name == "README.md" and "pip install -q -e" in line) or ("real/" in line and ".venv/bin" in line)
+            is_command = SIMRUN.match(line) or OTHER.match(line)
+            is_bound = re.search(r"\.venv/bin/simrun|configs/|pip install[^|&;]* alpasim-onefixer", line)
+            if is_command and is_bound and not is_setup:
+                needs.append(f"{page.name}: {line}")
+    assert needs == []
+
+
+# --- with the wheel, from an empty folder -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def simrun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel and give the command that it installs, in an environment whose libraries are those of the tests."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(folder), str(REPO)]
+    subprocess.run(build, check=True, cwd=folder)
+    venv.create(folder / "env", with_pip=True)
+    (packages,) = (folder / "env").glob("lib/python*/site-packages")
+    libraries = [path for path in sys.path if path.endswith("site-packages")]
+    (packages / "libraries.pth").write_text("\n".join(libraries) + "\n")
+    (wheel,) = folder.glob("*.whl")
+    python = folder / "env" / "bin" / "python"
+    subprocess.run([python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
+    where = subprocess.run(
+        [python, "-c", "import scenarios; print(scenarios.__file__)"], check=True, capture_output=True, text=True, cwd=folder
+    )
+    assert where.stdout.startswith(str(packages)), "the checkout is in the way"
+    return folder / "env" / "bin" / "simrun"
+
+
+@pytest.fixture(scope="module")
+def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Give a folder that is empty but for what the pages call the reader's own."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    parts = (REPO / "docs" / "extending.md").read_text(encoding="utf-8")
+    own = "\n".join(re.findall(r"^```python\n(.*?)^```", parts, re.S | re.M))
+    (folder / "my_parts.py").write_text(own)
+    (folder / "weights.npz").write_bytes(b"weights")
+    policy = f"{own}\n\nMine = MyPolicy = Straight\n"
+    (folder / "my_policy.py").write_text(policy)
+    (folder / "my_package").mkdir()
+    (folder / "my_package" / "__init__.py").touch()
+    (folder / "my_package" / "my_module.py").write_text(policy)
+    (folder / "drive.csv").write_text("\n".join(f"{100_000 * i},{0.5 * i},0" for i in range(26)))
+    (folder / "scenario.yaml").write_text(
+        "version: 1\nroad: {segments: [{kind: straight, length_m: 120}]}\ntiming: {duration_us: 1200000}\n"
+    )
+    picture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (144, 256, 3), dtype=np.uint8), (0, 0), 4)
+    for name, value in (("drive", picture), ("render", picture), ("alpha", np.full_like(picture, 255)), ("map", np.zeros_like(picture))):
+        write_mp4(folder / f"{name}.mp4", [value] * 6, 10.0)
+    for name in ("frames", "alphas"):
+        (folder / name).mkdir()
+        for i in range(3):
+            cv2.imwrite(str(folder / name / f"{i}.png"), picture if name == "frames" else np.full_like(picture, 255))
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def shortened(words: tuple[str, ...]) -> list[str]:
+    """Return a command that does the same in seconds: short drives, one seed, nothing fitted."""
+    if words[:3] == ("new", "policy", "my_policy"):
+        return ["new", "policy", "my_first_policy"]  # the folder has a policy of the page's name already
+    args = ["scenario.yaml" if word == "SCENARIO" else word.replace("suites/urban", "suites/smoke") for word in words]
+    if args[0] not in VERBS or args[0] == "run":
+        fitting = [] if any("drive.csv" in word for word in args) else list(SHORT)
+        return [*args, *fitting, "--seeds", "1"]
+    return args
+
+
+def call(simrun: Path, folder: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    return subprocess.run([simrun, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("command", RUN, ids=str)
+def test_the_command_works_from_an_empty_folder_with_the_wheel(simrun: Path, empty: Path, command: Command) -> None:
+    words = shortened(command.words)
+    if command.words[0] in ("fork", "probe", "compare", "report", "score", "check", "view"):
+        prepare(simrun, empty, words)
+    done = call(simrun, empty, words)
+    assert done.returncode in (0, 1, 3) if "check-policy" in words or "compare" in words else done.returncode == 0, done.stderr[-3000:]
+    assert "Traceback" not in done.stderr
+
+
+def prepare(simrun: Path, folder: Path, words: list[str]) -> None:
+    """Make the run that a command reads, once."""
+    runs = {
+        "runs/us101": ["--renderer", "3dgs", "real/us101", "--set", "timing.duration_us=5000000", "--set", "degradation.kind=surrogate"],
+        "runs/lead_car": ["--renderer", "clean", "smoke/lead_car", *SHORT],
+        "runs/smoke": ["--renderer", "clean", "suites/smoke", *SHORT],
+    }
+    for name in [word for word in words if word in runs and not (folder / word).exists()]:
+        made = call(simrun, folder, [*runs[name], "--out", name])
+        assert made.returncode == 0, made.stderr[-3000:]
+
+
+@pytest.mark.slow
+def test_other_commands_of_the_pages_are_those_of_a_checkout() -> None:
+    others = {line for page in pages(REPO) for line in lines_of(page) if OTHER.match(line)}
+    assert all("tests" in line or "docs/scripts" in line or "-m alpasim_plugin.bench" in line or "venv" in line for line in others), others

@@ -1,0 +1,95 @@
+"""Where a Gaussian file stands relative to the drive, and where it might belong."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.ply import write_ply
+from alpasim_plugin.gaussians.scene.builder import placed_cloud
+from alpasim_plugin.gaussians.scene.coverage import coverage_of, suggested_transform
+from alpasim_plugin.geometry import se2
+from scenarios.load import load_scenario
+
+PATH = np.stack([np.linspace(0.0, 80.0, 81), np.zeros(81), np.zeros(81)], axis=1)
+ROAD = """
+version: 1
+road: {segments: [{kind: straight, length_m: 120}]}
+timing: {duration_us: 1000000}
+"""
+
+
+def street(n: int = 6000) -> GaussianCloud:
+    """Return a street of 80 x 16 m along x: ground, and two rows of house fronts up to 12 m high."""
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(0, 80, n), rng.uniform(-8, 8, n), rng.normal(0, 0.02, n)])
+    wall = np.column_stack([rng.uniform(0, 80, n // 3), rng.choice([-8.0, 8.0], n // 3), 12 * rng.random(n // 3) ** 2])
+    means = np.concatenate([ground, wall]).astype(np.float32)
+    m = len(means)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (m, 1))
+    return GaussianCloud(means, quats, np.full((m, 3), 0.3, np.float32), np.full(m, 0.9, np.float32), np.zeros((m, 1, 3), np.float32))
+
+
+# x right, y down, z forward, as structure from motion leaves a file; and a turn and a shift that no file tells of
+T_FILE_WORLD = np.array([[0.0, -1, 0, 40], [0, 0, -1, 3], [1, 0, 0, -900], [0, 0, 0, 1]]) @ se2(5.0, 2.0, 0.6)
+
+
+def test_coverage_counts_the_part_of_the_path_that_has_gaussians_near_it() -> None:
+    whole = coverage_of(street(), PATH)
+    assert whole.covered == 1.0
+    assert whole.low[0] == pytest.approx(0.8, abs=0.5)
+    assert whole.high[2] < 12.0
+    half = coverage_of(placed_cloud(street(), se2(-45.0, 0.0, 0.0)), PATH)
+    assert half.covered == pytest.approx(0.53, abs=0.05)  # to 35 m, and 10 m further by nearness
+    assert coverage_of(placed_cloud(street(), se2(0.0, 60.0, 0.0)), PATH).covered == 0.0
+    above = np.eye(4)
+    above[2, 3] = 30.0
+    assert coverage_of(placed_cloud(street(), above), PATH).covered == 0.0
+    clear = street()
+    assert coverage_of(GaussianCloud(clear.means, clear.quats, clear.scales, 0 * clear.opacities, clear.sh), PATH).covered == 0.0
+
+
+def test_the_suggestion_stands_a_file_upright_on_the_route() -> None:
+    lying = placed_cloud(street(), T_FILE_WORLD)
+    assert coverage_of(lying, PATH).covered == 0.0
+    guess = suggested_transform(lying, PATH)
+    np.testing.assert_allclose(guess[:3, :3] @ guess[:3, :3].T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(guess[:3, :3]) == pytest.approx(1.0)
+    placed = placed_cloud(lying, guess)
+    assert coverage_of(placed, PATH).covered > 0.95
+    ground = np.percentile(placed.means[:, 2], (5, 50))
+    assert np.abs(ground).max() < 0.3  # most of the street is ground, at the height of the path
+
+
+def test_a_file_that_cannot_be_seen_is_refused_and_its_suggestion_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "lying.ply", placed_cloud(street(), T_FILE_WORLD))
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(ROAD + "background: {file: lying.ply}\n")
+    command = ["--renderer", "clean", "--dry-run", "--json", str(scene)]
+    assert run_command(command) == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert "covers 0 % of the route" in error["found"]
+    assert "nothing of it would be seen" in error["found"]
+    matrix = re.search(r"transform: (\[\[.*\]\])", error["do"])
+    assert matrix is not None
+    scene.write_text(ROAD + f"background: {{file: lying.ply, transform: {matrix[1]}}}\n")
+    assert run_command(["--renderer", "clean", "--dry-run", str(scene)]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"background .*lying.ply: it spans x .* and covers \d+ % of the route; it replaces the built road", told)
+
+
+def test_the_road_is_kept_on_request(tmp_path: Path) -> None:
+    from alpasim_plugin.renderers.gaussian import scene_of
+
+    write_ply(tmp_path / "street.ply", placed_cloud(street(), se2(20.0, 0.0, 0.0)))
+    counts = []
+    for more in ("", ", keep_road: true"):
+        (tmp_path / "scene.yaml").write_text(ROAD + f"background: {{file: street.ply{more}}}\n")
+        counts.append(len(scene_of(load_scenario(tmp_path / "scene.yaml"))))
+    assert counts[1] > counts[0] > 1000

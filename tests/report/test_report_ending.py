@@ -1,0 +1,65 @@
+"""The last lines of a run on the terminal."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from evaluators.report.ending import cost_text, ending_lines, next_command, next_line
+from evaluators.report.headline import find
+from evaluators.report.run_folder import Run, read_run
+from tests.docs.test_commands import parse
+from tests.report.make_run import Plan, make_run
+
+
+def words_of(run: Run) -> list[str]:
+    """Return the next command; it is one that the command line understands."""
+    words, why = next_command(run, find(run))
+    assert why
+    assert words[0] == "simrun"
+    parse(words[1:])
+    return words
+
+
+def test_a_run_ends_with_verdict_differences_cost_and_the_next_command(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    verdict, *pairs, cost = ending_lines(run)
+    assert verdict == f"verdict  {find(run).title}"
+    heads = [re.match(r" {9}(\S+ \u2212 \S+): ", line) for line in pairs]
+    assert [head[1] for head in heads if head] == ["3dgs \u2212 clean", "onefixer \u2212 clean", "onefixer \u2212 3dgs"]
+    assert all("95 % interval" in line for line in pairs)
+    assert re.fullmatch(r"cost     clean [\d.]+ ms, 3dgs [\d.]+ ms, onefixer [\d.]+ ms a frame, the whole loop \(mean\)", cost)
+    assert next_line(run).startswith("next     simrun ")
+
+
+def test_the_cost_is_the_mean_and_not_the_median() -> None:
+    speed = {"onefixer": {"ms_per_frame_p50": 1.0, "ms_per_frame_mean": 176.2}, "clean": {"ms_per_frame_mean": None}}
+    assert cost_text({"speed": speed}) == "onefixer 176 ms a frame, the whole loop (mean)"
+    assert cost_text({}) == ""
+
+
+def test_changed_outcomes_lead_to_a_probe_of_one_of_them(usual_run: Path) -> None:
+    run = read_run(usual_run)
+    assert words_of(run)[1] == "check"  # some rollouts failed: that comes first
+    run = dataclasses.replace(run, rollouts=tuple(rollout for rollout in run.rollouts if rollout.ok))
+    words = words_of(run)
+    assert words[1] == "probe"
+    renderer, policy, *scene, seed = words[words.index("--cell") + 1].split("/")
+    assert (renderer, policy, "/".join(scene), int(seed)) in {rollout.cell for rollout in run.rollouts}
+
+
+def test_one_renderer_leads_to_a_comparison_and_a_failing_policy_to_its_check(tmp_path: Path) -> None:
+    alone = read_run(make_run(tmp_path / "a", Plan(renderers=("clean",), seeds=(0,), steps=30)))
+    assert words_of(alone)[:3] == ["simrun", "--renderer", "clean,3dgs"]
+    broken = [dataclasses.replace(r, status="failed", failure_class="policy") for r in alone.rollouts]
+    assert words_of(dataclasses.replace(alone, rollouts=tuple(broken))) == ["simrun", "check-policy", alone.policies[0]]
+
+
+@pytest.mark.parametrize("renderers", [("clean", "3dgs")])
+def test_what_is_undecided_leads_to_more_scenes(tmp_path: Path, renderers: tuple[str, ...]) -> None:
+    run = read_run(make_run(tmp_path, Plan(renderers=renderers, scenes=("a",), seeds=(0,), steps=20, harm={"clean": 0.1, "3dgs": 0.1})))
+    if find(run).tone == "unclear":
+        assert words_of(run)[-1] == "suites/urban"

@@ -1,0 +1,37 @@
+"""Other road users in the pictures from above."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alpasim_plugin.runtime.scene_dump import scene_as_json
+from alpasim_plugin.types import Scenario
+from evaluators.report.road_users import road_users
+from scenarios.load import load_scenario
+
+
+def write(xy: np.ndarray, closed: bool) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in xy) + ("z" if closed else "")
+
+
+def users_of(scenario: Scenario, at_us: int) -> dict[str, tuple[str, str]]:
+    log = scenario.ego_log.xyz[:, :2]
+    found = road_users(scene_as_json(scenario), at_us, log, write)
+    return {one.text.split(",")[0]: (one.body, one.way) for one in found}
+
+
+def test_a_leader_is_where_it_is_at_that_time_and_leaves_its_way() -> None:
+    scenario = load_scenario("smoke/lead_car")
+    (lead,) = [actor for actor in scenario.actors if actor.actor_id == "lead"]
+    early, late = (users_of(scenario, t)[f"{lead.label} {lead.actor_id}"] for t in (scenario.start_us, scenario.end_us))
+    for (body, way), t_us in ((early, scenario.start_us), (late, scenario.end_us)):
+        corners = np.array([[float(v) for v in pair.split(",")] for pair in body.rstrip("z").split()])
+        k = int(np.searchsorted(lead.track.t_us, t_us))
+        assert np.hypot(*(corners.mean(axis=0) - lead.track.xyz[min(k, len(lead.track) - 1), :2])) < 3.0  # drawn every quarter of a second
+        assert np.isclose(np.hypot(*(corners[1] - corners[2])), lead.box.width_m, atol=0.15)
+        assert len(way.split()) > 10
+    assert early[0] != late[0]
+
+
+def test_scene_files_of_earlier_versions_have_no_road_users() -> None:
+    assert road_users({"actors": [{"id": "a", "label": "car", "static": False}]}, 0, np.zeros((2, 2)), write) == []
