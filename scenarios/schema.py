@@ -59,6 +59,8 @@ class EnvironmentSpec(Part):
     def _ordered(self) -> EnvironmentSpec:
         if self.building_height_m[0] > self.building_height_m[1]:
             raise ValueError(f"building_height_m = {list(self.building_height_m)} | give the smaller height first")
+        if 0 < self.poles_spacing_m < b.POLES_M.low:
+            raise ValueError(f"poles_spacing_m = {self.poles_spacing_m} | give at least {b.POLES_M.low:g} m, or 0 for none")
         return self
 
 

@@ -66,12 +66,12 @@ def draw_preview(scenario: Scenario, path: Path, frames: int = 5, renderer: str 
     """
     if path.suffix not in (".png", ".html"):
         raise InputError(DOING, str(path), f"suffix {path.suffix!r}", "name it .png or .html")
-    times = np.linspace(scenario.start_us, scenario.end_us, frames).astype(np.int64)
+    times = [int(t) for t in np.linspace(scenario.start_us, scenario.end_us, frames)]
     there = [actor for actor in scenario.actors if actor.track.t_us[0] <= scenario.end_us and actor.track.t_us[-1] >= scenario.start_us]
     facts = _facts(scenario, there)
     png = _figure(scenario, there, times, _camera_frames(scenario, times, renderer), facts)
     write_bytes(path, png if path.suffix == ".png" else _page(scenario, png, facts))
-    return Preview(tuple(((times - times[0]) * 1e-6).round(3).tolist()), len(there), facts)
+    return Preview(tuple(round((t - times[0]) * 1e-6, 3) for t in times), len(there), facts)
 
 
 def _camera_frames(scenario: Scenario, times: Sequence[int], renderer: str) -> list[U8]:
