@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.formats import read_gaussians
 from alpasim_plugin.gaussians.scene.builder import placed_cloud
@@ -25,12 +25,12 @@ def read_background(background: BackgroundFile, path: F64) -> tuple[GaussianClou
         The Gaussians in the file's frame, and their coverage once placed.
 
     Raises:
-        RendererError: No Gaussian of the file can be drawn.
-        InputError: It covers next to nothing of the path; the error suggests a transform.
+        InputError: It cannot be read, no Gaussian of it can be drawn, or it covers next to nothing of the path; then the error suggests a
+            transform.
     """
     cloud, report = read_gaussians(background.path)
     if report.n_kept == 0:
-        raise RendererError("loading a background", background.path, str(report), "give a file with at least one drawable Gaussian")
+        raise InputError("loading a background", background.path, str(report), "give a file with at least one drawable Gaussian")
     coverage = coverage_of(placed_cloud(cloud, background.T_world_file), path)
     if coverage.covered < LEAST:
         low, high = path.min(axis=0), path.max(axis=0)
@@ -44,7 +44,7 @@ def background_note(scenario: Scenario) -> str:
     """Say in one sentence what the scenario's background file shows; empty without one.
 
     Raises:
-        RendererError, InputError: As `read_background`.
+        InputError: As `read_background`.
     """
     if scenario.background is None:
         return ""

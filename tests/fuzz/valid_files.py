@@ -26,6 +26,14 @@ def make_scene_file(name: str) -> Callable[[Path], None]:
     return make
 
 
+def make_background(folder: Path) -> None:
+    from alpasim_plugin.gaussians import write_ply
+    from tests.gaussians.test_coverage import ROAD, street
+
+    (folder / "scene.yaml").write_text(ROAD + "background: {file: a.ply}\n")
+    write_ply(folder / "a.ply", street(900))
+
+
 def make_file(name: str, content: Callable[[], bytes]) -> Callable[[Path], None]:
     return lambda folder: (folder / name).write_bytes(content()) and None
 
