@@ -148,7 +148,8 @@ def bench_serve(settings: Settings, rollouts: Sequence[int], frames: int, size: 
                 alone = [ask_all(host.address, [one])[0][0] for one in wanted]
             unequal = sum(a != b for x, y in zip(got, alone, strict=True) for a, b in zip(x, y, strict=True))
             through, base = (np.percentile(ms, [50, 95, 99]) for ms in (fixed_ms, handed_ms))
-            rows.append(LoadRow(count, count * frames / seconds, *map(float, through), *map(float, through - base), unequal))
+            p50, p95, p99, more50, more95, more99 = (float(ms) for ms in (*through, *(through - base)))
+            rows.append(LoadRow(count, count * frames / seconds, p50, p95, p99, more50, more95, more99, unequal))
     return rows
 
 

@@ -28,8 +28,8 @@ def wire_pose(T: F64) -> common_pb2.Pose:
 
 def pinhole(width: int = WIDTH, height: int = HEIGHT, name: str = CAMERA) -> sensorsim_pb2.CameraSpec:
     """Return the intrinsics of a pinhole without distortion."""
-    centre = {"principal_point_x": width / 2, "principal_point_y": height / 2}
-    lens = sensorsim_pb2.OpenCVPinholeCameraParam(focal_length_x=40, focal_length_y=40, **centre)
+    lens = sensorsim_pb2.OpenCVPinholeCameraParam(focal_length_x=40, focal_length_y=40)
+    lens.principal_point_x, lens.principal_point_y = width / 2, height / 2
     return sensorsim_pb2.CameraSpec(opencv_pinhole_param=lens, logical_id=name, resolution_w=width, resolution_h=height)
 
 
@@ -38,7 +38,7 @@ def request(
     now: F64,
     t_us: int,
     shutter_us: int = SHUTTER_US,
-    image_format: int = sensorsim_pb2.PNG,
+    image_format: sensorsim_pb2.ImageFormat = sensorsim_pb2.PNG,
     camera: str = CAMERA,
     scene_id: str = "scene",
     size: tuple[int, int] = (WIDTH, HEIGHT),
@@ -59,7 +59,7 @@ def drive(
     """Return the requests of a drive along x at 10 m/s that swerves or brakes from a step on; until then all drives are equal."""
     xy, speed, poses = np.zeros(2), 10.0, []
     for step in range(-1, steps):
-        poses.append(se2(*xy, 0.0))
+        poses.append(se2(float(xy[0]), float(xy[1]), 0.0))
         on = step >= parts_at
         speed = max(0.0, speed - brake_mps2 * STEP_US / 1e6) if on else speed
         xy = xy + np.array([speed, aside_mps if on else 0.0]) * STEP_US / 1e6

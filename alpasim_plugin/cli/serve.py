@@ -85,12 +85,12 @@ def serve(
         for scene_id in made.shelf.ids:
             made.shelf.get(scene_id)
     security = Security(tls_cert, tls_key, tls_client_ca, read_token(token_file))
-    host = Host({"SensorsimService": made.service}, listen, security, workers, every=made.tree.expire)
+    host = Host(made.services, listen, security, workers, every=made.expire)
     if not is_loopback(listen) and security.token is None and security.client_ca is None:
         warning = "%s is open to everybody who can reach it; see --token-file and --tls-client-ca"
         logging.getLogger("simrun.serve").warning(warning, host.address)
-    what = {"serving": "SensorsimService", "at": host.address, "renderer": renderer, "upstream": upstream}
-    text = f"serving SensorsimService at {host.address}: {made.spec.name}" + (f" in front of {upstream}" if upstream else "")
+    what = {"serving": list(made.services), "at": host.address, "renderer": renderer, "upstream": upstream}
+    text = f"serving {', '.join(made.services)} at {host.address}: {made.spec.name}" + (f" in front of {upstream}" if upstream else "")
     print(json.dumps(what) if as_json else text, flush=True)
     host.start()
     try:

@@ -44,7 +44,7 @@ def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pi
 
 def content_key(t_us: int, rgb: U8) -> int:
     """Return a frame's number as its content gives it: the same render at the same time has the same noise in every rollout."""
-    return int.from_bytes(hashlib.blake2b(np.ascontiguousarray(rgb), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(), "little")
+    return int.from_bytes(hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(), "little")
 
 
 def _uniform(x: np.ndarray) -> np.ndarray:

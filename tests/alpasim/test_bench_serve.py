@@ -22,6 +22,7 @@ def test_a_soak_keeps_to_its_memory(overrides: list[str]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(7200)
 def test_ten_thousand_frames_at_constant_memory(overrides: list[str]) -> None:
     row = soak(Settings(overrides=overrides, threads=1, history_bytes=8 << 20), 10_000, (48, 32))
     assert (row.failed, row.frames) == (0, 10_000)

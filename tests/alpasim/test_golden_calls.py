@@ -87,6 +87,7 @@ def test_the_calls_of_one_recorded_drive(shared_data: Path, overrides: list[str]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(7200)
 def test_the_calls_of_all_recorded_drives(shared_data: Path) -> None:
     """With the fixer that ships, its maps, and trust by the distance from each recorded path."""
     logs = complete_logs(shared_data)

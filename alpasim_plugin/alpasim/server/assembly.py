@@ -20,6 +20,7 @@ from alpasim_plugin.alpasim.server.scenes import SceneShelf
 from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
 from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource
 from alpasim_plugin.alpasim.server.version import version_of
+from alpasim_plugin.alpasim.server.world_model import WorldModel
 from alpasim_plugin.alpasim.wire.services import OPTIONS, Stub
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import RendererSpec
@@ -89,15 +90,28 @@ class Settings:
 
 @dataclass(frozen=True)
 class Assembled:
-    """A service with what belongs to it."""
+    """A service with what belongs to it. The video model's is there where we render ourselves."""
 
     service: Sensorsim
+    world_model: WorldModel | None
     shelf: SceneShelf | None
     fixers: FixerShelf | None
     tree: HistoryTree[Answered]
     busy: threading.Lock
     spec: RendererSpec
     channel: Any
+
+    @property
+    def services(self) -> dict[str, object]:
+        """All services by name, for one port."""
+        both = {"SensorsimService": self.service, "WorldModelService": self.world_model}
+        return {name: service for name, service in both.items() if service is not None}
+
+    def expire(self) -> None:
+        """Forget what nobody used for long."""
+        self.tree.expire()
+        if self.world_model is not None:
+            self.world_model.expire()
 
 
 def assemble(settings: Settings) -> Assembled:
@@ -140,4 +154,9 @@ def assemble(settings: Settings) -> Assembled:
         "maps": needs_map and shelf is not None,
     }
     service = Sensorsim(frames, partial(version_of, spec, shaping), shelf, stub, verbatim=stub is not None and fixers is None)
-    return Assembled(service, shelf, fixers, tree, busy, spec, channel)
+    world_model = None
+    if stub is None:
+        assert shelf is not None
+        version = version_of(spec, shaping)
+        world_model = WorldModel(shelf, fixers, busy, version, settings.threads, settings.expiry_s)
+    return Assembled(service, world_model, shelf, fixers, tree, busy, spec, channel)

@@ -7,7 +7,7 @@ polynomial by the mean of both factors, as AlpaSim's own overlay does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from alpasim_plugin.alpasim.wire import sensorsim_pb2
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec
+from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec, Frame
 
 DOING = "reading a camera's intrinsics"
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the picture
@@ -48,13 +48,20 @@ class Lens:
         """Return the covering pinhole as a camera."""
         return CameraSpec(name, *self.cover, self.K, T_rig_camera, shutter_us)
 
+    def frame(self, covering: Frame) -> Frame:
+        """Return a covering frame as the lens shows it; where the lens sees nothing it is black and opaque."""
+        alpha = None if covering.alpha is None else self.plane(covering.alpha, 1.0)
+        return replace(covering, rgb=self.image(covering.rgb), alpha=alpha, depth=None)
+
     def image(self, covering: U8) -> U8:
         """Return the lens's picture ``(height, width, 3)`` of a covering one; black where it sees nothing."""
-        return self._through(covering, 0)
+        out: U8 = self._through(covering, 0)
+        return out
 
     def plane(self, covering: F32, outside: float) -> F32:
         """Return one value a pixel ``(height, width)``, ``outside`` where the lens sees nothing."""
-        return self._through(covering, outside)
+        out: F32 = self._through(covering, outside)
+        return out
 
     def _through(self, covering: Any, outside: float) -> Any:
         if self.resample is None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import logging
-from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import grpc
 
+from alpasim_plugin.alpasim.server.failures import Failures
 from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.scenes import SceneShelf, advertised
 from alpasim_plugin.alpasim.server.status import CallTime, answering
@@ -17,20 +16,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.log.schema import wire_trajectory
 
 DOING = "serving AlpaSim's renderer service"
-log = logging.getLogger("simrun.serve")
-
-
-class Failures:
-    """Counts and logs the calls that failed."""
-
-    def __init__(self) -> None:
-        self.statuses: Counter[str] = Counter()
-
-    def failed(self, call: str, code: Any, text: str, error: Exception) -> None:
-        """Note a failed call; an unforeseen error is logged with its traceback."""
-        self.statuses[code.name] += 1
-        foreseen = code is not grpc.StatusCode.INTERNAL
-        log.warning("%s: %s: %s", call, code.name, text, exc_info=None if foreseen else error)
+T = TypeVar("T")
 
 
 class Sensorsim(Failures):
@@ -60,7 +46,8 @@ class Sensorsim(Failures):
         """Render one frame."""
         left = CallTime(context)
         if self._verbatim:
-            return self._upstream.render_rgb(request, timeout=left.left_s())
+            handed_on: sensorsim_pb2.RGBRenderReturn = self._upstream.render_rgb(request, timeout=left.left_s())
+            return handed_on
         return sensorsim_pb2.RGBRenderReturn(image_bytes=self.frames.answers([request], left)[0])
 
     @answering
@@ -71,7 +58,8 @@ class Sensorsim(Failures):
         if len(set(names)) < len(names):
             raise InputError(DOING, f"a batch of {names}", "a camera name twice", "send one item a camera")
         if self._verbatim:
-            return self._upstream.batch_render_rgb(request, timeout=left.left_s())
+            handed_on: sensorsim_pb2.BatchRGBRenderReturn = self._upstream.batch_render_rgb(request, timeout=left.left_s())
+            return handed_on
         images = self.frames.answers([item.request for item in request.items], left)
         item, result = sensorsim_pb2.BatchRGBRenderReturnItem, sensorsim_pb2.RGBRenderReturn
         made = [item(camera_name=n, result=result(image_bytes=i), success=True) for n, i in zip(names, images, strict=True)]
@@ -82,12 +70,13 @@ class Sensorsim(Failures):
         """Render frames and lidar spins together; lidar and the renderer's data for the driver are the upstream's."""
         left = CallTime(context)
         if self._verbatim:
-            return self._upstream.render_aggregated(request, timeout=left.left_s())
+            handed_on: sensorsim_pb2.AggregatedRenderReturn = self._upstream.render_aggregated(request, timeout=left.left_s())
+            return handed_on
         if self._upstream is None:
             if request.lidar_requests:
                 raise NotHere("lidar")
             return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=self._returns(request, left))
-        reply = self._upstream.render_aggregated(request, timeout=left.left_s())
+        reply: sensorsim_pb2.AggregatedRenderReturn = self._upstream.render_aggregated(request, timeout=left.left_s())
         if request.rgb_requests:
             del reply.rgb_returns[:]
             reply.rgb_returns.extend(self._returns(request, left))
@@ -99,12 +88,12 @@ class Sensorsim(Failures):
     @answering
     def render_lidar(self, request: sensorsim_pb2.LidarRenderRequest, context: Any) -> sensorsim_pb2.LidarRenderReturn:
         """Hand a lidar request on to the upstream."""
-        return self._pass("render_lidar", request, context)
+        return self._pass("render_lidar", request, context, sensorsim_pb2.LidarRenderReturn)
 
     @answering
     def get_version(self, request: common_pb2.Empty, context: Any) -> common_pb2.VersionId:
         """Return the triple."""
-        return self._version(None if self._upstream is None else self._pass("get_version", request, context))
+        return self._version(None if self._upstream is None else self._pass("get_version", request, context, common_pb2.VersionId))
 
     @answering
     def get_available_scenes(self, request: common_pb2.Empty, context: Any) -> common_pb2.AvailableScenesReturn:
@@ -112,7 +101,7 @@ class Sensorsim(Failures):
         if self._upstream is None:
             assert self._shelf is not None
             return common_pb2.AvailableScenesReturn(scene_ids=self._shelf.ids)
-        theirs = self._pass("get_available_scenes", request, context)
+        theirs = self._pass("get_available_scenes", request, context, common_pb2.AvailableScenesReturn)
         if self._shelf is None or self._verbatim:
             return theirs
         known = set(theirs.scene_ids)
@@ -122,7 +111,7 @@ class Sensorsim(Failures):
     def get_loaded_scenes(self, request: common_pb2.Empty, context: Any) -> sensorsim_pb2.LoadedScenesReturn:
         """Return the scenes in memory; each serves any number of rollouts."""
         if self._upstream is not None:
-            return self._pass("get_loaded_scenes", request, context)
+            return self._pass("get_loaded_scenes", request, context, sensorsim_pb2.LoadedScenesReturn)
         assert self._shelf is not None
         entry = sensorsim_pb2.LoadedSceneEntry
         scenes = [entry(scene_id=name, loaded_instance_count=1, reusable_instance_count=1) for name in self._shelf.loaded]
@@ -145,7 +134,7 @@ class Sensorsim(Failures):
     def get_available_cameras(self, request: sensorsim_pb2.AvailableCamerasRequest, context: Any) -> sensorsim_pb2.AvailableCamerasReturn:
         """Return a scene's cameras."""
         if self._upstream is not None:
-            return self._pass("get_available_cameras", request, context)
+            return self._pass("get_available_cameras", request, context, sensorsim_pb2.AvailableCamerasReturn)
         assert self._shelf is not None
         return sensorsim_pb2.AvailableCamerasReturn(available_cameras=advertised(self._shelf.get(request.scene_id).scenario))
 
@@ -155,7 +144,7 @@ class Sensorsim(Failures):
     ) -> sensorsim_pb2.AvailableTrajectoriesReturn:
         """Return a scene's recorded ego path, local to rig."""
         if self._upstream is not None:
-            return self._pass("get_available_trajectories", request, context)
+            return self._pass("get_available_trajectories", request, context, sensorsim_pb2.AvailableTrajectoriesReturn)
         assert self._shelf is not None
         recorded = wire_trajectory(self._shelf.get(request.scene_id).scenario.ego_log, f"recorded path of scene {request.scene_id!r}")
         listed = sensorsim_pb2.AvailableTrajectoriesReturn.AvailableTrajectory(trajectory=recorded)
@@ -165,16 +154,18 @@ class Sensorsim(Failures):
     def get_available_ego_masks(self, request: common_pb2.Empty, context: Any) -> sensorsim_pb2.AvailableEgoMasksReturn:
         """Return the ego masks: the upstream's; our own renderer shows no part of the ego."""
         if self._upstream is not None:
-            return self._pass("get_available_ego_masks", request, context)
+            return self._pass("get_available_ego_masks", request, context, sensorsim_pb2.AvailableEgoMasksReturn)
         return sensorsim_pb2.AvailableEgoMasksReturn()
 
-    def _pass(self, name: str, request: Any, context: Any) -> Any:
+    def _pass(self, name: str, request: Any, context: Any, reply: type[T]) -> T:
         if self._upstream is None:
             raise NotHere(name)
-        return getattr(self._upstream, name)(request, timeout=CallTime(context).left_s())
+        given = getattr(self._upstream, name)(request, timeout=CallTime(context).left_s())
+        assert isinstance(given, reply), "a stub parses what its method returns"
+        return given
 
 
-class NotHere(grpc.RpcError):
+class NotHere(grpc.RpcError):  # type: ignore[misc]  # grpc has no types
     """A call that only an upstream can answer."""
 
     def __init__(self, what: str) -> None:

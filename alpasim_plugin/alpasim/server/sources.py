@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import grpc
@@ -101,8 +101,7 @@ class LocalSource:
         with left.holding(self._busy):
             frame = checked_frames(entry.renderer, [asked])[0]
             sdmap = drawn_map(entry, view, lens, camera, self._threads)
-        alpha = None if frame.alpha is None else lens.plane(frame.alpha, 1.0)
-        return Rendered(replace(frame, rgb=lens.image(frame.rgb), alpha=alpha, depth=None), sdmap)
+        return Rendered(lens.frame(frame), sdmap)
 
 
 class UpstreamSource:

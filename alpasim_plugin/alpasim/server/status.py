@@ -44,7 +44,7 @@ class CallTime:
     def __init__(self, context: Any = None) -> None:
         self._context = context
         left = context.time_remaining() if context is not None else None
-        self._end_s = None if left is None or left > 1e6 else time.monotonic() + left
+        self._end_s: float | None = None if left is None or left > 1e6 else time.monotonic() + left
 
     def left_s(self) -> float | None:
         """Return the seconds left; None: no limit.
@@ -56,7 +56,7 @@ class CallTime:
             raise Late("the caller is gone")
         if self._end_s is None:
             return None
-        left = self._end_s - time.monotonic()
+        left: float = self._end_s - time.monotonic()
         if left <= 0:
             raise Late("the deadline has passed")
         return left
