@@ -120,6 +120,7 @@ def test_the_check_prints_what_a_service_is(upstream: Host, capsys: pytest.Captu
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(upstream: Host, tmp_path: Path) -> None:
     wheel = building.build(tmp_path / "dist")
     python = environment(tmp_path / "venv", *PINS)
