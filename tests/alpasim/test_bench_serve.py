@@ -6,7 +6,8 @@ import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Settings
 from alpasim_plugin.bench.serve import bench_serve, soak
-from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.bench_serve import parse_counts
+from alpasim_plugin.errors import InputError
 
 
 def test_answers_under_load_equal_those_alone(overrides: list[str]) -> None:
@@ -32,6 +33,8 @@ def test_ten_thousand_frames_at_constant_memory(overrides: list[str]) -> None:
     assert row.threads_grown <= 2
 
 
-def test_numbers_of_rollouts_are_checked(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(["bench", "serve", "--rollouts", "1,x"]) == 2
-    assert "no numbers from 1 to 256" in capsys.readouterr().err
+def test_numbers_of_rollouts_are_checked() -> None:
+    assert parse_counts("1, 4,16") == [1, 4, 16]
+    for text in ("1,x", "0", "", "1000"):
+        with pytest.raises(InputError, match="no numbers from 1 to 256"):
+            parse_counts(text)
