@@ -33,6 +33,14 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.control": set(),
     "policies": set(),
     "alpasim_plugin.alpasim": set(),
+    "alpasim_plugin.alpasim.server": {
+        "alpasim_plugin.alpasim",
+        "alpasim_plugin.fixers",
+        "alpasim_plugin.log",
+        "alpasim_plugin.runtime",
+        "alpasim_plugin.semantic_map",
+        "scenarios",
+    },
     "alpasim_plugin.log": {"alpasim_plugin.alpasim"},
     "evaluators": set(),
     "alpasim_plugin.runtime": {

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from alpasim_plugin.bench.raster import bench_raster
-from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline
+from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline, bench_serve
 from alpasim_plugin.cli.quality import EPILOG as QUALITY_EXAMPLES
 from alpasim_plugin.cli.quality import quality
 
@@ -27,6 +27,7 @@ app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evalu
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
 app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
+app.command("serve", epilog=bench_serve.EPILOG)(bench_serve.serve)
 app.command("quality", epilog=QUALITY_EXAMPLES)(quality)
 
 

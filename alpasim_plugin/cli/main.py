@@ -55,6 +55,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "fork", "probe", "PROBE_EPILOG",
         "Query the policy at a logged rollout's poses behind several renderers and measure the distance between its plans.",
     ),
+    "serve": ("serve", "serve", "EPILOG", "Serve AlpaSim's renderer service: our renderer, or OneFixer in front of any other renderer."),
     "bench": ("bench", "app", "", "Measure speed and error of parts."),
     "train": ("train", "app", "", "Make training data and train networks."),
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.pixel_noise import pixel_noise
+from alpasim_plugin.fixers.pixel_noise import content_key, pixel_noise
 from alpasim_plugin.fixers.pixel_pipeline import PixelInputs, fix_frame, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -37,7 +37,7 @@ class PixelFixer(Fixer):
 
     Args:
         settings: Weights, steps, precision, guard.
-        scene_id, seed: Key of the noise, with camera, frame and pixel.
+        scene_id, seed: Key of the noise, with camera, frame (its index or its content, see `PixelFixerSettings.noise`) and pixel.
         device: ``cpu`` or ``cuda``.
         threads: Torch threads of this process; None leaves their number.
 
@@ -79,35 +79,48 @@ class PixelFixer(Fixer):
             InputError: Frames that do not continue the rollout, or are none (see `views.group_views`).
             RendererError: An opacity that is not a number or outside [0, 1].
         """
+        out, self._history = self._advance(block, maps, self._history)
+        return out
+
+    def advance(self, frame: Frame, sdmap: U8 | None, past: CameraHistory | None) -> tuple[Frame, CameraHistory]:
+        """Fix one frame of one camera from a given past; the session's own histories are neither read nor changed.
+
+        A past is never written to: histories can be forked, kept and continued in any order.
+
+        Args:
+            frame: The render.
+            sdmap: Its semantic map; None: nothing is drawn.
+            past: What an earlier call returned for the frame before; None: the first frame.
+
+        Returns:
+            The frame, and the past of the next one.
+
+        Raises:
+            InputError, RendererError: See `step`.
+        """
+        pasts = {} if past is None else {frame.camera: past}
+        (fixed,), after = self._advance([frame], () if sdmap is None else [sdmap], pasts)
+        return fixed, after[frame.camera]
+
+    def _advance(
+        self, block: Sequence[Frame], maps: Sequence[U8], pasts: Mapping[str, CameraHistory]
+    ) -> tuple[tuple[Frame, ...], dict[str, CameraHistory]]:
         views = group_views(block, maps if self.settings.uses_map else (), 1)
         for view in views:
-            self._check(view)
-        out, after = list(block), dict(self._history)
+            check_continues(view, pasts)
+        out, after = list(block), dict(pasts)
         for view in views:
-            for camera, index, made, event in self._fix(view):
+            for camera, index, made, event in self._fix(view, pasts):
                 i = index[0]
                 out[i] = replace(block[i], events=(*block[i].events, event)) if event else replace(block[i], rgb=made.fixed)
                 after[camera] = made
-        self._history = after
-        return tuple(out)
+        return tuple(out), after
 
-    def _check(self, view: Views) -> None:
-        for camera, times in zip(view.cameras, view.t_us, strict=True):
-            past = self._history.get(camera)
-            if past is None:
-                continue
-            if past.raw.shape[:2] != view.shape:
-                found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
-                raise InputError(DOING, f"camera {camera!r}", found, "keep a camera's image size for the whole rollout, or reset")
-            if times[0] <= past.t_us:
-                found = f"a frame at {times[0]} us after one at {past.t_us} us"
-                raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
-
-    def _fix(self, view: Views) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
+    def _fix(self, view: Views, histories: Mapping[str, CameraHistory]) -> list[tuple[str, tuple[int, ...], CameraHistory, str]]:
         """Return per camera its name, the places of its frames in the block, its history after the frame, and the guard's event."""
         net, device = self.generator.net, self.generator.device
         inputs = to_inputs(view, device)
-        pasts = [self._history.get(camera) for camera in view.cameras]
+        pasts = [histories.get(camera) for camera in view.cameras]
         states = [net.start(inputs.render[b : b + 1]) if past is None else past.state for b, past in enumerate(pasts)]
         counts = [0 if past is None else past.frames for past in pasts]
         height, width = view.shape
@@ -118,7 +131,8 @@ class PixelFixer(Fixer):
                 return inputs.render
 
             def noise(b: int, pixels: I64) -> F32:
-                return pixel_noise(self.scene_id, self.seed, view.cameras[b], draw, counts[b], pixels)
+                frame = counts[b] if self.settings.noise == "rollout" else content_key(view.t_us[b][0], view.rgb[b, 0])
+                return pixel_noise(self.scene_id, self.seed, view.cameras[b], draw, frame, pixels)
 
             return sparse_source(inputs.render, torch.zeros_like(inputs.opacity) if everywhere else inputs.opacity, noise)
 
@@ -135,6 +149,20 @@ class PixelFixer(Fixer):
                 state = net.start(inputs.render[b : b + 1])
             found.append((camera, view.index[b], CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]), event))
         return found
+
+
+def check_continues(view: Views, histories: Mapping[str, CameraHistory]) -> None:
+    """Raise `InputError` where a frame does not follow its camera's history in size and time."""
+    for camera, times in zip(view.cameras, view.t_us, strict=True):
+        past = histories.get(camera)
+        if past is None:
+            continue
+        if past.raw.shape[:2] != view.shape:
+            found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
+            raise InputError(DOING, f"camera {camera!r}", found, "keep a camera's image size for the whole rollout, or reset")
+        if times[0] <= past.t_us:
+            found = f"a frame at {times[0]} us after one at {past.t_us} us"
+            raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:

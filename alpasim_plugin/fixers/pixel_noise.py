@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 
 from alpasim_plugin.seeding import derive_seed
-from alpasim_plugin.types import F32, I64
+from alpasim_plugin.types import F32, I64, U8
 
 ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Steele et al., 2014, SplitMix64)
 MIX = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
@@ -21,7 +23,7 @@ def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pi
     Args:
         scene_id, seed, camera: Key of the stream.
         draw: Flow step.
-        frame: Index in the rollout.
+        frame: Index in the rollout, or `content_key`.
         pixels: ``(N,)`` row-major indices in the image.
 
     Returns:
@@ -38,6 +40,11 @@ def pixel_noise(scene_id: str, seed: int, camera: str, draw: int, frame: int, pi
         u, v = (_uniform(key + (index + np.uint64(i + 1)) * ODD) for i in range(2))
     normal: F32 = (np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)).astype(np.float32)  # Box and Muller, 1958
     return normal
+
+
+def content_key(t_us: int, rgb: U8) -> int:
+    """Return a frame's number as its content gives it: the same render at the same time has the same noise in every rollout."""
+    return int.from_bytes(hashlib.blake2b(rgb.tobytes(), digest_size=8, salt=t_us.to_bytes(8, "little")).digest(), "little")
 
 
 def _uniform(x: np.ndarray) -> np.ndarray:

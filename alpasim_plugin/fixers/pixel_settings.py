@@ -35,6 +35,9 @@ class PixelFixerSettings(FixerSettings):
         default="noise",
         description="Source of a frame: noise where the render is transparent (Eq. 1), the render alone, or noise everywhere.",
     )
+    noise: Literal["rollout", "content"] = Field(
+        default="rollout", description="Key of a frame's noise: its index in the rollout, or its time and content, as in `simrun serve`."
+    )
     keep_render: bool = Field(
         default=True, description="Keep the render where it is opaque, the change is large, and neither map nor history supports it."
     )

@@ -1,0 +1,1 @@
+"""Hydra presets for AlpaSim's wizard (entry point group ``alpasim.configs``)."""

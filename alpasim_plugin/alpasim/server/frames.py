@@ -1,0 +1,141 @@
+"""Answer render requests: find the frame or its past, render, fix, remember, encode."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from alpasim_plugin.alpasim.server.fixing import FixerShelf, size_of
+from alpasim_plugin.alpasim.server.history import HistoryTree, Node
+from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
+from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
+from alpasim_plugin.alpasim.server.views import View, read_view
+from alpasim_plugin.alpasim.wire import sensorsim_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log.images import ImageEncoding, encode_image
+from alpasim_plugin.types import U8
+
+DOING = "answering a render request"
+ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}
+QUALITY = 95.0  # where a request leaves it unset; AlpaSim always asks for it
+
+
+@dataclass(frozen=True)
+class Answered:
+    """What the tree keeps of a frame: the picture that was given, and the fixer's past for the next one."""
+
+    image: U8
+    past: Any
+
+
+class FrameServer:
+    """Frames for requests, in any order and from several threads.
+
+    Args:
+        source: Renders.
+        fixers: Fixes; None: frames are given as rendered, and no history is kept.
+        tree: Histories.
+        busy: Held while something is computed.
+    """
+
+    def __init__(self, source: FrameSource, fixers: FixerShelf | None, tree: HistoryTree[Answered], busy: threading.Lock) -> None:
+        self.source, self.tree = source, tree
+        self._fixers, self._busy = fixers, busy
+        self._in_work: dict[bytes, threading.Event] = {}
+        self._in_work_lock = threading.Lock()
+        self.events: Counter[str] = Counter()
+
+    def answers(self, requests: Sequence[Request], left: CallTime) -> list[bytes]:
+        """Return an encoded picture for every request, in order. Equal requests get equal bytes.
+
+        Raises:
+            SimrunError, grpc.RpcError, Late: See `status.status_of`.
+        """
+        forms = [image_form(request) for request in requests]
+        views = [read_view(request) for request in requests]
+        if self._fixers is None:
+            rendered = self.source.render(requests, views, left)
+            return [encode(item.frame.rgb, form) for item, form in zip(rendered, forms, strict=True)]
+        nodes = self._nodes(requests, views, left)
+        return [self._encoded(nodes[view.key], form) for view, form in zip(views, forms, strict=True)]
+
+    def _nodes(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> dict[bytes, Node[Answered]]:
+        """Return the frame of every view. A frame that another call is working on is waited for, after this call's own are done."""
+        nodes: dict[bytes, Node[Answered]] = {}
+        missing = dict(zip((view.key for view in views), zip(requests, views, strict=True), strict=True))
+        while missing:
+            for key, (_, view) in list(missing.items()):
+                known = self.tree.find(view)
+                if known is not None:
+                    nodes[key] = known
+                    del missing[key]
+            own, others = self._claim(list(missing))
+            try:
+                if own:
+                    asked, seen = zip(*(missing[key] for key in own), strict=True)
+                    for item, view in zip(self.source.render(asked, seen, left), seen, strict=True):
+                        nodes[view.key] = self._fixed(item, view, left)
+            finally:
+                self._release(own)
+            missing = {key: value for key, value in missing.items() if key not in nodes}
+            if others and missing:
+                left.wait(others[0])
+        return nodes
+
+    def _fixed(self, item: Rendered, view: View, left: CallTime) -> Node[Answered]:
+        assert self._fixers is not None
+        with left.holding(self._busy):
+            # Under the lock: which frames there are does not change between the look at the tree and the entry.
+            parent = self.tree.parent_of(view)
+            if parent is not None and parent.state.image.shape != item.frame.rgb.shape:
+                found = f"a picture of {item.frame.rgb.shape[:2]} after {parent.state.image.shape[:2]} (height, width)"
+                raise UpstreamFault(DOING, f"scene {view.scene_id!r}, camera {view.camera!r}", found, "see the upstream's log")
+            past = None if parent is None else parent.state.past
+            frame, after = self._fixers.of(view.scene_id).advance(item.frame, item.sdmap, past)
+            self.events.update(frame.events)
+            answered = Answered(frame.rgb, after)
+            return self.tree.add(view, answered, size_of(answered), parent)
+
+    def _encoded(self, node: Node[Answered], form: tuple[int, float]) -> bytes:
+        known = node.answers.get(form)
+        if known is None:
+            known = encode(node.state.image, form)
+            self.tree.remember(node, form, known)
+        return known
+
+    def _claim(self, keys: Sequence[bytes]) -> tuple[list[bytes], list[threading.Event]]:
+        """Take the keys that nobody works on; return them and what to wait for instead of the others."""
+        with self._in_work_lock:
+            others = [self._in_work[key] for key in keys if key in self._in_work]
+            own = [key for key in keys if key not in self._in_work]
+            for key in own:
+                self._in_work[key] = threading.Event()
+        return own, others
+
+    def _release(self, keys: Sequence[bytes]) -> None:
+        with self._in_work_lock:
+            for key in keys:
+                self._in_work.pop(key).set()
+
+
+def image_form(request: Request) -> tuple[int, float]:
+    """Return the format and quality that a request asks for.
+
+    Raises:
+        InputError: Neither PNG nor JPEG, or a quality outside 1 to 100.
+    """
+    quality = request.image_quality or QUALITY
+    if request.image_format not in ENCODINGS:
+        name = sensorsim_pb2.ImageFormat.Name(request.image_format) if request.image_format < 7 else str(request.image_format)
+        raise InputError(DOING, f"image_format {name}", "no format that is made here", "ask for PNG or JPEG")
+    if not 1 <= quality <= 100:
+        raise InputError(DOING, f"image_quality {quality}", "not between 1 and 100", "ask for 95")
+    return request.image_format, quality if request.image_format == sensorsim_pb2.JPEG else 0.0
+
+
+def encode(image: U8, form: tuple[int, float]) -> bytes:
+    """Encode a picture ``(H, W, 3)`` as asked."""
+    return encode_image(image, ENCODINGS[form[0]], round(form[1]))

@@ -1,0 +1,193 @@
+"""Histories without sessions: a tree of frames per scene, camera and lens.
+
+AlpaSim's render requests carry no session. Several rollouts of one scene come over one connection, interleaved, and with a deterministic
+driver their requests are equal byte for byte. So a frame's past is found by content:
+
+- A request that is equal to an earlier one *is* that frame, and has its answer.
+- Otherwise its parent is the frame before it on the same drive. With the shutter pair (start, end) of the request, the camera was at
+  ``end - (end - start) dt / shutter`` a time ``dt`` earlier (AlpaSim interpolates poses linearly over a control step, so this is nearly
+  exact); dynamic objects are taken back in the same way. With a shutter of 0, the parent's own motion is continued instead; the first
+  frame of a drive has none, so its nearest pose counts.
+- A frame with no parent within reach starts a history.
+
+Two drives that differ thus have their own branches from where they part, and what one is given does not depend on the other.
+
+Memory is bounded: what nobody used for `expiry_s` goes; beyond `max_bytes`, first frames that have a successor, the longest unused first,
+then the ends of branches, the longest unused first.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from bisect import bisect_left, insort
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from alpasim_plugin.alpasim.server.motion import distance
+from alpasim_plugin.alpasim.server.views import View
+from alpasim_plugin.types import F64
+
+S = TypeVar("S")
+GAP_US = 2_000_000  # longest time between two frames of a drive
+
+
+@dataclass(eq=False)
+class Node(Generic[S]):
+    """One frame that was answered.
+
+    Attributes:
+        view: Its request.
+        state: What the fixer knows after it.
+        size: Bytes that it holds.
+        T_before: Camera pose and time of its parent; None at the start of a history.
+        parent: Key of its parent.
+        children: How many frames follow it.
+        answers: Encoded images by format and quality.
+    """
+
+    view: View
+    state: S
+    size: int
+    T_before: tuple[F64, int] | None
+    parent: bytes | None
+    used_s: float
+    children: int = 0
+    answers: dict[tuple[int, float], bytes] = field(default_factory=dict)
+
+
+@dataclass
+class Counts:
+    """What happened so far, for the log and the soak."""
+
+    frames: int = 0
+    repeated: int = 0
+    forks: int = 0
+    starts: int = 0
+    expired: int = 0
+    pruned: int = 0
+
+
+class HistoryTree(Generic[S]):
+    """The histories of all scenes and cameras. All methods may be called from several threads.
+
+    Args:
+        max_bytes: Most memory of states and answers together.
+        expiry_s: Frames unused for so long are forgotten.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(self, max_bytes: int, expiry_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self.max_bytes, self.expiry_s, self._clock = max_bytes, expiry_s, clock
+        self.bytes, self.counts = 0, Counts()
+        self._nodes: OrderedDict[bytes, Node[S]] = OrderedDict()  # the longest unused first
+        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(list)  # sorted by time
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def find(self, view: View) -> Node[S] | None:
+        """Return the frame that an equal request was answered with, if it is still known."""
+        with self._lock:
+            node = self._touch(view.key)
+            self.counts.repeated += node is not None
+            return node
+
+    def parent_of(self, view: View) -> Node[S] | None:
+        """Return the frame before a view on the same drive; None where a history starts."""
+        with self._lock:
+            node = self._nearest(view)
+            return None if node is None else self._touch(node.view.key)
+
+    def add(self, view: View, state: S, size: int, parent: Node[S] | None) -> Node[S]:
+        """Enter an answered frame; if an equal one was entered meanwhile, that one stays and is returned."""
+        with self._lock:
+            known = self._touch(view.key)
+            if known is not None:
+                return known
+            before = None if parent is None else (parent.view.T_world_camera[1], parent.view.t_us)
+            node = Node(view, state, size, before, None if parent is None else parent.view.key, self._clock())
+            self._nodes[view.key] = node
+            insort(self._times[_group(view)], (view.t_us, view.key))
+            self.bytes += size
+            self.counts.frames += 1
+            self.counts.starts += parent is None
+            if parent is not None:
+                self.counts.forks += parent.children > 0
+                parent.children += 1
+            self._trim(keep=view.key)
+            return node
+
+    def remember(self, node: Node[S], form: tuple[int, float], data: bytes) -> None:
+        """Keep a frame's answer in one image format."""
+        with self._lock:
+            if self._nodes.get(node.view.key) is node and form not in node.answers:
+                node.answers[form] = data
+                node.size += len(data)
+                self.bytes += len(data)
+                self._trim(keep=node.view.key)
+
+    def expire(self) -> None:
+        """Forget what nobody used for `expiry_s`."""
+        with self._lock:
+            self._trim(keep=None)
+
+    def _touch(self, key: bytes) -> Node[S] | None:
+        node = self._nodes.get(key)
+        if node is not None:
+            node.used_s = self._clock()
+            self._nodes.move_to_end(key)
+        return node
+
+    def _nearest(self, view: View) -> Node[S] | None:
+        best: tuple[float, Node[S]] | None = None
+        at: int | None = None
+        for node in self._earlier(view):
+            if at is not None and node.view.t_us != at and best is not None:
+                return best[1]  # the latest time with a frame within reach has it
+            at = node.view.t_us
+            error, limit = distance(view, node.view, node.T_before)
+            if error <= limit and (best is None or error < best[0]):
+                best = error, node
+        return None if best is None else best[1]
+
+    def _earlier(self, view: View) -> Iterator[Node[S]]:
+        """Yield the frames of the same scene, camera and lens before a view, the latest first."""
+        times = self._times.get(_group(view), [])
+        for t_us, key in reversed(times[: bisect_left(times, (view.t_us, b""))]):
+            if view.t_us - t_us > GAP_US:
+                return
+            yield self._nodes[key]
+
+    def _trim(self, keep: bytes | None) -> None:
+        now = self._clock()
+        while self._nodes:
+            oldest = next(iter(self._nodes.values()))
+            if now - oldest.used_s <= self.expiry_s or oldest.view.key == keep:
+                break
+            self._remove(oldest)
+            self.counts.expired += 1
+        while self.bytes > self.max_bytes:
+            others = [node for key, node in self._nodes.items() if key != keep]
+            if not others:
+                break
+            self._remove(next((node for node in others if node.children), others[0]))
+            self.counts.pruned += 1
+
+    def _remove(self, node: Node[S]) -> None:
+        del self._nodes[node.view.key]
+        group = _group(node.view)
+        self._times[group].remove((node.view.t_us, node.view.key))
+        if not self._times[group]:
+            del self._times[group]
+        self.bytes -= node.size
+        parent = self._nodes.get(node.parent) if node.parent is not None else None
+        if parent is not None:
+            parent.children -= 1
+
+
+def _group(view: View) -> tuple[str, str, bytes]:
+    return view.scene_id, view.camera, view.lens

@@ -1,0 +1,144 @@
+"""The scenes that a server knows: found by id in folders, loaded when first asked for, a few kept."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from alpasim_plugin.alpasim.wire import sensorsim_pb2
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log.schema import wire_camera
+from alpasim_plugin.parts import RendererSpec, build, complete
+from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
+from alpasim_plugin.types import Renderer, Scenario
+from scenarios.load import load_scenario
+from scenarios.usdz import usdz_scene_id
+
+DOING = "looking for a scene"
+FILES = (".usdz", ".yaml", ".yml", ".xml")
+FRONT_WIDE = "camera_front_wide_120fov"  # AlpaSim's evaluation and its drivers know the front camera by this name
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """A loaded scene: the scenario, its prepared map, and its renderer where the server renders itself."""
+
+    scenario: Scenario
+    scene_map: PreparedMap | None
+    renderer: Renderer | None
+
+
+class SceneShelf:
+    """Scenes by id.
+
+    Args:
+        places: Folders with ``*.usdz`` and scenario files (searched for files, not deeper), single files, recorded logs, or shipped names.
+        spec: The renderer to build for a scene; None: scenes are only needed for their maps and paths.
+        needs_map: Whether the fixer takes semantic maps.
+        device, threads, seed: For the renderer.
+        kept: Scenes that stay loaded, the least recently used going first.
+
+    Raises:
+        InputError: A place without a scene, a file that is none, or two scenes of one id.
+    """
+
+    def __init__(
+        self,
+        places: Iterable[str | Path],
+        spec: RendererSpec | None,
+        needs_map: bool,
+        device: str = "cpu",
+        threads: int | None = None,
+        seed: int = 0,
+        kept: int = 4,
+    ) -> None:
+        self._spec, self._needs_map, self.kept = spec, needs_map, kept
+        self._session = {"seed": seed, "device": device, "threads": threads}
+        self._sources: dict[str, str | Path] = {}
+        self._loaded: OrderedDict[str, SceneEntry] = OrderedDict()
+        self._lock = threading.Lock()
+        for place in places:
+            for source in sources_in(place):
+                self._enter(source)
+
+    @property
+    def ids(self) -> list[str]:
+        """All scene ids, sorted."""
+        return sorted(self._sources)
+
+    @property
+    def loaded(self) -> list[str]:
+        """Ids of the scenes that are loaded, the least recently used first."""
+        return list(self._loaded)
+
+    def get(self, scene_id: str) -> SceneEntry:
+        """Return a scene, loaded if it is not; one is loaded at a time.
+
+        Raises:
+            UnknownScene: No scene has that id.
+            InputError: It cannot be read or built.
+        """
+        with self._lock:
+            if scene_id not in self._loaded:
+                if scene_id not in self._sources:
+                    some = ", ".join(self.ids[:5]) + (" ..." if len(self._sources) > 5 else "")
+                    found = f"it is none of the {len(self._sources)} known: {some}"
+                    raise UnknownScene(DOING, f"scene {scene_id!r}", found, "add its file to --scenes")
+                self._loaded[scene_id] = self._load(self._sources[scene_id])
+                while len(self._loaded) > self.kept:
+                    self._loaded.popitem(last=False)
+            self._loaded.move_to_end(scene_id)
+            return self._loaded[scene_id]
+
+    def _load(self, source: str | Path) -> SceneEntry:
+        scenario = load_scenario(source)
+        renderer = None
+        if self._spec is not None:
+            renderer = complete(build(self._spec.base, scenario=scenario, **self._session), Renderer)
+        return SceneEntry(scenario, prepare_map(scenario.lane_map) if self._needs_map else None, renderer)
+
+    def _enter(self, source: str | Path) -> None:
+        scene_id = usdz_scene_id(source) if str(source).endswith(".usdz") else load_scenario(source).scene_id
+        if scene_id in self._sources:
+            raise InputError(DOING, f"scene {scene_id!r}", f"both {self._sources[scene_id]} and {source} have this id", "remove one")
+        self._sources[scene_id] = source
+
+
+class UnknownScene(InputError):
+    """A scene id that the server does not know."""
+
+
+def sources_in(place: str | Path) -> list[str | Path]:
+    """Return the scene files of a folder, or the place itself where it is a file, a recorded log or a shipped name.
+
+    Raises:
+        InputError: A folder without a scene.
+    """
+    folder = Path(place)
+    if not folder.is_dir():
+        return [place]
+    files: list[str | Path] = [path for path in sorted(folder.iterdir()) if path.suffix in FILES and path.is_file()]
+    if files:
+        return files
+    logs: list[str | Path] = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    if not logs:
+        do = "name a folder with scenes, a file or a shipped scenario"
+        raise InputError(DOING, str(place), f"no {', '.join(FILES)} and no recorded log", do)
+    return logs
+
+
+def advertised(scenario: Scenario) -> list[sensorsim_pb2.AvailableCamerasReturn.AvailableCamera]:
+    """Return a scene's cameras; a single camera also under the name that AlpaSim's presets use for the front one."""
+    cameras = [wire_camera(camera) for camera in scenario.cameras]
+    if cameras and all(camera.logical_id != FRONT_WIDE for camera in cameras):
+        front = next((camera for camera in cameras if camera.logical_id == "front"), cameras[0])
+        twin = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera()
+        twin.CopyFrom(front)
+        twin.logical_id = twin.intrinsics.logical_id = FRONT_WIDE
+        cameras.append(twin)
+    return cameras
+
+

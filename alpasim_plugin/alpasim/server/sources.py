@@ -1,0 +1,251 @@
+"""Where frames come from before they are fixed: our own renderer, or any server of AlpaSim's renderer service."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import grpc
+import numpy as np
+
+from alpasim_plugin.alpasim.server import reliability
+from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
+from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf
+from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
+from alpasim_plugin.alpasim.server.views import View
+from alpasim_plugin.alpasim.wire import sensorsim_pb2
+from alpasim_plugin.errors import InputError, SimrunError
+from alpasim_plugin.geometry import interpolate, inverse
+from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.schema import read_trajectory, read_transform
+from alpasim_plugin.runtime.guards import checked_frames
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.layers import actor_boxes
+from alpasim_plugin.types import F64, U8, CameraSpec, Frame, RenderRequest
+
+DOING = "rendering a requested frame"
+Request = sensorsim_pb2.RGBRenderRequest
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A frame before it is fixed, with its semantic map where the fixer takes one."""
+
+    frame: Frame
+    sdmap: U8 | None
+
+
+class FrameSource(Protocol):
+    """Gives frames for requests."""
+
+    def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
+        """Return one frame a request, in order."""
+
+
+def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
+    """Return every road user's box pose at shutter end: those of the request, and the scene's static ones, which requests leave out.
+
+    Raises:
+        InputError: A track that the scene does not have.
+    """
+    known = {actor.actor_id: actor for actor in entry.scenario.actors}
+    foreign = sorted(set(view.objects) - set(known))
+    if foreign:
+        found = f"track {foreign[0]!r}" + (f" and {len(foreign) - 1} more" if len(foreign) > 1 else "")
+        do = "render with the scene file that the runtime uses"
+        raise InputError(DOING, f"scene {view.scene_id!r}", f"{found}, not in the scene", do)
+    poses = {}
+    for actor_id, actor in known.items():
+        if actor.is_static and actor_id not in view.objects and actor.track.t_us[0] <= view.t_us <= actor.track.t_us[-1]:
+            poses[actor_id] = interpolate(actor.track, view.t_us)
+    return poses | {track: pair[1] for track, pair in view.objects.items()}
+
+
+def drawn_map(entry: SceneEntry, view: View, lens: Lens, camera: CameraSpec, threads: int | None) -> U8 | None:
+    """Return the semantic map as the lens sees it; None where the fixer takes none."""
+    if entry.scene_map is None:
+        return None
+    boxes = actor_boxes(boxes_at(entry, view), entry.scenario.actors)
+    return lens.image(draw_map(entry.scene_map, camera, view.T_world_camera[1], boxes, threads=threads))
+
+
+class LocalSource:
+    """Render scenes here, through the lens of the request, at the pose of the shutter's end.
+
+    Args:
+        shelf: Scenes with their renderers.
+        busy: Held while something is computed: renderers are no more than one at a time.
+        threads: Threads of the map rasteriser.
+    """
+
+    def __init__(self, shelf: SceneShelf, busy: threading.Lock, threads: int | None = None) -> None:
+        self._shelf, self._busy, self._threads = shelf, busy, threads
+
+    def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
+        """Return one frame a request, in order.
+
+        Raises:
+            InputError: A lens or a track that cannot be rendered; an unknown scene.
+            RendererError: The renderer broke its contract.
+        """
+        return [self._render(request, view, left) for request, view in zip(requests, views, strict=True)]
+
+    def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
+        lens = read_lens(request.camera_intrinsics, view.width, view.height)
+        entry = self._shelf.get(view.scene_id)
+        assert entry.renderer is not None, "a shelf without a renderer serves maps only"
+        camera = lens.spec(view.camera, mount_of(entry, view), view.t_us - view.start_us)
+        asked = RenderRequest(view.t_us, camera, view.T_world_camera, boxes_at(entry, view))
+        with left.holding(self._busy):
+            frame = checked_frames(entry.renderer, [asked])[0]
+            sdmap = drawn_map(entry, view, lens, camera, self._threads)
+        return Rendered(lens.frame(frame), sdmap)
+
+
+class UpstreamSource:
+    """Ask another server of the renderer service, and estimate how far its frames can be trusted.
+
+    Args:
+        stub: Of ``SensorsimService`` at the upstream.
+        shelf: Scenes for maps and recorded paths; None: no map, and the path is asked of the upstream.
+        trust: A fixed reliability from 0 to 1; None: from the distance to the recorded path (`reliability`).
+        masks: Grey masks by camera.
+        as_png: Ask for PNG whatever the caller asked for, so that the picture is not compressed twice.
+        threads: Threads of the map rasteriser.
+    """
+
+    def __init__(
+        self,
+        stub: Any,
+        shelf: SceneShelf | None,
+        trust: float | None = None,
+        masks: Mapping[str, U8] | None = None,
+        as_png: bool = True,
+        threads: int | None = None,
+    ) -> None:
+        self._stub, self._shelf, self._trust, self._masks = stub, shelf, trust, masks or {}
+        self._as_png, self._threads, self._has_batch = as_png, threads, True
+        self._paths: dict[str, F64] = {}
+        self._mounts: dict[tuple[str, str], F64] = {}
+
+    def render(self, requests: Sequence[Request], views: Sequence[View], left: CallTime) -> list[Rendered]:
+        """Return one frame a request, in order.
+
+        Raises:
+            grpc.RpcError: The upstream failed.
+            UpstreamFault: It sent no picture, or another number of them.
+            InputError: An unknown scene, or no recorded path to estimate the reliability from.
+        """
+        cameras = [view.camera for view in views]
+        names = cameras if len(set(cameras)) == len(cameras) else [str(i) for i in range(len(cameras))]
+        images = self._images([self._asked(request) for request in requests], names, left)
+        return [self._rendered(request, view, data, left) for request, view, data in zip(requests, views, images, strict=True)]
+
+    def _asked(self, request: Request) -> Request:
+        if not self._as_png:
+            return request
+        asked = Request()
+        asked.CopyFrom(request)  # fields of newer versions are kept
+        asked.image_format = sensorsim_pb2.PNG
+        return asked
+
+    def _images(self, requests: Sequence[Request], names: Sequence[str], left: CallTime) -> list[bytes]:
+        if len(requests) > 1 and self._has_batch:
+            item = sensorsim_pb2.BatchRGBRenderRequestItem
+            batch = sensorsim_pb2.BatchRGBRenderRequest(
+                items=[item(camera_name=n, request=r) for n, r in zip(names, requests, strict=True)]
+            )
+            try:
+                reply = self._stub.batch_render_rgb(batch, timeout=left.left_s())
+            except grpc.RpcError as error:
+                if error.code() != grpc.StatusCode.UNIMPLEMENTED:
+                    raise
+                self._has_batch = False  # older servers have render_rgb alone
+            else:
+                return batch_images(reply, names)
+        return [self._stub.render_rgb(request, timeout=left.left_s()).image_bytes for request in requests]
+
+    def _rendered(self, request: Request, view: View, data: bytes, left: CallTime) -> Rendered:
+        rgb = decoded(data, f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us")
+        height, width = rgb.shape[:2]
+        alpha = reliability.opacity(self._trust_in(view, left), self._masks.get(view.camera), height, width)
+        sdmap = None
+        if self._shelf is not None:
+            entry = self._shelf.get(view.scene_id)
+            lens = read_lens(without_windshield(request.camera_intrinsics), width, height)
+            sdmap = drawn_map(entry, view, lens, lens.spec(view.camera, np.eye(4)), self._threads)
+        return Rendered(Frame(view.t_us, view.camera, rgb, alpha), sdmap)
+
+    def _trust_in(self, view: View, left: CallTime) -> float:
+        if self._trust is not None:
+            return self._trust
+        T_world_rig = view.T_world_camera[1] @ inverse(self._mount(view, left))
+        return reliability.path_reliability(self._path(view, left), T_world_rig[:2, 3])
+
+    def _path(self, view: View, left: CallTime) -> F64:
+        if view.scene_id not in self._paths:
+            if self._shelf is not None:
+                path = self._shelf.get(view.scene_id).scenario.ego_log.xyz
+            else:
+                asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=view.scene_id)
+                listed = self._stub.get_available_trajectories(asked, timeout=left.left_s()).available_trajectories
+                if not listed or len(listed[0].trajectory.poses) < 2:
+                    do = "give --scenes with the scene's file, or a fixed --reliability"
+                    raise InputError(reliability.DOING, f"scene {view.scene_id!r}", "the upstream lists no recorded path", do)
+                path = read_trajectory(listed[0].trajectory, f"recorded path of scene {view.scene_id!r}").xyz
+            self._paths[view.scene_id] = path[:, :2]
+        return self._paths[view.scene_id]
+
+    def _mount(self, view: View, left: CallTime) -> F64:
+        key = view.scene_id, view.camera
+        if key not in self._mounts:
+            asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=view.scene_id)
+            for camera in self._stub.get_available_cameras(asked, timeout=left.left_s()).available_cameras:
+                self._mounts[view.scene_id, camera.logical_id] = read_transform(camera.rig_to_camera, f"mount of {camera.logical_id!r}")
+            self._mounts.setdefault(key, np.eye(4))  # a camera of the runtime's own: its place counts instead of the rig's
+        return self._mounts[key]
+
+
+def mount_of(entry: SceneEntry, view: View) -> F64:
+    """Return the mounting of a scene's camera of that name, else of its first: renderers that follow the recorded path want the rig."""
+    cameras = {camera.name: camera for camera in entry.scenario.cameras}
+    return cameras.get(view.camera, entry.scenario.cameras[0]).T_rig_camera
+
+
+def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]) -> list[bytes]:
+    """Return the pictures of a batch in the order of ``names``.
+
+    Raises:
+        UpstreamFault: A picture is missing, there twice, or marked as failed.
+    """
+    found = {item.camera_name: item for item in reply.items}
+    bad = [item.error_message or f"item {item.camera_name!r} has success = false" for item in reply.items if not item.success]
+    if bad or len(reply.items) != len(names) or set(found) != set(names):
+        what = bad[0] if bad else f"{len(reply.items)} items for {len(names)}"
+        raise UpstreamFault(DOING, "the upstream's batch", what, "see the upstream's log")
+    return [found[name].result.image_bytes for name in names]
+
+
+def decoded(data: bytes, what: str) -> U8:
+    """Decode an upstream's picture.
+
+    Raises:
+        UpstreamFault: It is not whole.
+    """
+    whole = data.rstrip(b"\0").endswith(b"\xff\xd9") if data[:2] == b"\xff\xd8" else b"IEND" in data[-16:]
+    try:
+        if not whole:
+            raise InputError(DOING, what, f"{len(data)} bytes that are no whole PNG or JPEG", "see the upstream's log")
+        return decode_image(data, what)
+    except SimrunError as error:
+        raise UpstreamFault(DOING, what, f"the upstream's picture: {error.found}", "see the upstream's log") from error
+
+
+def without_windshield(spec: sensorsim_pb2.CameraSpec) -> sensorsim_pb2.CameraSpec:
+    """Return intrinsics without the windshield's bending: the semantic map is drawn without it."""
+    out = sensorsim_pb2.CameraSpec()
+    out.CopyFrom(spec)
+    out.ClearField("bivariate_windshield_model_param")
+    return out

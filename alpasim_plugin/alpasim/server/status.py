@@ -1,0 +1,120 @@
+"""Errors as gRPC statuses that AlpaSim's runtime treats rightly, and the time a call has left.
+
+The runtime retries a render on UNAVAILABLE, and on a text with "Stopped waiting for backend"; anything else fails the rollout. So what
+may pass (an upstream that is away, busy, or sent a broken picture) is UNAVAILABLE, and what would fail again is not.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any
+
+import grpc
+
+from alpasim_plugin.alpasim.server.scenes import UnknownScene
+from alpasim_plugin.errors import InfrastructureError, InputError, SimrunError
+
+Code = grpc.StatusCode
+BACKEND = "Stopped waiting for backend"
+#: Statuses of an upstream that a second attempt may not meet again.
+PASSING = (Code.UNAVAILABLE, Code.RESOURCE_EXHAUSTED, Code.ABORTED, Code.CANCELLED, Code.DEADLINE_EXCEEDED)
+BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
+POLL_S = 0.1
+
+
+class UpstreamFault(InfrastructureError):
+    """The upstream sent something unusable; another attempt may go well."""
+
+
+class Late(Exception):
+    """The caller is gone, or its time is over."""
+
+
+class CallTime:
+    """How long a call may still take.
+
+    Args:
+        context: The server's context of the call; None: for ever.
+    """
+
+    def __init__(self, context: Any = None) -> None:
+        self._context = context
+        left = context.time_remaining() if context is not None else None
+        self._end_s: float | None = None if left is None or left > 1e6 else time.monotonic() + left
+
+    def left_s(self) -> float | None:
+        """Return the seconds left; None: no limit.
+
+        Raises:
+            Late: None are left, or the caller is gone.
+        """
+        if self._context is not None and not self._context.is_active():
+            raise Late("the caller is gone")
+        if self._end_s is None:
+            return None
+        left: float = self._end_s - time.monotonic()
+        if left <= 0:
+            raise Late("the deadline has passed")
+        return left
+
+    @contextmanager
+    def holding(self, lock: threading.Lock) -> Iterator[None]:
+        """Hold a lock; waiting ends with the call's time."""
+        while True:
+            left = self.left_s()
+            if lock.acquire(timeout=POLL_S if left is None else min(left, POLL_S)):
+                break
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def wait(self, event: threading.Event) -> None:
+        """Wait for an event; waiting ends with the call's time."""
+        while not event.wait(POLL_S):
+            self.left_s()
+
+
+def status_of(error: Exception) -> tuple[Any, str]:
+    """Return the status and text that a caller gets for an error."""
+    if isinstance(error, grpc.RpcError):
+        code, text = error.code(), error.details() or ""
+        if BACKEND in text:
+            return code, text
+        passing = code in PASSING or (code in (Code.UNKNOWN, Code.INTERNAL) and any(sign in text for sign in BROKEN_TRANSPORT))
+        return (Code.UNAVAILABLE if passing else code), f"upstream: {code.name}: {text}"
+    if isinstance(error, Late):
+        return Code.CANCELLED, str(error)
+    if isinstance(error, UnknownScene):
+        return Code.NOT_FOUND, one_line(error)
+    if isinstance(error, UpstreamFault):
+        return Code.UNAVAILABLE, one_line(error)
+    if isinstance(error, InputError):
+        return Code.INVALID_ARGUMENT, one_line(error)
+    if isinstance(error, SimrunError):
+        return Code.INTERNAL, one_line(error)
+    return Code.INTERNAL, f"{type(error).__name__}: {error}"
+
+
+def one_line(error: SimrunError) -> str:
+    """Return an error's four parts in one line."""
+    return f"{error.doing}: {error.with_what}: {error.found}; {error.do_this}"
+
+
+def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
+    """Make a service's method answer errors as statuses; unexpected ones are handed to the service's ``unexpected``."""
+
+    @wraps(call)
+    def answer(self: Any, request: Any, context: Any) -> Any:
+        try:
+            return call(self, request, context)
+        except Exception as error:
+            code, text = status_of(error)
+            self.failed(call.__name__, code, text, error)
+            context.abort(code, text)
+
+    return answer

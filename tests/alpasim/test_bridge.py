@@ -1,0 +1,133 @@
+"""The thin distribution for AlpaSim's environment: built from this checkout, installed beside packages with AlpaSim's pins, and used."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+import yaml
+
+from alpasim_plugin.alpasim.bridge import build as building
+from alpasim_plugin.alpasim.bridge import check
+from alpasim_plugin.alpasim.bridge.client import RendererClient
+from alpasim_plugin.alpasim.server.hosting import Host
+from alpasim_plugin.alpasim.wire import sensorsim_pb2
+from tests.alpasim.service_cases import CAMERA, StandInRenderer, drive, hosted
+from tests.alpasim.test_wire_generated import environment
+
+# AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio 1.62.3.
+PINS = ("protobuf>=4.25,<5", "grpcio==1.62.3", "numpy>=2,<2.3", "hydra-core")
+USING = """
+import sys
+from importlib import metadata
+from google.protobuf import descriptor_pb2, descriptor_pool
+foreign = descriptor_pb2.FileDescriptorProto(name="alpasim_grpc/v0/common.proto", package="common")
+foreign.message_type.add(name="Vec3")
+descriptor_pool.Default().AddSerializedFile(foreign.SerializeToString())
+from alpasim_onefixer_bridge.client.check import main
+(entry,) = metadata.entry_points(group="alpasim.configs")
+assert entry.name == "onefixer" and entry.load().__name__ == entry.value
+from hydra import compose, initialize_config_module
+with initialize_config_module(version_base=None, config_module=entry.value):
+    assert compose("renderer/onefixer").runtime.renderer.kind == "sensorsim"
+code = main([sys.argv[1]])
+assert not {"torch", "numba", "av", "alpasim_plugin"} & set(sys.modules), sys.modules.keys()
+sys.exit(code)
+"""
+
+
+@pytest.fixture(scope="module")
+def staged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bridge")
+    building.stage(folder)
+    return folder
+
+
+def test_the_bridge_imports_nothing_heavy_and_nothing_of_the_project(staged: Path) -> None:
+    allowed = {"grpc", "google", "__future__", *sys.stdlib_module_names}
+    modules = [path for path in staged.rglob("*.py") if not path.name.endswith("_pb2.py")]
+    assert len(modules) >= 8
+    for path in modules:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
+            assert {name.split(".")[0] for name in names} <= allowed, path
+
+
+def test_presets_are_of_the_group_renderer_and_name_one_endpoint(staged: Path) -> None:
+    presets = sorted((staged / building.PACKAGE / "configs" / "renderer").glob("*.yaml"))
+    kinds = {}
+    for path in presets:
+        assert path.read_text().startswith("# @package _global_\n")
+        preset = yaml.safe_load(path.read_text())
+        kinds[path.stem] = preset["runtime"]["renderer"]["kind"]
+        assert len(preset["wizard"]["external_services"]["renderer"]) == 1
+        assert preset["runtime"]["endpoints"]["physics"]["skip"]
+        assert preset["runtime"]["simulation_config"]["physics_update_mode"] == "NONE"
+    assert kinds == {"onefixer": "sensorsim", "onefixer_world_model": "video_model"}
+
+
+def test_the_client_asks_again_only_after_what_may_pass(upstream: Host, renderer: StandInRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("alpasim_plugin.alpasim.bridge.client.PAUSES_S", (0.0, 0.0))
+    frame, seen = drive(1)[0], []
+
+    def fault(code: Any, text: str, times: int) -> Any:
+        def answer(asked: Any, context: Any, data: bytes) -> bytes:
+            seen.append(code)
+            return data if len(seen) > times else context.abort(code, text)
+
+        seen.clear()
+        return answer
+
+    with RendererClient(upstream.address) as client:
+        renderer.fault = fault(grpc.StatusCode.UNAVAILABLE, "away", 2)
+        assert list(client.render([frame])) == [CAMERA]
+        renderer.fault = fault(grpc.StatusCode.DEADLINE_EXCEEDED, "Stopped waiting for backend", 2)
+        assert list(client.render([frame])) == [CAMERA]
+        for code, text, times, calls in ((grpc.StatusCode.UNAVAILABLE, "away", 9, 3), (grpc.StatusCode.UNKNOWN, "broken", 9, 1)):
+            renderer.fault = fault(code, text, times)
+            with pytest.raises(grpc.RpcError, match=text):
+                client.render([frame])
+            assert len(seen) == calls
+
+
+@pytest.mark.parametrize("items", [0, 1])
+def test_the_client_refuses_what_the_runtime_refuses(items: int) -> None:
+    """No item for a camera, or one without success."""
+
+    class Refused(StandInRenderer):
+        def batch_render_rgb(self, asked: Any, context: Any) -> sensorsim_pb2.BatchRGBRenderReturn:
+            item = sensorsim_pb2.BatchRGBRenderReturnItem(camera_name=CAMERA)
+            return sensorsim_pb2.BatchRGBRenderReturn(items=[item][:items])
+
+    with hosted({"SensorsimService": Refused()}) as host, RendererClient(host.address) as client:
+        frames = drive(1)
+        with pytest.raises(ValueError, match="answered"):
+            client.render(frames)
+
+
+def test_the_check_prints_what_a_service_is(upstream: Host, capsys: pytest.CaptureFixture[str]) -> None:
+    assert check.main([upstream.address, "scene"]) == 0
+    out = capsys.readouterr().out
+    assert "version stand-in" in out
+    assert f"camera  {CAMERA}: 48 x 32, opencv_pinhole_param" in out
+    assert check.main([]) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(upstream: Host, tmp_path: Path) -> None:
+    wheel = building.build(tmp_path / "dist")
+    python = environment(tmp_path / "venv", *PINS)
+    subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True)
+    versions = subprocess.run([python, "-m", "pip", "list", "--format=freeze"], check=True, capture_output=True, text=True).stdout
+    assert "protobuf==4.25" in versions
+    assert "grpcio==1.62.3" in versions
+    done = subprocess.run([python, "-c", USING, upstream.address], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "version stand-in" in done.stdout

@@ -1,0 +1,140 @@
+"""The renderer service with our own renderer: what the request says is what is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, assemble
+from alpasim_plugin.alpasim.server.scenes import FRONT_WIDE
+from alpasim_plugin.alpasim.server.views import read_view
+from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire.services import Stub
+from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.log.images import decode_image
+from alpasim_plugin.log.schema import wire_pose
+from alpasim_plugin.renderers.gaussian import CleanRenderer
+from alpasim_plugin.types import F64, RenderRequest
+from scenarios.load import load_scenario
+from tests.alpasim.service_cases import answers, channel_to, hosted, in_front_of, pinhole
+
+SCENE = "smoke/lead_car"
+W, H = 64, 36
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[tuple[Any, Assembled]]:
+    made = assemble(Settings(renderer="clean", scenes=[SCENE], threads=1))
+    with hosted({"SensorsimService": made.service}) as host, channel_to(host) as channel:
+        yield Stub(channel, "SensorsimService"), made
+
+
+def ask(t_s: float = 1.0, spec: sensorsim_pb2.CameraSpec | None = None) -> sensorsim_pb2.RGBRenderRequest:
+    """Return the request for the recorded pose after a time, with the first moving car."""
+    scenario = load_scenario(SCENE)
+    t_us = scenario.start_us + int(t_s * 1e6)
+    pose: F64 = interpolate(scenario.ego_log, t_us) @ scenario.cameras[0].T_rig_camera
+    pair = sensorsim_pb2.PosePair(start_pose=wire_pose(pose, "a test"), end_pose=wire_pose(pose, "a test"))
+    asked = sensorsim_pb2.RGBRenderRequest(
+        scene_id=scenario.scene_id, resolution_w=W, resolution_h=H, camera_intrinsics=spec or pinhole(W, H, "front"),
+        frame_start_us=t_us - 30_000, frame_end_us=t_us, sensor_pose=pair, image_format=sensorsim_pb2.PNG,
+    )  # fmt: skip
+    for actor in scenario.actors:
+        if not actor.is_static:
+            box = wire_pose(interpolate(actor.track, t_us), "a test")
+            asked.dynamic_objects.add(track_id=actor.actor_id, pose_pair=sensorsim_pb2.PosePair(start_pose=box, end_pose=box))
+    return asked
+
+
+def test_a_frame_equals_the_renderers_own_at_the_pose_of_the_wire(served: tuple[Any, Assembled]) -> None:
+    asked, scenario = ask(), load_scenario(SCENE)
+    view = read_view(asked)
+    camera = replace(scenario.cameras[0], name="front", width=W, height=H, K=np.array([[40.0, 0, 32], [0, 40, 18], [0, 0, 1]]))
+    boxes = {track: pair[1] for track, pair in view.objects.items()}
+    direct = CleanRenderer(scenario, 0, "cpu", 1).render(RenderRequest(view.t_us, camera, view.T_world_camera, boxes))
+    (data,) = answers(served[0], [asked])
+    np.testing.assert_array_equal(decode_image(data), direct.rgb)
+
+
+def test_a_moved_object_and_another_lens_are_seen(served: tuple[Any, Assembled]) -> None:
+    asked = ask()
+    (before,) = answers(served[0], [asked])
+    for o in asked.dynamic_objects:
+        o.pose_pair.end_pose.vec.z -= 100.0  # as the runtime hides an actor
+    (hidden,) = answers(served[0], [asked])
+    assert hidden != before
+    lens = sensorsim_pb2.FthetaCameraParam(principal_point_x=32, principal_point_y=18, angle_to_pixeldist_poly=[0.0, 40.0, 0.0, 0.0])
+    lens.reference_poly = sensorsim_pb2.FthetaCameraParam.ANGLE_TO_PIXELDIST
+    round_lens = sensorsim_pb2.CameraSpec(ftheta_param=lens, logical_id="front", resolution_w=W, resolution_h=H)
+    (bent,) = answers(served[0], [ask(spec=round_lens)])
+    centre = np.s_[14:22, 26:38]  # within 0.15 rad of the axis the lenses agree to a quarter of a pixel
+    a, b = (decode_image(x)[centre].astype(int) for x in (before, bent))
+    assert np.abs(a - b).mean() < 6
+    assert before != bent
+
+
+def test_questions_about_scenes_are_answered(served: tuple[Any, Assembled]) -> None:
+    stub, made = served
+    (scene_id,) = stub.get_available_scenes(common_pb2.Empty()).scene_ids
+    cameras = stub.get_available_cameras(sensorsim_pb2.AvailableCamerasRequest(scene_id=scene_id)).available_cameras
+    assert [camera.logical_id for camera in cameras] == ["front", FRONT_WIDE]
+    assert cameras[0].rig_to_camera == cameras[1].rig_to_camera
+    assert cameras[1].intrinsics.logical_id == FRONT_WIDE
+    assert stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id=scene_id)) == common_pb2.Empty()
+    assert [s.scene_id for s in stub.get_loaded_scenes(common_pb2.Empty()).scenes] == [scene_id]
+    asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=scene_id)
+    path = stub.get_available_trajectories(asked).available_trajectories[0].trajectory
+    assert len(path.poses) == len(load_scenario(SCENE).ego_log)
+    assert not stub.get_available_ego_masks(common_pb2.Empty()).ego_mask_metadata
+    assert "clean" in stub.get_version(common_pb2.Empty()).version_id
+    assert made.fixers is None
+
+
+@pytest.mark.parametrize(
+    ("call", "code", "found"),
+    [
+        (lambda stub: stub.render_rgb(changed(scene_id="other")), "NOT_FOUND", "none of the 1 known"),
+        (lambda stub: stub.prefetch_scene(sensorsim_pb2.ScenePrefetchRequest(scene_id="other")), "NOT_FOUND", "none of the 1 known"),
+        (lambda stub: stub.render_rgb(changed(track="ghost")), "INVALID_ARGUMENT", "'ghost', not in the scene"),
+        (lambda stub: stub.render_lidar(sensorsim_pb2.LidarRenderRequest()), "UNIMPLEMENTED", "needs an --upstream"),
+    ],
+)
+def test_what_is_not_here_is_refused_with_a_reason(served: tuple[Any, Assembled], call: Any, code: str, found: str) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        call(served[0])
+    assert caught.value.code().name == code
+    assert found in caught.value.details()
+
+
+def changed(scene_id: str | None = None, track: str | None = None) -> sensorsim_pb2.RGBRenderRequest:
+    asked = ask()
+    if scene_id is not None:
+        asked.scene_id = scene_id
+    if track is not None:
+        asked.dynamic_objects.add(track_id=track, pose_pair=asked.sensor_pose)
+    return asked
+
+
+@pytest.mark.slow
+def test_our_own_service_behind_the_fixer_equals_both_in_one(served: tuple[Any, Assembled], overrides: list[str], tmp_path: Path) -> None:
+    """Upstream and fixer in two servers give the pictures of one server where the upstream is fully trusted and has no holes."""
+    _, behind = served
+    both = assemble(Settings(renderer="onefixer+clean", overrides=overrides, scenes=[SCENE], threads=1))
+    frames = [ask(1.0 + 0.1 * i) for i in range(3)]
+    with hosted({"SensorsimService": both.service}) as host, channel_to(host) as channel:
+        one = answers(Stub(channel, "SensorsimService"), frames)
+    with (
+        hosted({"SensorsimService": behind.service}) as upstream,
+        in_front_of(upstream, overrides=overrides, scenes=[SCENE], reliability=1.0) as (stub, made),
+    ):
+        two = answers(stub, frames)
+        assert stub.get_available_scenes(common_pb2.Empty()).scene_ids == [frames[0].scene_id]
+        assert made.fixers is not None
+        assert made.fixers.needs_map
+    assert one == two

@@ -1,0 +1,63 @@
+"""The command itself, as a process: it says where it listens, serves, and ends well on a signal. And the commands of its page."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import grpc
+import pytest
+import typer.main
+
+from alpasim_plugin.alpasim.server.hosting import Host
+from alpasim_plugin.alpasim.wire import common_pb2
+from alpasim_plugin.alpasim.wire.services import Stub, methods
+from alpasim_plugin.cli.main import make_app
+from tests.alpasim.service_cases import answers, drive
+
+
+def test_the_command_serves_until_it_is_stopped(upstream: Host) -> None:
+    command = [sys.executable, "-m", "alpasim_plugin.cli.main", "serve", "--listen", "127.0.0.1:0", "--renderer", "identity", "--json"]
+    with subprocess.Popen([*command, "--upstream", upstream.address], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        opened = json.loads(process.stdout.readline())
+        with grpc.insecure_channel(opened["at"]) as channel:
+            stub = Stub(channel, "SensorsimService")
+            assert "identity" in stub.get_version(common_pb2.Empty(), timeout=60, wait_for_ready=True).version_id
+            assert len(answers(stub, drive(2))) == 2
+        process.send_signal(signal.SIGTERM)
+        counts = json.loads(process.stdout.readline())
+        assert process.wait(30) == 0
+    assert opened["serving"] == ["SensorsimService"]
+    assert counts["failed"] == {}
+
+
+def test_the_commands_of_the_page_are_valid(repo: Path) -> None:
+    """Every `simrun` line of the page parses; files and addresses in it are not touched."""
+    page = (repo / "docs" / "alpasim.md").read_text()
+    lines = [line.partition("#")[0] for block in re.findall(r"```bash\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
+    commands = [shlex.split(line)[1:] for line in lines if line.startswith("simrun ")]
+    assert len(commands) >= 4
+    for verb, *rest in commands:
+        command = typer.main.get_command(make_app(verb))
+        context = command.make_context("simrun", [verb, *rest], resilient_parsing=False)
+        one = command.get_command(context, verb)
+        while hasattr(one, "get_command"):
+            one, rest = one.get_command(context, rest[0]), rest[1:]
+        one.make_context(verb, list(rest))
+    modules = re.findall(r"python -m (alpasim_plugin[\w.]+)", page)
+    assert modules
+    for module in modules:
+        assert (repo / (module.replace(".", "/") + ".py")).is_file()
+
+
+@pytest.mark.parametrize("names", [("SensorsimService", "WorldModelService")])
+def test_the_page_lists_every_call_that_is_served(repo: Path, names: tuple[str, ...]) -> None:
+    page = (repo / "docs" / "alpasim.md").read_text()
+    assert [name for name in methods(names[0]) if f"`{name}`" not in page] == []
+    assert f"`{names[1]}`" in page
