@@ -22,7 +22,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
-from alpasim_plugin.types import F64, I64, U8, Actor, RenderRequest, Scenario
+from alpasim_plugin.types import F64, U8, Actor, RenderRequest, Scenario
 
 DOING = "previewing a scenario"
 MARGIN_M = 15.0
@@ -73,7 +73,7 @@ def draw_preview(scenario: Scenario, path: Path, frames: int = 5, renderer: str 
     return Preview(tuple(round((t - times[0]) * 1e-6, 3) for t in times), len(there), facts)
 
 
-def _camera_frames(scenario: Scenario, times: I64, renderer: str) -> list[U8]:
+def _camera_frames(scenario: Scenario, times: Sequence[int], renderer: str) -> list[U8]:
     """Render the first camera along the recorded drive."""
     session, camera = make_renderer(renderer, scenario), scenario.cameras[0]
     images = []
@@ -109,7 +109,7 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _figure(scenario: Scenario, there: Sequence[Actor], times: I64, images: Sequence[U8], facts: Sequence[str]) -> bytes:
+def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], images: Sequence[U8], facts: Sequence[str]) -> bytes:
     start = interpolate(scenario.ego_log, np.array([times[0], times[-1]]))[:, :2, 3]
     chord = start[1] - start[0]
     turn = np.arctan2(chord[1], chord[0]) if np.hypot(*chord) > 1.0 else yaw_of(interpolate(scenario.ego_log, np.array([times[0]]))[0])
@@ -159,7 +159,7 @@ def _draw_road(axes: Axes, scenario: Scenario, place: Any) -> None:
     axes.add_collection(LineCollection([place(edge) for edge in scenario.lane_map.road_edges], colors=EDGE, linewidths=1.1, zorder=2))
 
 
-def _draw_users(axes: Axes, scenario: Scenario, there: Sequence[Actor], times: I64, place: Any, turn: float) -> None:
+def _draw_users(axes: Axes, scenario: Scenario, there: Sequence[Actor], times: Sequence[int], place: Any, turn: float) -> None:
     """Draw ways as lines and bodies at each moment, later ones darker; the ego last."""
     log, vehicle = scenario.ego_log, scenario.vehicle
     shades = np.linspace(0.25, 0.95, len(times))
