@@ -188,7 +188,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
         _rates(spec), start, end, spec.timing.warmup_us, Latency(**spec.latency.model_dump()), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
         _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map, kind,
-        spec.timing.stop_at_path_end,
+        stop_at_path_end=spec.timing.stop_at_path_end,
     )  # fmt: skip
 
 

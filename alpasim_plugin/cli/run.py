@@ -23,6 +23,7 @@ from alpasim_plugin.stopping import Stopped
 from evaluators import PRESETS
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 from evaluators.report.run_folder import read_run
+from scenarios.library import shipped_names
 from scenarios.suite import expand
 
 FIXER_PREFIX = "fixer."
@@ -202,7 +203,14 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     for line in ending_lines(run):
         print(line)
     print(report_line(result.root))
-    print(next_line(run))
+    print(_by_name(next_line(run)))
+
+
+def _by_name(line: str) -> str:
+    """Write the paths of shipped scenarios as their names."""
+    for name, path in shipped_names().items():
+        line = line.replace(str(path.absolute()), name)
+    return line
 
 
 def _failed_line(result: RunResult) -> str:

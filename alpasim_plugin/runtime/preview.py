@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 
 from alpasim_plugin.atomic import write_bytes
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
@@ -80,7 +79,9 @@ def _camera_frames(scenario: Scenario, times: Sequence[int], renderer: str) -> l
     images = []
     for t_us in times:
         pose = interpolate(scenario.ego_log, np.array([t_us]))[0] @ camera.T_rig_camera
-        request = RenderRequest(int(t_us), camera, np.stack([pose, pose]), log_actors(scenario, int(t_us)))
+        there = (a for a in scenario.actors if a.track.t_us[0] <= t_us <= a.track.t_us[-1])
+        poses = {actor.actor_id: interpolate(actor.track, int(t_us)) for actor in there}
+        request = RenderRequest(int(t_us), camera, np.stack([pose, pose]), poses)
         images.append(checked_frames(session, [request])[0].rgb)
     return images
 

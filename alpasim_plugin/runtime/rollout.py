@@ -68,7 +68,7 @@ def run_rollout(
         requests = rig.requests(tick, state.history, others)
         with recorder.rendering(renderer, len(requests)):
             frames = checked_frames(renderer, requests)
-        if frames:
+        if frames and not watched:
             plans.frames(tick.t_us, renderer.stage_ms)
         for frame, request in zip(frames, requests, strict=True):
             if frame.camera in seen:

@@ -24,7 +24,7 @@ WORDS = {
     "collision_at_fault": "at-fault collisions",
     "collision_any": "collisions",
     "offroad": "off-road rollouts",
-    "lateral_distance_m": "distance to the side of the logged path",
+    "lateral_distance_m": "lateral distance",
     "route_distance_m": "route distance",
     "progress": "progress",
 }
@@ -157,18 +157,18 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
         worse,
         better,
         _baseline(pairs),
-        _lead(run, variant, pairs, moved),
+        _lead(run, variant, pairs, lead),
     )
 
 
-def _lead(run: Run, variant: str, pairs: Mapping[str, Any], moved: Sequence[str]) -> str:
+def _lead(run: Run, variant: str, pairs: Mapping[str, Any], metrics: Sequence[str]) -> str:
     """Print the first difference that is shown; where none is, the one that is largest against its margin."""
-    shown = [m for m in moved if pairs[m].get("difference") in ("better", "worse")]
+    shown = [m for m in metrics if pairs[m].get("difference") in ("better", "worse")]
 
     def size(metric: str) -> float:
         return abs(float(pairs[metric]["diff"])) / max(finite(pairs[metric].get("margin")) or 0.0, 1e-3)
 
-    chosen = next(iter(shown), max(moved, key=size, default=None))
+    chosen = next(iter(shown), max(metrics, key=size, default=None))
     return "" if chosen is None else _difference(run, variant, chosen, pairs[chosen], brief=False)
 
 

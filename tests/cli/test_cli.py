@@ -120,7 +120,8 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path: Path, 
     command = [*GOOD, "--workers", "1", "--set", "timing.duration_us=1000000", "--out", str(tmp_path), "smoke/straight"]
     assert run_command(command) == 0
     captured = capsys.readouterr()
-    assert "route_distance_m" in captured.out
+    assert "lateral_distance_m" in captured.out
+    assert captured.out.splitlines()[-1].startswith("next     simrun --renderer clean,3dgs --policy log-replay --seeds 1 smoke/straight ")
     assert "report.html" in captured.out
     names = {"run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", "junit.xml", "report.html"}
     assert names <= {p.name for p in tmp_path.iterdir()}

@@ -71,7 +71,7 @@ def test_commands_do_not_need_the_checkout_nor_an_index() -> None:
         if page.parent.name == "experiments":
             continue
         for line in lines_of(page):
-            is_setup = (page.name == "README.md" and "pip install -q -e" in line) or ("real/" in line and ".venv/bin" in line)
+            is_setup = (page.name == "README.md" and "pip install -q -e" in line) or ("suites/first" in line and ".venv/bin" in line)
             is_command = SIMRUN.match(line) or OTHER.match(line)
             is_bound = re.search(r"\.venv/bin/simrun|configs/|pip install[^|&;]* alpasim-onefixer", line)
             if is_command and is_bound and not is_setup:

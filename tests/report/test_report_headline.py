@@ -45,7 +45,7 @@ def test_worse_in_one_and_better_in_another_is_mixed(usual_run: Path) -> None:
     pairs = {"3dgs": {"offroad": pair(0.2, 0.1, 0.3, "worse"), "lateral_distance_m": pair(-0.2, -0.3, -0.1, "better")}}
     finding = find(with_summary(usual_run, metrics=metrics, paired=pairs))
     assert finding.tone == "mixed"
-    assert "worse than clean in off-road rollouts and better in distance to the side of the logged path" in finding.title
+    assert "worse than clean in off-road rollouts and better in lateral distance" in finding.title
 
 
 def test_a_worse_renderer_is_not_hidden_by_a_better_one(usual_run: Path) -> None:

@@ -106,7 +106,7 @@ def test_charts_compare_renderers_only_where_there_are_two(usual_run: Path, tmp_
     assert [chart.title for chart in forest(run, variants)] == [
         f"{kind}, against {base}" for base in ("clean", "3dgs") for kind in ("Rates and shares", "Distances")
     ]
-    assert {chart.title for chart in speed_against_error(run, variants)} >= {"distance to the side of the logged path"}
+    assert {chart.title for chart in speed_against_error(run, variants)} >= {"lateral distance"}
     alone = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=30)))
     assert forest(alone, {"clean": 0}) == []
     assert speed_against_error(alone, {"clean": 0}) == []

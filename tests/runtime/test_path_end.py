@@ -90,9 +90,11 @@ def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
     assert {find_rollout_state(cell, tmp_path)[0] for cell in plan("strict").cells} == {"score"}
 
 
+@pytest.mark.parametrize("name", ["smoke/straight", "real/us101"])
 @pytest.mark.parametrize("stop", [True, False])
-def test_the_key_in_the_file_decides(stop: bool) -> None:
+def test_the_key_in_the_file_decides(stop: bool, name: str) -> None:
     override = () if stop else ("timing.stop_at_path_end=false",)
-    scenario = load_scenario("smoke/straight", overrides=override)
+    scenario = load_scenario(name, overrides=override)
     assert scenario.stop_at_path_end is stop
-    assert scenario.content_hash == load_scenario("smoke/straight").content_hash  # it is the same scene
+    assert scenario.varied == {}
+    assert scenario.content_hash == load_scenario(name).content_hash  # it is the same scene
