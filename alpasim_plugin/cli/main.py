@@ -35,6 +35,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
     "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
     "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),
+    "export": ("export", "export", "EPILOG", "Write a run as AlpaSim run folders and its scenes as .usdz; or scenes alone."),
     "list": (
         "listing", "list_parts", "EPILOG",
         "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",

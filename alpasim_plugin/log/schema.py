@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, sensorsim_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
-from alpasim_plugin.types import F64, Actor, Box, CameraSpec, EgoState, Scenario, Trajectory, Vehicle
+from alpasim_plugin.log.images import ImageEncoding
+from alpasim_plugin.types import F64, Actor, Box, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory, Vehicle
 
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
@@ -201,6 +202,39 @@ def wire_intrinsics(camera: CameraSpec) -> sensorsim_pb2.CameraSpec:
         resolution_w=camera.width,
         shutter_type=sensorsim_pb2.ROLLING_TOP_TO_BOTTOM if camera.shutter_us else sensorsim_pb2.GLOBAL,
     )
+
+
+def wire_render_request(scene_id: str, request: RenderRequest, encoding: ImageEncoding) -> sensorsim_pb2.RGBRenderRequest:
+    """Return the message of one frame to render."""
+    camera = request.camera
+    start, end = (wire_pose(T, f"pose of camera {camera.name!r}") for T in request.T_world_camera)
+    objects = []
+    if request.actors:
+        ids = sorted(request.actors)
+        stack = np.stack([request.actors[i] for i in ids])
+        poses = wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
+        pair = sensorsim_pb2.PosePair
+        objects = [
+            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p)) for i, p in zip(ids, poses, strict=True)
+        ]
+    return sensorsim_pb2.RGBRenderRequest(
+        scene_id=scene_id,
+        resolution_h=camera.height,
+        resolution_w=camera.width,
+        camera_intrinsics=wire_intrinsics(camera),
+        frame_start_us=request.t_us - camera.shutter_us,
+        frame_end_us=request.t_us,
+        sensor_pose=sensorsim_pb2.PosePair(start_pose=start, end_pose=end),
+        dynamic_objects=objects,
+        image_format=sensorsim_pb2.PNG if encoding == "png" else sensorsim_pb2.JPEG,
+        image_quality=95,
+    )
+
+
+def wire_image(session_uuid: str, camera: str, start_us: int, end_us: int, data: bytes) -> egodriver_pb2.RolloutCameraImage:
+    """Return the message of one encoded frame; ``end_us`` is its time stamp."""
+    image = egodriver_pb2.RolloutCameraImage.CameraImage(frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera)
+    return egodriver_pb2.RolloutCameraImage(session_uuid=session_uuid, camera_image=image)
 
 
 # --- from the wire --------------------------------------------------------------------------------------------------
