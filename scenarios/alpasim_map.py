@@ -1,8 +1,8 @@
 """A lane map as AlpaSim's loader reads it from map tables: the form in which scenes are exported and in which preset ``alpasim`` scores.
 
-Tables hold two rails a lane with the same number of points, and nothing else of its shape: the centre is halfway between the rails, point by
-point. So a lane's own centre line is not used where it has both rails, and rails of different lengths get points added on their own segments,
-which leaves the lane's area as it is.
+Tables hold two rails a lane with the same number of points, and nothing else of its shape: the centre is halfway between the rails, point
+by point. So a lane's own centre line is not used where it has both rails, and rails with different numbers of points get points added on
+their own segments, which leaves the lane's area as it is.
 """
 
 from __future__ import annotations

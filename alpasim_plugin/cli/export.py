@@ -35,8 +35,8 @@ def export(
 ) -> None:
     """Write a run as AlpaSim run folders, one for each renderer and policy, and its scenes as .usdz; or scenes alone.
 
-    The folders hold the logs, `_complete` marks, metadata and settings, so that `alpasim-eval`, `alpasim-aggregation` and `alpasim-reeval` take
-    them as they are, and `simrun score --preset alpasim` gives the same numbers.
+    The folders hold the logs, `_complete` marks, metadata and settings, so that `alpasim-eval`, `alpasim-aggregation` and `alpasim-reeval`
+    take them as they are, and `simrun score --preset alpasim` gives the same numbers.
     """
     del debug  # read from the command line by cli.main, before any option is parsed
     runs = [item for item in items if any((Path(item) / name).is_file() for name in (RUN_INFO, CONTENTS))]

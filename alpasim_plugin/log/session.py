@@ -11,8 +11,8 @@ SEED_BITS, DIGEST_BITS = 64, 58
 def session_uuid(seed: int, identity: str) -> str:
     """Return the session id of a rollout, a UUID of version 8 (RFC 9562, section 5.8).
 
-    AlpaSim pairs the rollouts of different scenes by the rank of their ids, so an id begins with the seed: rollouts of one seed have the same
-    rank in every scene. The rest is a digest, so that ids differ between renderers, policies and scenes.
+    AlpaSim pairs the rollouts of different scenes by the rank of their ids, so an id begins with the seed: rollouts of one seed have the
+    same rank in every scene. The rest is a digest, so that ids differ between renderers, policies and scenes.
 
     Args:
         seed: The rollout's seed, 0 to 2^64 - 1.
