@@ -158,6 +158,10 @@ class Policy(Protocol):
     def act(self, observation: Observation) -> Plan:
         """Return the plan in the rig frame of the observation."""
 
+    def facts(self) -> Mapping[str, Any]:
+        """Return what the policy did beside its plans, such as what happened on its bus, for the rollout's manifest."""
+        return {}
+
 
 @runtime_checkable
 class Controller(Protocol):

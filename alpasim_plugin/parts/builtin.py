@@ -40,6 +40,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "policies.learned:Learned",
             "a network trained on clean frames: one front camera, its speed, a command such as left-ahead",
         ),
+        "can://": ("alpasim_plugin.control.can_policy:CanPolicy", "a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]"),
         "learned-mean": ("policies.learned:LearnedMean", "the same network, driven by its mean prediction: every seed drives alike"),
     },
     "controller": {

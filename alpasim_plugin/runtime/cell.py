@@ -89,6 +89,8 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
             with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
                 run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
         manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
+        own = dict(complete(parts.policy, Policy).facts())
+        manifest |= {"policy_facts": own} if own else {}
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"
