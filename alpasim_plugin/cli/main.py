@@ -36,6 +36,10 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
     "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),
     "export": ("export", "export", "EPILOG", "Write a run as AlpaSim run folders and its scenes as .usdz; or scenes alone."),
+    "serve-policy": (
+        "serve_policy", "serve_policy", "EPILOG",
+        "Serve a policy as AlpaSim's EgodriverService, so that AlpaSim's runtime drives it.",
+    ),
     "list": (
         "listing", "list_parts", "EPILOG",
         "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",

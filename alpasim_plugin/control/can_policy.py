@@ -82,6 +82,10 @@ class CanPolicy(Policy):
         xy = np.array([[s.x_m, s.y_m] for s in states])
         return Plan(now, np.array(times), xy, np.array([s.yaw_rad for s in states]), debug={"mark": commands.mark})
 
+    def close(self) -> None:
+        """Close the bus."""
+        self._bus.shutdown()
+
     def facts(self) -> Mapping[str, Any]:
         """Return what happened on the bus, for the rollout's manifest."""
         return {"bus": f"{self._address.interface}:{self._address.channel}", **self._exchange.facts()}

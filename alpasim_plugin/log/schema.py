@@ -176,16 +176,16 @@ def wire_box(box: Box) -> common_pb2.AABB:
     return common_pb2.AABB(size_x=box.length_m, size_y=box.width_m, size_z=box.height_m)
 
 
-def wire_camera(camera: CameraSpec) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
-    """Return a camera with the pinhole that is really rendered."""
+def wire_camera(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
+    """Return a camera with the pinhole that is really rendered, under its own name or another."""
     return sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
-        intrinsics=wire_intrinsics(camera),
+        intrinsics=wire_intrinsics(camera, name),
         rig_to_camera=wire_pose(camera.T_rig_camera, f"mounting of camera {camera.name!r}"),
-        logical_id=camera.name,
+        logical_id=name or camera.name,
     )
 
 
-def wire_intrinsics(camera: CameraSpec) -> sensorsim_pb2.CameraSpec:
+def wire_intrinsics(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.CameraSpec:
     """Return the intrinsics of a camera; all twelve distortion coefficients are stated, as zeros."""
     return sensorsim_pb2.CameraSpec(
         opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
@@ -197,15 +197,17 @@ def wire_intrinsics(camera: CameraSpec) -> sensorsim_pb2.CameraSpec:
             tangential_coeffs=[0.0] * 2,
             thin_prism_coeffs=[0.0] * 4,
         ),
-        logical_id=camera.name,
+        logical_id=name or camera.name,
         resolution_h=camera.height,
         resolution_w=camera.width,
         shutter_type=sensorsim_pb2.ROLLING_TOP_TO_BOTTOM if camera.shutter_us else sensorsim_pb2.GLOBAL,
     )
 
 
-def wire_render_request(scene_id: str, request: RenderRequest, encoding: ImageEncoding) -> sensorsim_pb2.RGBRenderRequest:
-    """Return the message of one frame to render."""
+def wire_render_request(
+    scene_id: str, request: RenderRequest, encoding: ImageEncoding, name: str | None = None
+) -> sensorsim_pb2.RGBRenderRequest:
+    """Return the message of one frame to render, of the request's camera under its own name or another."""
     camera = request.camera
     start, end = (wire_pose(T, f"pose of camera {camera.name!r}") for T in request.T_world_camera)
     objects = []
@@ -221,7 +223,7 @@ def wire_render_request(scene_id: str, request: RenderRequest, encoding: ImageEn
         scene_id=scene_id,
         resolution_h=camera.height,
         resolution_w=camera.width,
-        camera_intrinsics=wire_intrinsics(camera),
+        camera_intrinsics=wire_intrinsics(camera, name),
         frame_start_us=request.t_us - camera.shutter_us,
         frame_end_us=request.t_us,
         sensor_pose=sensorsim_pb2.PosePair(start_pose=start, end_pose=end),

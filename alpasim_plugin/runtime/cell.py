@@ -87,7 +87,10 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         with parts_print_to_stderr():
             parts = builder(cell, options, scenario, threads)
             with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
-                run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
+                try:
+                    run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
+                finally:
+                    complete(parts.policy, Policy).close()
         manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
         own = dict(complete(parts.policy, Policy).facts())
         manifest |= {"policy_facts": own} if own else {}

@@ -20,9 +20,9 @@ from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_pa
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 from evaluators.aggregate.paired import base_pairs
+from evaluators.aggregate.reduce import value_in_manifest
 
 NO_BASES: Mapping[str, str] = {}
-from evaluators.aggregate.reduce import value_in_manifest
 
 
 def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
