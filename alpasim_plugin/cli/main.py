@@ -40,6 +40,10 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "serve_policy", "serve_policy", "EPILOG",
         "Serve a policy as AlpaSim's EgodriverService, so that AlpaSim's runtime drives it.",
     ),
+    "check-driver": (
+        "check_driver", "check_driver", "EPILOG",
+        "Check a driver before it is submitted: a rollout in AlpaSim's order of calls, its times, its plans, and what it must tolerate.",
+    ),
     "list": (
         "listing", "list_parts", "EPILOG",
         "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",

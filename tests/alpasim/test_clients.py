@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from concurrent import futures
@@ -19,6 +20,7 @@ from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.alpasim.wire import SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
 from alpasim_plugin.alpasim.wire.services import Stub, handlers
+from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.errors import InfrastructureError, InputError, PolicyError, RendererError
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.parts import build, resolve
@@ -29,6 +31,7 @@ from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.types import RolloutLog, Scenario
 from scenarios.library import shipped_names
 from scenarios.load import load_scenario
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -254,3 +257,25 @@ def test_our_driver_service_is_tolerant_where_alpasim_needs_it(driver: tuple[Dri
             stub.start_session(request)
         assert "runtime.extra_cameras" in lensed.value.details()
     assert SERVICE_PATHS["EgodriverService"] == "/egodriver.EgodriverService/"
+
+
+def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
+    scene: str, driver: tuple[DriverService, str, Calls], capsys: pytest.CaptureFixture[str]
+) -> None:
+    timing = ["--set", "timing.duration_us=1900000", "--limit-ms", "60000", "--json"]
+    assert run_command(["check-driver", driver[1], "--scenario", scene, *timing]) == 0
+    good = {one["name"]: one["result"] for one in json.loads(capsys.readouterr().out)["checks"]}
+    assert set(good.values()) == {"passed", "noted"}
+    assert good["samples for minADE"] == "passed"
+    late = egodriver_pb2.DriveResponse()
+    for t in (0, 700_000, 600_000):
+        late.trajectory.poses.add(timestamp_us=t, pose={"quat": {"w": 1.0}})
+    server, address = serve("EgodriverService", Scripted(late))
+    assert run_command(["check-driver", address, "--scenario", scene, *timing]) == 1
+    server.stop(0)
+    bad = {one["name"]: (one["result"], one["text"]) for one in json.loads(capsys.readouterr().out)["checks"]}
+    assert bad["the shape of plans"][0] == "failed"
+    assert "not at time_now" in bad["the shape of plans"][1]
+    assert "do not increase" in bad["the shape of plans"][1]
+    assert bad["a session from start to close"][0] == "failed"
+    assert bad["close_session of a session that is not open"][0] == "passed"

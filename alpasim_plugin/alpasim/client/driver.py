@@ -52,8 +52,8 @@ class AlpasimPolicy(Policy):
             raise InputError("reading a service's address", f"alpasim://{address}", f"encoding {encoding!r}", "write encoding=jpeg or png")
         self._encoding: ImageEncoding = encoding
         self._timeout_s = float(place.options.get("timeout_s", "300"))
-        self._service = Service("EgodriverService", place.target, PolicyError, retries=False)
-        version = self._service.version()
+        self.service = Service("EgodriverService", place.target, PolicyError, retries=False)
+        version = self.service.version()
         self._facts: dict[str, Any] = {"driver": f"{version.version_id} at {place.target}"}
         self._session = ""
 
@@ -132,14 +132,14 @@ class AlpasimPolicy(Policy):
 
     def _plan(self, answer: egodriver_pb2.DriveResponse, observation: Observation) -> Plan:
         if answer.terminate_session:
-            raise PolicyError("asking an AlpaSim driver", self._service.target, "it ends the session", "see the driver's own log")
+            raise PolicyError("asking an AlpaSim driver", self.service.target, "it ends the session", "see the driver's own log")
         now = observation.t_us
         if not answer.trajectory.poses:
             self._facts["empty_plans"] += 1
             if now > self._scenario.start_us + self._scenario.warmup_us:
                 found = "an empty plan after the warm-up"
                 do_this = "lengthen timing.warmup_us until the driver has the frames that it needs"
-                raise PolicyError("asking an AlpaSim driver", self._service.target, found, do_this)
+                raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this)
             return straight_on(now, observation.ego.speed_mps)
         times, rows = in_rig(read_trajectory(answer.trajectory, "the driver's plan"), observation)
         reach = (int(times[-1]) - now) * 1e-6
@@ -156,7 +156,7 @@ class AlpasimPolicy(Policy):
 
     def _call(self, method: str, request: Any) -> Any:
         self._facts["calls"] = self._facts.get("calls", 0) + 1
-        return self._service.call(method, request, self._timeout_s)
+        return self.service.call(method, request, self._timeout_s)
 
 
 def cameras_of(scenario: Scenario, text: str | None) -> dict[str, CameraSpec]:
