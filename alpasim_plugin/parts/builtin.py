@@ -45,7 +45,10 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.alpasim.client.driver:AlpasimPolicy",
             "an AlpaSim driver: alpasim://HOST:PORT[?cameras=THEIRS:OURS,...]",
         ),
-        "can://": ("alpasim_plugin.control.can_policy:CanPolicy", "a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]"),
+        "can://": (
+            "alpasim_plugin.control.can_policy:CanPolicy",
+            "a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]",
+        ),
         "learned-mean": ("policies.learned:LearnedMean", "the same network, driven by its mean prediction: every seed drives alike"),
     },
     "controller": {

@@ -59,7 +59,7 @@ class AlpasimPolicy(Policy):
 
     def reset(self, seed: int, route: Route) -> None:
         """Open a session for a new rollout."""
-        self.close()
+        self._end_session()
         self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{self._scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}"))
         self._sent_us, self._image_us = -1, dict.fromkeys(self._cameras, -1)
         self._facts |= {"empty_plans": 0, "shortest_plan_s": None, "samples_cut": 0, "calls": 0}
@@ -94,10 +94,16 @@ class AlpasimPolicy(Policy):
     def end(self, frames: Mapping[str, Frame]) -> None:
         """Send the last frames, which no query follows, as AlpaSim's runtime does, and close the session."""
         self._send_images(frames)
-        self.close()
+        self._end_session()
 
     def close(self) -> None:
-        """Close the session, if one is open."""
+        """Close the session, if one is open, and the channel."""
+        try:
+            self._end_session()
+        finally:
+            self.service.close()
+
+    def _end_session(self) -> None:
         if self._session:
             session, self._session = self._session, ""
             self._call("close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=session))
