@@ -45,7 +45,7 @@ def check_driver(
     except PolicyError as error:
         failed = error
     warmup = scene.warmup_us // scene.rates.policy_us + 1
-    found = [*findings(times, failed, warmup, limit_ms / 1000), *tolerances(policy.service), *outside_view()]
+    found = [*findings(times, failed, warmup, limit_ms / 1000), *tolerances(policy.service, scene.scene_id), *outside_view()]
     worst = 1 if any(one.result == "failed" for one in found) else 0
     if as_json:
         print(json.dumps({"driver": policy.facts()["driver"], "checks": [one.__dict__ for one in found], "exit_code": worst}))

@@ -121,11 +121,11 @@ def findings(times: DriveTimes, failed: SimrunError | None, warmup_steps: int, l
     return out
 
 
-def tolerances(service: Service) -> list[Finding]:
-    """Try calls that AlpaSim's runtime makes after failures and in concurrent rollouts."""
+def tolerances(service: Service, scene_id: str) -> list[Finding]:
+    """Try calls that AlpaSim's runtime makes after failures, in a scene that the driver has driven."""
     out = []
     name = str(uuid.uuid5(uuid.NAMESPACE_URL, "simrun check-driver"))
-    out.append(_tried("close_session before any step", lambda: _open_and_close(service, name)))
+    out.append(_tried("close_session before any step", lambda: _open_and_close(service, name, scene_id)))
     close = egodriver_pb2.DriveSessionCloseRequest(session_uuid=name)
     out.append(_tried("close_session of a session that is not open", lambda: service.call("close_session", close, 10.0)))
     return out
@@ -137,8 +137,9 @@ def outside_view() -> Sequence[Finding]:
     return [Finding("read-only root and memory", "noted", text)]
 
 
-def _open_and_close(service: Service, name: str) -> None:
-    service.call("start_session", egodriver_pb2.DriveSessionRequest(session_uuid=name), 10.0)
+def _open_and_close(service: Service, name: str, scene_id: str) -> None:
+    debug = egodriver_pb2.DriveSessionRequest.DebugInfo(scene_id=scene_id)
+    service.call("start_session", egodriver_pb2.DriveSessionRequest(session_uuid=name, debug_info=debug), 10.0)
     service.call("close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=name), 10.0)
 
 
