@@ -147,18 +147,27 @@ class AlpasimPolicy(Policy):
                 do_this = "lengthen timing.warmup_us until the driver has the frames that it needs"
                 raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this)
             return straight_on(now, observation.ego.speed_mps)
-        times, rows = in_rig(read_trajectory(answer.trajectory, "the driver's plan"), observation)
+        times, rows = in_rig(self._read(answer.trajectory, "the driver's plan"), observation)
         reach = (int(times[-1]) - now) * 1e-6
         shortest = self._facts["shortest_plan_s"]
         self._facts["shortest_plan_s"] = reach if shortest is None else min(shortest, reach)
         samples = []
         for message in answer.debug_info.sampled_trajectories:
-            sample = read_trajectory(message, "a sampled plan")
+            sample = self._read(message, "a sampled plan")
             if len(sample) and int(sample.t_us[-1]) >= int(times[-1]):
                 samples.append(in_rig(sample, observation, times)[1])
             else:
                 self._facts["samples_cut"] += 1  # a sample that ends before the plan has no place at the plan's last times
         return Plan(now, times, rows[:, :2], rows[:, 2], tuple(samples))
+
+    def _read(self, message: common_pb2.Trajectory, what: str) -> Trajectory:
+        """Return what the driver sent; poses or times that are none are its failure."""
+        try:
+            return read_trajectory(message, what)
+        except InputError as error:
+            found = f"{error.with_what}: {error.found}"
+            do_this = "send strictly increasing times, finite positions and unit quaternions"
+            raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this) from error
 
     def _call(self, method: str, request: Any) -> Any:
         self._facts["calls"] = self._facts.get("calls", 0) + 1
