@@ -13,6 +13,7 @@ import grpc
 from alpasim_plugin.alpasim.wire import common_pb2
 from alpasim_plugin.alpasim.wire.services import OPTIONS, Stub
 from alpasim_plugin.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.log.images import ImageEncoding
 
 READY_S = 30.0  # how long a service may take to accept its first call
 CALL_S = 300.0  # AlpaSim's own deadline of a render
@@ -47,6 +48,18 @@ class Address:
             shown = "&".join(f"{name}=..." for name in known)
             raise InputError("reading a service's address", f"{scheme}://{text}", found, f"write {scheme}://HOST:PORT[?{shown}]")
         return cls(target, options)
+
+
+def encoding_of(address: str, given: str) -> ImageEncoding:
+    """Return the encoding that an address asks for.
+
+    Raises:
+        InputError: It is none that the wire has.
+    """
+    known: dict[str, ImageEncoding] = {"jpeg": "jpeg", "png": "png"}
+    if given in known:
+        return known[given]
+    raise InputError("reading a service's address", address, f"encoding {given!r}", "write encoding=jpeg or encoding=png")
 
 
 class Service:

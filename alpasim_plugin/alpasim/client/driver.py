@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.alpasim.client.channel import Address, Service
+from alpasim_plugin.alpasim.client.channel import Address, Service, encoding_of
 from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2
 from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import interpolate, inverse, se3, wrap_angle, yaw_of
-from alpasim_plugin.log.images import ImageEncoding, encode_image
+from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.schema import read_trajectory, wire_camera, wire_dynamics, wire_image, wire_trajectory
 from alpasim_plugin.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec, Trajectory
 
@@ -47,10 +47,7 @@ class AlpasimPolicy(Policy):
         self._scenario = scenario
         self._cameras = cameras_of(scenario, place.options.get("cameras"))
         self.sensors: Sequence[SensorSpec] = tuple(SensorSpec(camera.name) for camera in self._cameras.values())
-        encoding = place.options.get("encoding", "jpeg")
-        if encoding not in ("jpeg", "png"):
-            raise InputError("reading a service's address", f"alpasim://{address}", f"encoding {encoding!r}", "write encoding=jpeg or png")
-        self._encoding: ImageEncoding = encoding
+        self._encoding = encoding_of(f"alpasim://{address}", place.options.get("encoding", "jpeg"))
         self._timeout_s = float(place.options.get("timeout_s", "300"))
         self.service = Service("EgodriverService", place.target, PolicyError, retries=False)
         version = self.service.version()

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from alpasim_plugin.alpasim.client.channel import READY_S, Address, Service
+from alpasim_plugin.alpasim.client.channel import READY_S, Address, Service, encoding_of
 from alpasim_plugin.alpasim.client.driver import cameras_of
 from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
 from alpasim_plugin.errors import InputError, RendererError
-from alpasim_plugin.log.images import ImageEncoding, decode_image
+from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_render_request
 from alpasim_plugin.types import Frame, Renderer, RenderRequest, Scenario
 
@@ -32,10 +32,7 @@ class NreRenderer(Renderer):
 
     def __init__(self, scenario: Scenario, address: str) -> None:
         place = Address.parse("nre", address, OPTIONS)
-        encoding = place.options.get("encoding", "png")
-        if encoding not in ("jpeg", "png"):
-            raise InputError("reading a service's address", f"nre://{address}", f"encoding {encoding!r}", "write encoding=jpeg or png")
-        self._encoding: ImageEncoding = encoding
+        self._encoding = encoding_of(f"nre://{address}", place.options.get("encoding", "png"))
         self._scene = place.options.get("scene", scenario.scene_id)
         self._service = Service("SensorsimService", place.target, RendererError, retries=True)
         self._version = self._service.version()
