@@ -158,6 +158,18 @@ class Policy(Protocol):
     def act(self, observation: Observation) -> Plan:
         """Return the plan in the rig frame of the observation."""
 
+    def end(self, frames: Mapping[str, Frame]) -> None:
+        """Take the newest frame of each camera at the end of a rollout; no query follows."""
+        return
+
+    def close(self) -> None:
+        """Give back what the policy holds, such as a session or a bus; called after a rollout, also after one that failed."""
+        return
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return what the policy did beside its plans, such as what happened on its bus, for the rollout's manifest."""
+        return {}
+
 
 @runtime_checkable
 class Controller(Protocol):

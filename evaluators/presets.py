@@ -18,6 +18,7 @@ class Preset:
     """Conventions of one scoring protocol."""
 
     name: str
+    reproduces: str | None = None  # whose evaluation, in which version: stamped on the results with the rest
     # Footprint. The sizes of all boxes are scaled by 1 - shrink; corners are rounded by roundness * shorter side / 2.
     ego_size_m: tuple[float, float] | None = None  # length, width; None: as logged
     shrink: float = 0.0
@@ -86,6 +87,7 @@ PRESETS: dict[str, Preset] = {
     "paper": Preset(name="paper", ego_size_m=(4.855, 1.88)),
     "alpasim": Preset(
         name="alpasim",
+        reproduces="AlpaSim, alpasim_eval 1.36.0 (commit 3032e0c, wire API 0.54.0)",
         shrink=0.02,
         roundness=0.5,
         hits="last",

@@ -23,6 +23,7 @@ IDM_ACCEL_MPS2, IDM_BRAKE_MPS2, HARD_BRAKE_MPS2 = 1.5, 2.0, 7.0
 
 N_SAMPLES = 6
 NOISE_LATERAL_M, NOISE_SPEED, NOISE_S = 0.15, 0.03, 3.0
+DRIFT_STEPS = 40  # rows of a plan over which a sample drifts by NOISE_SPEED: 4 s
 MAX_NOISE_M = 0.5
 NOISE_RAMP_M = 12.0
 
@@ -162,7 +163,7 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
     ramp = np.clip(s / NOISE_RAMP_M, 0.0, 1.0)
     ramp_slope = np.where(s < NOISE_RAMP_M, 6 * ramp * (1 - ramp) / NOISE_RAMP_M, 0.0)
     ramp = ramp * ramp * (3 - 2 * ramp)
-    ahead = np.linspace(0.0, 1.0, len(s))
+    ahead = np.arange(len(s)) / DRIFT_STEPS
     out = [np.column_stack([xy, yaw])]
     for lateral, faster in noise[1:] - noise[0]:
         shift_m = sigma_m * float(lateral)

@@ -144,7 +144,7 @@ def _known(lane: Lane, lanes: dict[str, Lane]) -> Lane:
 
 def _sign(archive: Archive, row: _Row) -> tuple[F64, Box] | None:
     centre = row.own.get("center")
-    if not centre or not isinstance(centre, dict) or any(centre.get(axis) is None for axis in "xyz"):
+    if row.map_id is None or not centre or not isinstance(centre, dict) or any(centre.get(axis) is None for axis in "xyz"):
         return None
     pose = np.eye(4)
     pose[:3, 3] = points(archive, row.where, [centre])[0]

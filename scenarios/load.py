@@ -31,6 +31,7 @@ from alpasim_plugin.types import (
     Vehicle,
 )  # fmt: skip
 from alpasim_plugin.world.ground import flat
+from scenarios.alpasim_map import alpasim_view
 from scenarios.budget import check_record, check_scenario, check_specification
 from scenarios.build import build, last_us
 from scenarios.cameras import camera_spec
@@ -42,6 +43,7 @@ from scenarios.variation import differences, draw, jitter
 
 DOING = "reading a scenario"
 AS_WRITTEN = 0  # the scene seed that jitters nothing
+ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
 
 
 def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = (), source: str | None = None) -> Scenario:
@@ -81,6 +83,8 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     if spec.seed != own_seed:
         scenario = replace(scenario, scene_id=f"{scenario.scene_id}-seed{spec.seed}")
     check_scenario(scenario, document.path)
+    if scenario.source != "usdz":  # the map of an AlpaSim scene is in its form already
+        scenario = replace(scenario, alpasim_map=alpasim_view(scenario.lane_map))
     return _timed(document, spec, scenario)
 
 
@@ -145,11 +149,11 @@ def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenari
 
     check_specification(spec, lambda loc, found, do_this: document.error(DOING, loc, found, do_this))
     built = build(spec, vehicle, fail)
-    start = spec.timing.start_us
+    start, warmup = spec.timing.start_us, _warmup_us(spec)
     cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else (camera_spec(),)
     return Scenario(
         scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
-        _rates(spec), start, last_us(spec), spec.timing.warmup_us, Latency(**spec.latency.model_dump()),
+        _rates(spec), start, last_us(spec), warmup, Latency(**spec.latency.model_dump()),
         _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, scene_id),
         stop_at_path_end=spec.timing.stop_at_path_end,
     )  # fmt: skip
@@ -174,6 +178,8 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
     cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else record.cameras or (camera_spec(),)
     first, last = int(record.ego_log.t_us[0]), int(record.ego_log.t_us[-1])
     start = first + spec.timing.start_us
+    if spec.timing.timeline == "alpasim" and record.first_frame_us is not None:
+        start = record.first_frame_us
     end = last if spec.timing.duration_us is None else start + spec.timing.duration_us
     if end > last:
         raise document.error(
@@ -185,7 +191,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
     return Scenario(
         chosen_id, record.source, spec.seed, record.lane_map, record.ground, record.ego_log,
         _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
-        _rates(spec), start, end, spec.timing.warmup_us, Latency(**spec.latency.model_dump()), _environment(spec),
+        _rates(spec), start, end, _warmup_us(spec), Latency(**spec.latency.model_dump()), _environment(spec),
         _degradation(spec), _background(document, spec), record.world_origin,
         _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map, kind,
         stop_at_path_end=spec.timing.stop_at_path_end,
@@ -208,6 +214,9 @@ def _timed(document: Document, spec: ScenarioSpec, scenario: Scenario) -> Scenar
         key = next((k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what), None)
         loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
         raise document.error(DOING, loc, f"{e.with_what}: {e.found}", e.do_this) from e
+    if spec.timing.timeline == "alpasim" and scenario.warmup_us % scenario.rates.control_us:
+        found = f"a control period of {scenario.rates.control_us} us, of which {scenario.warmup_us} us is no multiple"
+        raise document.error(DOING, ("timing", "timeline"), found, "choose a rates.control_us that divides AlpaSim's 1.7 s")
     length = clock.n_steps * scenario.rates.control_us
     if scenario.warmup_us >= length:
         raise document.error(
@@ -222,6 +231,10 @@ def _vehicle(v: VehicleSpec) -> Vehicle:
         Box(v.length_m, v.width_m, v.height_m), v.rear_axle_to_centre_m, v.wheelbase_m, v.max_steer_rad, v.max_steer_rate_radps,
         v.max_accel_mps2, v.max_brake_mps2,
     )  # fmt: skip
+
+
+def _warmup_us(spec: ScenarioSpec) -> int:
+    return ALPASIM_WARMUP_US if spec.timing.timeline == "alpasim" else spec.timing.warmup_us
 
 
 def _rates(spec: ScenarioSpec) -> Rates:

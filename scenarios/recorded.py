@@ -26,4 +26,5 @@ class RecordedLog:
     world_origin: tuple[float, float, float]
     content_hash: str  # sha256 over the bytes that were read
     notes: tuple[str, ...] = ()
+    first_frame_us: int | None = None  # when the first recorded camera frame ends, where the source says it
     alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs

@@ -105,6 +105,10 @@ class TimingSpec(Part):
     stop_at_path_end: bool = Field(
         default=True, description="A rollout ends where the recorded path ends, unless the recorded car stands there."
     )
+    timeline: Literal["scenario", "alpasim"] = Field(
+        default="scenario",
+        description="alpasim: start at the recording's first camera frame, where it has any, and force 1.7 s, whatever the keys above say.",
+    )
 
 
 class LatencySpec(Part):

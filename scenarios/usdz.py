@@ -17,6 +17,7 @@ from alpasim_plugin.geometry import quat_from_matrix
 from alpasim_plugin.types import F64, Actor, Box, LaneMap, Scene, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.clipgt import clipgt_map, without_rails
+from scenarios.cosmos_camera import FRONT_WIDE
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_alpasim import alpasim_map
 from scenarios.opendrive_place import T_local_map
@@ -91,6 +92,7 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         world_origin=(0.0, 0.0, 0.0),
         content_hash=files.content_hash,
         notes=notes,
+        first_frame_us=rig.first_frame_us(),
         alpasim_map=road.alpasim if rails or road.alpasim is None else without_rails(road.alpasim),
     )
 
@@ -159,6 +161,21 @@ class _Rig:
     def T_earth_local(self) -> F64:
         """Return the ``(4, 4)`` pose of the local frame in earth-centred coordinates."""
         return self._array(self._document, "T_world_base", (4, 4))
+
+    def first_frame_us(self) -> int | None:
+        """Return when the first frame of the front wide camera ends, of all cameras where it has none; None without frames.
+
+        Raises:
+            InputError: A frame's times are no pair of integers.
+        """
+        frames = self._rig.get("cameras_frame_timestamps_us") or {}
+        calibrated = self._document.get("camera_calibrations") or {}
+        try:
+            ends = {str(calibrated[uid]["logical_sensor_name"]): int(times[0][1]) for uid, times in frames.items() if times}
+        except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
+            found = f"camera frames: {type(error).__name__} {error}"
+            raise self.files.fail(self.where, found, "give every camera a calibration and its frames as [start, end]") from error
+        return ends.get(FRONT_WIDE, min(ends.values(), default=None))
 
     def vehicle(self) -> tuple[Vehicle, tuple[str, ...]]:
         """Return the ego's body and notes."""

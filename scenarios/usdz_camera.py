@@ -12,7 +12,7 @@ from scenarios.usdz_archive import Archive
 
 TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
 # Columns: camera x (right), y (down), z (forward) seen in the sensor's axes forward, left, up.
-_FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...]]:
@@ -58,7 +58,7 @@ def mount(sensor: dict[str, Any]) -> F64:
     turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
     shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
     out = np.eye(4)
-    out[:3, :3] = _rotation(nominal["roll-pitch-yaw"]) @ _rotation(turn) @ _FLU_FROM_CAMERA
+    out[:3, :3] = _rotation(nominal["roll-pitch-yaw"]) @ _rotation(turn) @ FLU_FROM_CAMERA
     out[:3, 3] = np.asarray(nominal["t"], dtype=np.float64) + np.asarray(shift, dtype=np.float64)
     return out
 

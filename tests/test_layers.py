@@ -33,6 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.control": set(),
     "policies": set(),
     "alpasim_plugin.alpasim": set(),
+    "alpasim_plugin.alpasim.client": {"alpasim_plugin.alpasim", "alpasim_plugin.log"},
     "alpasim_plugin.alpasim.server": {
         "alpasim_plugin.alpasim",
         "alpasim_plugin.fixers",
@@ -44,6 +45,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.log": {"alpasim_plugin.alpasim"},
     "evaluators": set(),
     "alpasim_plugin.runtime": {
+        "alpasim_plugin.alpasim",  # the messages of logs that it exports
         "alpasim_plugin.fixers",
         "alpasim_plugin.world",
         "alpasim_plugin.renderers",

@@ -35,6 +35,18 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
     "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
     "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),
+    "export": (
+        "export", "export", "EPILOG",
+        "Write a run as AlpaSim run folders, one for each renderer and policy, and its scenes as .usdz; or scenes alone.",
+    ),
+    "serve-policy": (
+        "serve_policy", "serve_policy", "EPILOG",
+        "Serve a policy as AlpaSim's EgodriverService, so that AlpaSim's runtime drives it.",
+    ),
+    "check-driver": (
+        "check_driver", "check_driver", "EPILOG",
+        "Check a driver before it is submitted: a rollout in AlpaSim's order of calls, its times, its plans, and what it must tolerate.",
+    ),
     "list": (
         "listing", "list_parts", "EPILOG",
         "List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help.",

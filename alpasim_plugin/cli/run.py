@@ -59,6 +59,10 @@ def run(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="Override a scenario key, or with `fixer.` a fixer's: key=value. Repeatable.")
     ] = None,
+    timeline: Annotated[
+        Literal["scenario", "alpasim"],
+        typer.Option("--timeline", help="alpasim: start at the first recorded frame and force 1.7 s, as AlpaSim does."),
+    ] = "scenario",
     controller: Annotated[
         str | None, typer.Option("--controller", help="Controller that tracks the plans; by default the policy's.")
     ] = None,
@@ -96,6 +100,8 @@ def run(
     if baseline is not None and baseline not in names:
         raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")
     of_scene, of_fixer = split_overrides(overrides or ())
+    if timeline != "scenario":
+        of_scene = (*of_scene, f"timing.timeline={timeline}")
     refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
     options = RunOptions(preset, images, video, device, baseline, of_fixer, controller, tuple(evaluators or ()))
     plan = make_plan(refs, names, drivers, parse_seeds(seeds), options)

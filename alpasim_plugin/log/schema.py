@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, sensorsim_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
-from alpasim_plugin.types import F64, Actor, Box, CameraSpec, EgoState, Scenario, Trajectory, Vehicle
+from alpasim_plugin.log.images import ImageEncoding
+from alpasim_plugin.types import F64, Actor, Box, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory, Vehicle
 
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it
@@ -175,16 +176,16 @@ def wire_box(box: Box) -> common_pb2.AABB:
     return common_pb2.AABB(size_x=box.length_m, size_y=box.width_m, size_z=box.height_m)
 
 
-def wire_camera(camera: CameraSpec) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
-    """Return a camera with the pinhole that is really rendered."""
+def wire_camera(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.AvailableCamerasReturn.AvailableCamera:
+    """Return a camera with the pinhole that is really rendered, under its own name or another."""
     return sensorsim_pb2.AvailableCamerasReturn.AvailableCamera(
-        intrinsics=wire_intrinsics(camera),
+        intrinsics=wire_intrinsics(camera, name),
         rig_to_camera=wire_pose(camera.T_rig_camera, f"mounting of camera {camera.name!r}"),
-        logical_id=camera.name,
+        logical_id=name or camera.name,
     )
 
 
-def wire_intrinsics(camera: CameraSpec) -> sensorsim_pb2.CameraSpec:
+def wire_intrinsics(camera: CameraSpec, name: str | None = None) -> sensorsim_pb2.CameraSpec:
     """Return the intrinsics of a camera; all twelve distortion coefficients are stated, as zeros."""
     return sensorsim_pb2.CameraSpec(
         opencv_pinhole_param=sensorsim_pb2.OpenCVPinholeCameraParam(
@@ -196,11 +197,46 @@ def wire_intrinsics(camera: CameraSpec) -> sensorsim_pb2.CameraSpec:
             tangential_coeffs=[0.0] * 2,
             thin_prism_coeffs=[0.0] * 4,
         ),
-        logical_id=camera.name,
+        logical_id=name or camera.name,
         resolution_h=camera.height,
         resolution_w=camera.width,
         shutter_type=sensorsim_pb2.ROLLING_TOP_TO_BOTTOM if camera.shutter_us else sensorsim_pb2.GLOBAL,
     )
+
+
+def wire_render_request(
+    scene_id: str, request: RenderRequest, encoding: ImageEncoding, name: str | None = None
+) -> sensorsim_pb2.RGBRenderRequest:
+    """Return the message of one frame to render, of the request's camera under its own name or another."""
+    camera = request.camera
+    start, end = (wire_pose(T, f"pose of camera {camera.name!r}") for T in request.T_world_camera)
+    objects = []
+    if request.actors:
+        ids = sorted(request.actors)
+        stack = np.stack([request.actors[i] for i in ids])
+        poses = wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
+        pair = sensorsim_pb2.PosePair
+        objects = [
+            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p)) for i, p in zip(ids, poses, strict=True)
+        ]
+    return sensorsim_pb2.RGBRenderRequest(
+        scene_id=scene_id,
+        resolution_h=camera.height,
+        resolution_w=camera.width,
+        camera_intrinsics=wire_intrinsics(camera, name),
+        frame_start_us=request.t_us - camera.shutter_us,
+        frame_end_us=request.t_us,
+        sensor_pose=sensorsim_pb2.PosePair(start_pose=start, end_pose=end),
+        dynamic_objects=objects,
+        image_format=sensorsim_pb2.PNG if encoding == "png" else sensorsim_pb2.JPEG,
+        image_quality=95,
+    )
+
+
+def wire_image(session_uuid: str, camera: str, start_us: int, end_us: int, data: bytes) -> egodriver_pb2.RolloutCameraImage:
+    """Return the message of one encoded frame; ``end_us`` is its time stamp."""
+    image = egodriver_pb2.RolloutCameraImage.CameraImage(frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera)
+    return egodriver_pb2.RolloutCameraImage(session_uuid=session_uuid, camera_image=image)
 
 
 # --- from the wire --------------------------------------------------------------------------------------------------

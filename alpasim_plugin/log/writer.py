@@ -22,9 +22,10 @@ from alpasim_plugin.log.schema import (
     wire_box,
     wire_camera,
     wire_dynamics,
-    wire_intrinsics,
+    wire_image,
     wire_pose,
     wire_poses,
+    wire_render_request,
     wire_trajectory,
 )
 from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
@@ -124,7 +125,10 @@ class AslWriter:
     def render_request(self, requests: Sequence[RenderRequest], encoding: ImageEncoding = "png") -> None:
         """Write the render requests of one instant, bundled as AlpaSim sends them by default."""
         items = [
-            sensorsim_pb2.BatchRGBRenderRequestItem(camera_name=r.camera.name, request=self._render_request(r, encoding)) for r in requests
+            sensorsim_pb2.BatchRGBRenderRequestItem(
+                camera_name=r.camera.name, request=wire_render_request(self.header.scene_id, r, encoding)
+            )
+            for r in requests
         ]
         self._write(batch_render_request=sensorsim_pb2.BatchRGBRenderRequest(items=items))
 
@@ -134,10 +138,7 @@ class AslWriter:
 
     def encoded_image(self, camera: str, start_us: int, end_us: int, data: bytes) -> None:
         """Write one frame that is already encoded; ``end_us`` is its time stamp."""
-        image = egodriver_pb2.RolloutCameraImage.CameraImage(
-            frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera
-        )
-        self._write(driver_camera_image=egodriver_pb2.RolloutCameraImage(session_uuid=self._uuid, camera_image=image))
+        self._write(driver_camera_image=wire_image(self._uuid, camera, start_us, end_us, data))
 
     def ego_trajectory(self, states: Sequence[EgoState]) -> None:
         """Write the ego states the driver learned since the last call; the first call carries the recorded context."""
@@ -293,28 +294,3 @@ class AslWriter:
         """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or around it."""
         tracks = ((a.actor_id, a.track) for a in self.header.actors if len(a.track))
         return {i: interpolate(track, t_us) for i, track in tracks if track.t_us[0] <= t_us <= track.t_us[-1]}
-
-    def _render_request(self, request: RenderRequest, encoding: ImageEncoding) -> sensorsim_pb2.RGBRenderRequest:
-        camera = request.camera
-        start, end = (wire_pose(T, f"pose of camera {camera.name!r}") for T in request.T_world_camera)
-        objects = []
-        if request.actors:
-            ids = sorted(request.actors)
-            stack = np.stack([request.actors[i] for i in ids])
-            poses = wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
-            pair = sensorsim_pb2.PosePair
-            objects = [
-                sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=p)) for i, p in zip(ids, poses, strict=True)
-            ]
-        return sensorsim_pb2.RGBRenderRequest(
-            scene_id=self.header.scene_id,
-            resolution_h=camera.height,
-            resolution_w=camera.width,
-            camera_intrinsics=wire_intrinsics(camera),
-            frame_start_us=request.t_us - camera.shutter_us,
-            frame_end_us=request.t_us,
-            sensor_pose=sensorsim_pb2.PosePair(start_pose=start, end_pose=end),
-            dynamic_objects=objects,
-            image_format=sensorsim_pb2.PNG if encoding == "png" else sensorsim_pb2.JPEG,
-            image_quality=95,
-        )

@@ -13,6 +13,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.renderers.reconstruction:reconstruction_renderer",
             "a reconstruction of the logged drive: error grows with the distance from its path",
         ),
+        "nre://": ("alpasim_plugin.alpasim.client.renderer:NreRenderer", "an AlpaSim renderer service: nre://HOST:PORT[?scene=ID]"),
         "broken-black": (f"{_BROKEN}black_renderer", "deliberate fault: black frames"),
         "broken-mirrored": (f"{_BROKEN}mirrored_renderer", "deliberate fault: left and right swapped"),
         "broken-blurred": (f"{_BROKEN}blurred_renderer", "deliberate fault: strong blur"),
@@ -39,6 +40,14 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "learned": (
             "policies.learned:Learned",
             "a network trained on clean frames: one front camera, its speed, a command such as left-ahead",
+        ),
+        "alpasim://": (
+            "alpasim_plugin.alpasim.client.driver:AlpasimPolicy",
+            "an AlpaSim driver: alpasim://HOST:PORT[?cameras=THEIRS:OURS,...]",
+        ),
+        "can://": (
+            "alpasim_plugin.control.can_policy:CanPolicy",
+            "a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]",
         ),
         "learned-mean": ("policies.learned:LearnedMean", "the same network, driven by its mean prediction: every seed drives alike"),
     },

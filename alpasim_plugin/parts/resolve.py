@@ -139,8 +139,11 @@ def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> De
 
 
 def _declares_nothing(kind: KindName, target: str) -> bool:
-    """Tell whether a factory need not be imported before it is used: shipped parts of some kinds have nothing to declare."""
-    return kind in PLAIN_KINDS and any(target == shipped for shipped, _ in BUILTIN[kind].values())
+    """Tell whether a factory need not be imported before it is used: shipped parts of some kinds have nothing to declare.
+
+    Those behind an address have: they are remote.
+    """
+    return kind in PLAIN_KINDS and any(target == shipped for name, (shipped, _) in BUILTIN[kind].items() if "://" not in name)
 
 
 def note_of(spec: PartSpec, declared: Declaration) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -86,9 +87,12 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         scenario = replace(_scenario(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr():
             parts = builder(cell, options, scenario, threads)
-            with Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names) as recorder:
+            recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
+            with recorder, _closing(complete(parts.policy, Policy)):
                 run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
         manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
+        own = dict(complete(parts.policy, Policy).facts())
+        manifest |= {"policy_facts": own} if own else {}
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"
@@ -159,6 +163,18 @@ def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) ->
     scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators)
     write_table(folder / STEPS_NAME, [cell.names | row for row in scored.steps], STEPS_SCHEMA)
     return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
+
+
+@contextmanager
+def _closing(policy: Policy) -> Iterator[None]:
+    """Close a policy after its rollout."""
+    try:
+        yield
+    except BaseException:
+        with suppress(SimrunError):  # what failed first is the rollout's failure; a service that is gone cannot be closed either
+            policy.close()
+        raise
+    policy.close()
 
 
 @lru_cache(maxsize=4)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from alpasim_plugin.errors import InputError
@@ -93,3 +95,32 @@ def _from_scenario(one: Scenario) -> LoggedScene:
     return LoggedScene(
         one.scene, one.source, one.content_hash, one.notes, one.actors, one.world_origin, one.start_us, one.end_us, one.warmup_us
     )
+
+
+def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
+    """Return what finds a scenario by its scene id among files, folders and shipped names.
+
+    Without places, and only then, every id gets a straight road, of which nothing is true but the id: a policy under test takes no more
+    from its scenario than cameras and vehicle.
+
+    Raises (when called):
+        InputError: None of the places has the id.
+    """
+    if not places:
+        blank = load_scenario("smoke/straight")
+        return lambda scene_id: replace(blank, scene_id=scene_id, actors=())
+    paths = [path for place in places for path in _scene_files(place)]
+    found: dict[str, Scenario] = {}
+    reading = threading.Lock()  # sessions open at the same time
+
+    def find(scene_id: str) -> Scenario:
+        with reading:
+            while scene_id not in found and paths:
+                scenario = load_scenario(paths.pop(0))
+                found[scenario.scene_id] = scenario
+        if scene_id not in found:
+            shown = ", ".join(sorted(found)[:5])
+            raise InputError(DOING, f"scene {scene_id!r}", f"not among the {len(found)} scenes given: {shown}", "name it with --scenes")
+        return found[scene_id]
+
+    return find

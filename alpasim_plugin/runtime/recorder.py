@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.log.session import session_uuid
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.pictures import Pictures
 from alpasim_plugin.runtime.plan_motion import PlanMotion
@@ -64,7 +64,7 @@ class Recorder:
         self._temporary = tempfile.TemporaryDirectory(prefix="simrun-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
         self._scenario, self._seed = scenario, seed
-        self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, session or f"{scenario.scene_id}/{seed}"))
+        self._session = session_uuid(seed, session or f"{scenario.scene_id}/{seed}")
         self._images, self._keep_frames, self._versions = images, keep_frames, dict(versions or {})
         self._times = StageTimes()
         self.plan_motion = PlanMotion(scenario.vehicle)

@@ -75,6 +75,7 @@ def run_rollout(
                 state.frames[frame.camera] = frame
             recorder.frame(frame, request)
         if path_end.ends_rollout(state.ego) or tick.is_last:
+            policy.end(dict(state.frames))
             break
         if cadence.queries_at(tick.t_us):
             observation = state.observe(seen)

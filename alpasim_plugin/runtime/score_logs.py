@@ -77,16 +77,25 @@ def score_logs(
     """
     out: list[LogScore] = []
     taken: set[str] = set()
+    names: set[str] = set()
     for log in logs:
         began = time.perf_counter()
-        one = _score(log, scenes, preset, evaluators, root, taken)
+        one = _score(log, scenes, preset, evaluators, root, taken, names)
         one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
         out.append(one)
         on_done(one.manifest)
     return out
 
 
-def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[PartSpec], root: Path, taken: set[str]) -> LogScore:
+def _score(
+    log: Path,
+    scenes: KnownScenes,
+    preset: Preset,
+    evaluators: Sequence[PartSpec],
+    root: Path,
+    taken: set[str],
+    names: set[str],
+) -> LogScore:
     name = log.resolve().parent.name
     manifest: dict[str, Any] = {
         "renderer": UNKNOWN, "policy": UNKNOWN, "scene": UNKNOWN, "seed": 0, "rollout": name, "log": str(log), "preset": preset.name,
@@ -103,6 +112,7 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
         "policy": _named(versions.get("egodriver")),
         "scene": rollout.scene_id,
         "seed": int(rollout.seed) & (2**63 - 1),
+        "rollout": _rollout_name(rollout.session_uuid, name, names),
         "session_uuid": rollout.session_uuid,
         "frames": len(rollout.images),
         "steps": _steps(rollout),
@@ -120,7 +130,15 @@ def _score(log: Path, scenes: KnownScenes, preset: Preset, evaluators: Sequence[
     keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
     write_table(root / manifest["path"] / STEPS_NAME, [keys | row for row in one.steps], steps_schema(of_logs=True))
     run_uuid, run_name = run_names(log)
-    return LogScore(manifest, ScoredRollout(rollout.scene_id, name, series, run_uuid, run_name))
+    return LogScore(manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name))
+
+
+def _rollout_name(session_uuid: str, folder: str, names: set[str]) -> str:
+    """Return the name of a rollout, its session id as in AlpaSim; a second log with that id gets its folder's name with it."""
+    name = session_uuid or folder
+    name = name if name not in names else f"{name} ({folder})"
+    names.add(name)
+    return name
 
 
 def check_vouched(log: Path) -> None:

@@ -135,7 +135,7 @@ def _aggregate(
             if i in marks:
                 facts = info("scene_score")
                 values["scene_score"] = RolloutValue(marks[i].score, True, "", facts.unit, facts.direction)
-            good[i].manifest["metrics"] = {name: dict(value.__dict__) for name, value in values.items()}
+            good[i].manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
             good[i].manifest["scene_score"] = None if i not in marks else {"failure_reason": marks[i].failure_reason}
         if reduced and not skipped:
             own = [one.of for one in reduced]

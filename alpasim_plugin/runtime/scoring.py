@@ -133,4 +133,5 @@ def _placed(rollout: RolloutLog, reduction: Reduction) -> list[dict[str, Any]]:
 
 
 def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
+    """Return a value for a table: missing where it is NaN; an infinite one stays, as in AlpaSim's tables."""
+    return None if value is None or np.isnan(value) else float(value)

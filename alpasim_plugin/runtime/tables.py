@@ -20,6 +20,7 @@ from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_pa
 from alpasim_plugin.types import F64
 from evaluators import aggregate, censoring, paired
 from evaluators.aggregate.paired import base_pairs
+from evaluators.aggregate.reduce import value_in_manifest
 
 NO_BASES: Mapping[str, str] = {}
 
@@ -38,7 +39,7 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             "steps": manifest.get("steps"),
         }
         for name, entry in manifest.get("metrics", {}).items():
-            row[name] = entry["value"]
+            row[name] = value_in_manifest(entry)
             row[f"{name}_valid"] = entry["valid"]
         rows.append(row)
     return rows

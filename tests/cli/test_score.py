@@ -38,13 +38,15 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert (printed["out"], printed["exit_code"], printed["summary"]["preset"]) == (str(out), 0, "paper")
     before, after = rows(our_run), rows(out)
-    assert [row["rollout"] for row in after] == ["0", "1"]  # the log's folder name
+    names = [row["rollout"] for row in after]
+    assert names == sorted(names)  # session ids, which sort as the seeds
+    assert names == [json.loads((our_run / row["path"] / "manifest.json").read_text())["session_uuid"] for row in before]
     for one, two in zip(before, after, strict=True):
         for key in one:
             if key not in ("path", "wall_s"):
                 assert two[key] == one[key], key
     steps = pq.read_table(out / "steps.parquet")
-    assert set(steps["rollout"].to_pylist()) == {"0", "1"}
+    assert set(steps["rollout"].to_pylist()) == set(names)
     for name in ("run.json", "summary.json", "summary.md", "junit.xml", "report.html"):
         assert (out / name).stat().st_size > 0
     assert json.loads((out / "run.json").read_text())["config"]["preset"]["name"] == "paper"
@@ -129,7 +131,8 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
     scene = str(golden / "scenes" / f"{GOLDEN_SCENE}.usdz")
     assert run_command(["score", str(logs), "--scene", scene, "--no-report", "--out", str(out)]) == 2
     found = {row["rollout"]: (row["status"], row["failure_class"]) for row in rows(out)}
-    assert found == {"whole": ("ok", None), "cut": ("failed", "infrastructure"), "beheaded": ("failed", "input")}
+    name = first.parent.name  # the session id, of which the second log is another copy
+    assert found == {f"{name} (whole)": ("ok", None), name: ("failed", "infrastructure"), "beheaded": ("failed", "input")}
     assert "of 80 control steps" in capsys.readouterr().err
 
 

@@ -22,14 +22,14 @@ DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote
 def test_every_shipped_part_resolves_and_has_a_digest_and_help(kind: str) -> None:
     for name, text in names(kind).items():  # type: ignore[arg-type]
         spec = resolve(kind, name)  # type: ignore[arg-type]
-        assert spec.digest is not None
+        assert (spec.digest is None) == name.endswith("://"), name  # what is behind an address is not known here
         assert text
         assert "\n" not in text
 
 
 @pytest.mark.parametrize("kind", PLAIN_KINDS)
 def test_shipped_parts_of_plain_kinds_declare_nothing(kind: str) -> None:
-    for target, _ in BUILTIN[kind].values():
+    for target in (target for name, (target, _) in BUILTIN[kind].items() if not name.endswith("://")):
         factory = load(target, kind)
         own = {name for name in DECLARED if getattr(factory, name, None)}
         assert own == set(), target

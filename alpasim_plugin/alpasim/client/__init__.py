@@ -1,0 +1,1 @@
+"""Clients of AlpaSim's services: any driver as a policy, any renderer as a renderer."""

@@ -1,0 +1,120 @@
+"""A channel to one service, and its failures as errors of the part that it stands for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qs
+
+import grpc
+
+from alpasim_plugin.alpasim.wire import common_pb2
+from alpasim_plugin.alpasim.wire.services import OPTIONS, Stub
+from alpasim_plugin.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.log.images import ImageEncoding
+
+READY_S = 30.0  # how long a service may take to accept its first call
+CALL_S = 300.0  # AlpaSim's own deadline of a render
+RETRY_S = (0.5, 2.0)  # AlpaSim's own waits before a second and a third attempt
+PASSING_TEXTS = ("Stopped waiting for backend", "A load persistent id instruction was encountered")
+
+
+@dataclass(frozen=True)
+class Address:
+    """What stands after ``alpasim://`` or ``nre://``: ``HOST:PORT[?option=value&...]``."""
+
+    target: str
+    options: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, scheme: str, text: str, known: tuple[str, ...]) -> Address:
+        """Read an address.
+
+        Example:
+            >>> Address.parse("nre", "127.0.0.1:50051?scene=a", ("scene",))
+            Address(target='127.0.0.1:50051', options={'scene': 'a'})
+
+        Raises:
+            InputError: No host or port, or an unknown option.
+        """
+        target, _, query = text.partition("?")
+        host, _, port = target.rpartition(":")
+        options = {key: values[-1] for key, values in parse_qs(query, keep_blank_values=True).items()}
+        unknown = sorted(set(options) - set(known))
+        if not host or not port.isdigit() or unknown:
+            found = f"no option {unknown[0]!r}" if unknown else "no HOST:PORT"
+            shown = "&".join(f"{name}=..." for name in known)
+            raise InputError("reading a service's address", f"{scheme}://{text}", found, f"write {scheme}://HOST:PORT[?{shown}]")
+        return cls(target, options)
+
+
+def encoding_of(address: str, given: str) -> ImageEncoding:
+    """Return the encoding that an address asks for.
+
+    Raises:
+        InputError: It is none that the wire has.
+    """
+    known: dict[str, ImageEncoding] = {"jpeg": "jpeg", "png": "png"}
+    if given in known:
+        return known[given]
+    raise InputError("reading a service's address", address, f"encoding {given!r}", "write encoding=jpeg or encoding=png")
+
+
+class Service:
+    """One service behind an address.
+
+    Args:
+        name: Name of the service, as in `alpasim_plugin.alpasim.wire.SERVICE_PATHS`.
+        target: ``HOST:PORT``.
+        error: Class of the errors that a failing call raises.
+        retries: Whether a call that may pass is made again, as AlpaSim does with renders and not with drivers.
+    """
+
+    def __init__(self, name: str, target: str, error: type[SimrunError], retries: bool) -> None:
+        self.name, self.target, self._error, self._retries = name, target, error, retries
+        self._channel = grpc.insecure_channel(target, options=OPTIONS)
+        self.stub = Stub(self._channel, name)
+
+    def wait_ready(self, timeout_s: float = READY_S) -> None:
+        """Wait for the service.
+
+        Raises:
+            InfrastructureError: Nothing listens there.
+        """
+        try:
+            grpc.channel_ready_future(self._channel).result(timeout=timeout_s)
+        except grpc.FutureTimeoutError as error:
+            found = f"nothing answers at {self.target} within {timeout_s:g} s"
+            raise InfrastructureError(f"calling {self.name}", self.target, found, "start the service, or correct the address") from error
+
+    def call(self, method: str, request: Any, timeout_s: float = CALL_S) -> Any:
+        """Make one call and return its answer.
+
+        Raises:
+            SimrunError: Of the class that the constructor was given: the service answered with an error status, or not in time.
+        """
+        ask: Callable[..., Any] = getattr(self.stub, method)
+        for wait_s in (*(RETRY_S if self._retries else ()), None):
+            try:
+                return ask(request, timeout=timeout_s, wait_for_ready=False)
+            except grpc.RpcError as error:
+                code, text = error.code(), error.details() or ""
+                passing = code == grpc.StatusCode.UNAVAILABLE or any(phrase in text for phrase in PASSING_TEXTS)
+                if wait_s is None or not passing:
+                    found = f"{code.name}: {text}"
+                    do_this = "see the service's own log"
+                    raise self._error(f"calling {self.name}.{method}", self.target, found, do_this) from error
+                time.sleep(wait_s)
+        raise AssertionError("the last attempt returns or raises")
+
+    def version(self) -> common_pb2.VersionId:
+        """Return the service's version triple, once it is ready."""
+        self.wait_ready()
+        answer: common_pb2.VersionId = self.call("get_version", common_pb2.Empty(), READY_S)
+        return answer
+
+    def close(self) -> None:
+        """Close the channel; harmless if closed."""
+        self._channel.close()

@@ -1,0 +1,230 @@
+"""``--policy alpasim://HOST:PORT``: any AlpaSim driver drives, called in exactly the order of AlpaSim's runtime.
+
+    start_session; then at each query submit_image_observation (one a camera), submit_egomotion_observation, submit_route, drive; at the end
+    the last frames, and close_session.
+
+The first egomotion message carries the whole recorded context, with true speeds, where AlpaSim's own runtime sends zeros until it hands
+over.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.alpasim.client.channel import Address, Service, encoding_of
+from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2
+from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.geometry import interpolate, inverse, se3, wrap_angle, yaw_of
+from alpasim_plugin.log.images import encode_image
+from alpasim_plugin.log.schema import read_trajectory, wire_camera, wire_dynamics, wire_image, wire_trajectory
+from alpasim_plugin.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec, Trajectory
+
+OPTIONS = ("cameras", "encoding", "timeout_s")
+HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
+_SESSIONS = itertools.count()  # sessions of several rollouts of one scene and seed may be open at one driver
+FRONT_WIDE = "camera_front_wide_120fov"  # what AlpaSim calls its main camera
+
+
+class AlpasimPolicy(Policy):
+    """A driver behind AlpaSim's EgodriverService.
+
+    Args:
+        scenario: Gives cameras, periods and the warm-up.
+        address: ``HOST:PORT[?cameras=THEIRS:OURS,...&encoding=jpeg|png&timeout_s=N]``. Without ``cameras`` the scenario's main camera is
+            sent under AlpaSim's name for it.
+    """
+
+    is_remote = True
+
+    def __init__(self, scenario: Scenario, address: str) -> None:
+        place = Address.parse("alpasim", address, OPTIONS)
+        self._scenario = scenario
+        self._cameras = cameras_of(scenario, place.options.get("cameras"))
+        self.sensors: Sequence[SensorSpec] = tuple(SensorSpec(camera.name) for camera in self._cameras.values())
+        self._encoding = encoding_of(f"alpasim://{address}", place.options.get("encoding", "jpeg"))
+        self._timeout_s = float(place.options.get("timeout_s", "300"))
+        self.service = Service("EgodriverService", place.target, PolicyError, retries=False)
+        version = self.service.version()
+        self._facts: dict[str, Any] = {"driver": f"{version.version_id} at {place.target}"}
+        self._session = ""
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Open a session for a new rollout."""
+        self._end_session()
+        self._session = str(uuid.uuid5(uuid.NAMESPACE_URL, f"{self._scenario.scene_id}/{seed}/{os.getpid()}/{next(_SESSIONS)}"))
+        self._sent_us, self._image_us = -1, dict.fromkeys(self._cameras, -1)
+        self._facts |= {"empty_plans": 0, "shortest_plan_s": None, "samples_cut": 0, "calls": 0}
+        request = egodriver_pb2.DriveSessionRequest
+        listed = [wire_camera(camera, name) for name, camera in self._cameras.items()]
+        self._call(
+            "start_session",
+            request(
+                session_uuid=self._session,
+                random_seed=seed & 0xFFFFFFFF,
+                debug_info=request.DebugInfo(scene_id=self._scenario.scene_id),
+                rollout_spec=request.RolloutSpec(vehicle=request.RolloutSpec.VehicleDefinition(available_cameras=listed)),
+            ),
+        )
+
+    def act(self, observation: Observation) -> Plan:
+        """Send what is new and return the driver's plan.
+
+        Raises:
+            PolicyError: A call fails, the driver ends the session, its answer is no plan, or empty after the warm-up.
+        """
+        now = observation.t_us
+        self._send_images(observation.frames)
+        self._send_motion(observation)
+        points = [common_pb2.Vec3(x=x, y=y, z=0.0) for x, y, _ in observation.route_rig.tolist()]
+        route = egodriver_pb2.Route(waypoints=points, timestamp_us=now)
+        self._call("submit_route", egodriver_pb2.RouteRequest(session_uuid=self._session, route=route))
+        query = egodriver_pb2.DriveRequest(session_uuid=self._session, time_now_us=now, time_query_us=now + self._scenario.rates.control_us)
+        answer = self._call("drive", query)
+        return self._plan(answer, observation)
+
+    def end(self, frames: Mapping[str, Frame]) -> None:
+        """Send the last frames, which no query follows, as AlpaSim's runtime does, and close the session."""
+        self._send_images(frames)
+        self._end_session()
+
+    def close(self) -> None:
+        """Close the session, if one is open, and the channel."""
+        try:
+            self._end_session()
+        finally:
+            self.service.close()
+
+    def _end_session(self) -> None:
+        if self._session:
+            session, self._session = self._session, ""
+            self._call("close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=session))
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return what the driver is and how its plans were, for the rollout's manifest."""
+        return dict(self._facts)
+
+    def _send_images(self, frames: Mapping[str, Frame]) -> None:
+        for name, camera in self._cameras.items():
+            frame = frames.get(camera.name)
+            if frame is None or frame.t_us == self._image_us[name]:
+                continue
+            self._image_us[name] = frame.t_us
+            data = encode_image(frame.rgb, self._encoding)
+            message = wire_image(self._session, name, frame.t_us - camera.shutter_us, frame.t_us, data)
+            self._call("submit_image_observation", message)
+
+    def _send_motion(self, observation: Observation) -> None:
+        """Send every pose since the last one sent, with its speeds."""
+        history = observation.history
+        states = motion_states(history, observation.ego)
+        first = int(np.searchsorted(history.t_us, self._sent_us, side="right"))
+        new = Trajectory(history.t_us[first:], history.xyz[first:], history.quat[first:])
+        self._sent_us = observation.t_us
+        message = egodriver_pb2.RolloutEgoTrajectory(
+            session_uuid=self._session,
+            trajectory=wire_trajectory(new, "the ego's motion"),
+            dynamic_states=[wire_dynamics(state) for state in states[first:]],
+        )
+        self._call("submit_egomotion_observation", message)
+
+    def _plan(self, answer: egodriver_pb2.DriveResponse, observation: Observation) -> Plan:
+        if answer.terminate_session:
+            raise PolicyError("asking an AlpaSim driver", self.service.target, "it ends the session", "see the driver's own log")
+        now = observation.t_us
+        if not answer.trajectory.poses:
+            self._facts["empty_plans"] += 1
+            if now > self._scenario.start_us + self._scenario.warmup_us:
+                found = "an empty plan after the warm-up"
+                do_this = "lengthen timing.warmup_us until the driver has the frames that it needs"
+                raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this)
+            return straight_on(now, observation.ego.speed_mps)
+        times, rows = in_rig(self._read(answer.trajectory, "the driver's plan"), observation)
+        reach = (int(times[-1]) - now) * 1e-6
+        shortest = self._facts["shortest_plan_s"]
+        self._facts["shortest_plan_s"] = reach if shortest is None else min(shortest, reach)
+        samples = []
+        for message in answer.debug_info.sampled_trajectories:
+            sample = self._read(message, "a sampled plan")
+            if len(sample) and int(sample.t_us[-1]) >= int(times[-1]):
+                samples.append(in_rig(sample, observation, times)[1])
+            else:
+                self._facts["samples_cut"] += 1  # a sample that ends before the plan has no place at the plan's last times
+        return Plan(now, times, rows[:, :2], rows[:, 2], tuple(samples))
+
+    def _read(self, message: common_pb2.Trajectory, what: str) -> Trajectory:
+        """Return what the driver sent; poses or times that are none are its failure."""
+        try:
+            return read_trajectory(message, what)
+        except InputError as error:
+            found = f"{error.with_what}: {error.found}"
+            do_this = "send strictly increasing times, finite positions and unit quaternions"
+            raise PolicyError("asking an AlpaSim driver", self.service.target, found, do_this) from error
+
+    def _call(self, method: str, request: Any) -> Any:
+        self._facts["calls"] = self._facts.get("calls", 0) + 1
+        return self.service.call(method, request, self._timeout_s)
+
+
+def cameras_of(scenario: Scenario, text: str | None) -> dict[str, CameraSpec]:
+    """Return the scenario's cameras to send, by the driver's names for them: ``THEIRS:OURS,...``.
+
+    Raises:
+        InputError: The scenario lacks a camera that is named, or has none.
+    """
+    own = {camera.name: camera for camera in scenario.cameras}
+    main = next((name for name in (FRONT_WIDE, "front") if name in own), next(iter(own), ""))
+    pairs = [(FRONT_WIDE, main)] if text is None else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
+    missing = [b for _, b in pairs if b not in own]
+    if missing or not pairs:
+        found = f"no camera {missing[0]!r} among {sorted(own)}" if missing else "no camera"
+        raise InputError("connecting a driver to its cameras", f"scene {scenario.scene_id!r}", found, "write ?cameras=THEIRS:OURS,...")
+    return {a: own[b] for a, b in pairs}
+
+
+def motion_states(history: Trajectory, ego: EgoState) -> list[EgoState]:
+    """Return the state at every pose of a history ``(T,)``: speeds by differences, the last one as it is known."""
+    poses, t_s = se3(history.xyz, history.quat), (history.t_us - history.t_us[0]) * 1e-6
+    if len(history) == 1:
+        return [ego]
+    velocity = np.gradient(history.xyz, t_s, axis=0)
+    speed = np.einsum("ti,ti->t", velocity, poses[:, :3, 0])
+    yaw = np.unwrap([yaw_of(pose) for pose in poses])
+    rate, accel = np.gradient(yaw, t_s), np.gradient(speed, t_s)
+    states = [
+        EgoState(int(t), pose, float(v), float(a), float(w))
+        for t, pose, v, a, w in zip(history.t_us, poses, speed, accel, rate, strict=True)
+    ]
+    return [*states[:-1], ego]
+
+
+def in_rig(plan: Trajectory, observation: Observation, times: I64 | None = None) -> tuple[I64, F64]:
+    """Return times ``(T,)`` and rows x, y, yaw ``(T, 3)`` in the rig frame of a plan with absolute poses.
+
+    Args:
+        plan: What the driver sent; poses before now are left out, and the present pose comes first where it has none.
+        observation: Of the query.
+        times: At these times, instead of the plan's own.
+    """
+    now = observation.t_us
+    later = plan.t_us[plan.t_us > now]
+    wanted: I64 = np.concatenate([[now], later]).astype(np.int64) if times is None else times
+    poses = np.empty((len(wanted), 4, 4))
+    inside = (wanted >= plan.t_us[0]) & (wanted <= plan.t_us[-1])
+    if inside.any():
+        poses[inside] = interpolate(plan, wanted[inside])
+    poses[~inside] = observation.ego.T_world_rig
+    local = inverse(observation.ego.T_world_rig) @ poses
+    return wanted, np.column_stack([local[:, :2, 3], wrap_angle(np.array([yaw_of(pose) for pose in local]))])
+
+
+def straight_on(now_us: int, speed_mps: float) -> Plan:
+    """Return a plan straight on at the present speed, for the warm-up, in which it is not driven."""
+    times = now_us + np.arange(0, HOLD_US + 1, 100_000, dtype=np.int64)
+    xy = np.column_stack([speed_mps * (times - now_us) * 1e-6, np.zeros(len(times))])
+    return Plan(now_us, times, xy, np.zeros(len(times)), debug={"empty": True})

@@ -1,0 +1,151 @@
+"""The pre-flight check of an AlpaSim driver: what the challenge and AlpaSim's runtime ask of it, tried over its socket.
+
+Each check gives a line: passed, failed, or not visible from outside. The session that is driven is a real rollout of ours.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+
+from alpasim_plugin.alpasim.client.channel import Service
+from alpasim_plugin.alpasim.wire import egodriver_pb2
+from alpasim_plugin.errors import PolicyError, SimrunError
+
+LIMIT_S = 0.1  # of a drive call, in the public challenge
+HORIZON_US, MINADE_US = 2_000_000, 5_000_000  # what AlpaSim's controller needs, and its evaluation
+Result = Literal["passed", "failed", "noted"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the check."""
+
+    name: str
+    result: Result
+    text: str
+
+
+@dataclass
+class DriveTimes:
+    """Measures the drive calls of a service and looks at its raw answers, beside whoever makes them.
+
+    Attributes:
+        seconds: Of each drive call.
+        problems: What was wrong with answers, by kind, with the first example.
+        reach_us: The shortest plan, from its query to its last pose.
+        samples_us: The shortest sampled plan; None without samples.
+        empty: Answers without poses.
+    """
+
+    seconds: list[float] = field(default_factory=list)
+    problems: dict[str, str] = field(default_factory=dict)
+    reach_us: int | None = None
+    samples_us: int | None = None
+    empty: int = 0
+
+    def watch(self, service: Service) -> None:
+        """Measure every drive call of a service from now on."""
+        made: Callable[..., Any] = service.stub.drive
+
+        def drive(request: egodriver_pb2.DriveRequest, **options: Any) -> egodriver_pb2.DriveResponse:
+            began = time.perf_counter()
+            answer: egodriver_pb2.DriveResponse = made(request, **options)
+            self.seconds.append(time.perf_counter() - began)
+            self.look(request, answer)
+            return answer
+
+        setattr(service.stub, "drive", drive)  # noqa: B010  # the stub makes its methods when it is made
+
+    def look(self, request: egodriver_pb2.DriveRequest, answer: egodriver_pb2.DriveResponse) -> None:
+        """Look at one answer as it came."""
+        poses = answer.trajectory.poses
+        if not poses:
+            self.empty += 1
+            return
+        now, t_us = int(request.time_now_us), [int(pose.timestamp_us) for pose in poses]
+        if t_us[0] != now:
+            self.problems.setdefault("the first pose is not at time_now", f"{t_us[0] - now:+d} us at {now}")
+        if any(b <= a for a, b in pairwise(t_us)):
+            self.problems.setdefault("times do not increase strictly", f"at {now}")
+        squares = [sum(getattr(pose.pose.quat, axis) ** 2 for axis in "wxyz") for pose in poses]
+        if any(abs(square - 1) > 1e-4 for square in squares):
+            self.problems.setdefault("a quaternion is no unit quaternion", f"|q|^2 = {min(squares):.5f} at {now}")
+        if not all(np.isfinite([pose.pose.vec.x, pose.pose.vec.y, pose.pose.vec.z]).all() for pose in poses):
+            self.problems.setdefault("a position is not finite", f"at {now}")
+        self.reach_us = min(t_us[-1] - now, self.reach_us if self.reach_us is not None else t_us[-1] - now)
+        for sample in answer.debug_info.sampled_trajectories:
+            reach = int(sample.poses[-1].timestamp_us) - now if sample.poses else 0
+            self.samples_us = min(reach, self.samples_us if self.samples_us is not None else reach)
+
+
+def findings(times: DriveTimes, failed: SimrunError | None, warmup_steps: int, limit_s: float = LIMIT_S) -> list[Finding]:
+    """Return what a driven session showed.
+
+    Args:
+        times: Of its drive calls.
+        failed: What ended it early, if anything did.
+        warmup_steps: Queries in which empty plans are accepted.
+        limit_s: Of a drive call.
+    """
+    out = [
+        Finding("a session from start to close", "failed" if failed else "passed", str(failed.found) if failed else "answered throughout")
+    ]
+    if times.seconds:
+        ms = np.array(times.seconds) * 1000
+        over = int((ms > limit_s * 1000).sum())
+        text = (
+            f"p50 {np.percentile(ms, 50):.1f} ms, p95 {np.percentile(ms, 95):.1f} ms, longest {ms.max():.1f} ms; {over} of {len(ms)} over"
+        )
+        out.append(Finding(f"a drive call within {limit_s * 1000:.0f} ms", "failed" if over else "passed", text))
+    text = "; ".join(f"{kind} ({example})" for kind, example in times.problems.items())
+    out.append(Finding("the shape of plans", "failed" if text else "passed", text or "first pose now, times increase, unit quaternions"))
+    too_many = times.empty > warmup_steps
+    out.append(Finding("empty plans in the warm-up only", "failed" if too_many else "passed", f"{times.empty} of {len(times.seconds)}"))
+    if times.reach_us is not None:
+        short = times.reach_us < HORIZON_US
+        text = f"the shortest reaches {times.reach_us * 1e-6:g} s; where a plan ends the car brakes"
+        out.append(Finding("plans of at least 2 s", "failed" if short else "passed", text))
+    if times.samples_us is None:
+        out.append(Finding("samples for minADE", "noted", "no sampled_trajectories: AlpaSim's tables will hold no minADE"))
+    else:
+        short = times.samples_us < MINADE_US
+        text = f"the shortest reaches {times.samples_us * 1e-6:g} s" + ("; one below 5 s loses all minADE metrics of its rollout" * short)
+        out.append(Finding("samples for minADE", "failed" if short else "passed", text))
+    return out
+
+
+def tolerances(service: Service, scene_id: str) -> list[Finding]:
+    """Try calls that AlpaSim's runtime makes after failures, in a scene that the driver has driven."""
+    out = []
+    name = str(uuid.uuid5(uuid.NAMESPACE_URL, "simrun check-driver"))
+    out.append(_tried("close_session before any step", lambda: _open_and_close(service, name, scene_id)))
+    close = egodriver_pb2.DriveSessionCloseRequest(session_uuid=name)
+    out.append(_tried("close_session of a session that is not open", lambda: service.call("close_session", close, 10.0)))
+    return out
+
+
+def outside_view() -> Sequence[Finding]:
+    """Return what no socket shows, and how to see it."""
+    text = "run its container with --read-only --tmpfs /tmp --gpus and a memory limit of the challenge: 16 GiB of GPU memory"
+    return [Finding("read-only root and memory", "noted", text)]
+
+
+def _open_and_close(service: Service, name: str, scene_id: str) -> None:
+    debug = egodriver_pb2.DriveSessionRequest.DebugInfo(scene_id=scene_id)
+    service.call("start_session", egodriver_pb2.DriveSessionRequest(session_uuid=name, debug_info=debug), 10.0)
+    service.call("close_session", egodriver_pb2.DriveSessionCloseRequest(session_uuid=name), 10.0)
+
+
+def _tried(name: str, call: Callable[[], Any]) -> Finding:
+    try:
+        call()
+    except PolicyError as error:
+        return Finding(name, "failed", error.found)
+    return Finding(name, "passed", "answered")

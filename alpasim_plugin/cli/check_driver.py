@@ -1,0 +1,56 @@
+"""``simrun check-driver``: the pre-flight check of an AlpaSim driver."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
+from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, findings, outside_view, tolerances
+from alpasim_plugin.errors import PolicyError
+from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.rollout import run_rollout
+from scenarios.load import load_scenario
+
+EPILOG = """
+Examples:
+
+- `simrun check-driver 127.0.0.1:50052`
+
+- `simrun check-driver my-driver:6000 --scenario scenes/one.usdz --set 'cameras=[{width: 576, height: 320}]'`
+"""
+
+
+def check_driver(
+    address: Annotated[str, typer.Argument(metavar="HOST:PORT", help="The driver, with options as after alpasim://.")],
+    scenario: Annotated[str, typer.Option("--scenario", help="What it drives through.")] = "smoke/curve",
+    renderer: Annotated[str, typer.Option("--renderer", help="Renderer of its frames.")] = "clean",
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
+    limit_ms: Annotated[float, typer.Option("--limit-ms", min=0.1, help="Longest drive call; the challenge allows 100.")] = LIMIT_S * 1000,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Check a driver before it is submitted: a rollout in AlpaSim's order of calls, its times, its plans, and what it must tolerate.
+
+    Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
+    """
+    del debug  # read from the command line by cli.main, before any option is parsed
+    scene = load_scenario(scenario, overrides=("timing.timeline=alpasim", *(overrides or ())))
+    policy, times, failed = AlpasimPolicy(scene, address), DriveTimes(), None
+    times.watch(policy.service)
+    try:
+        run_rollout(scene, make_renderer(renderer, scene), policy)
+    except PolicyError as error:
+        failed = error
+    warmup = scene.warmup_us // scene.rates.policy_us + 1
+    found = [*findings(times, failed, warmup, limit_ms / 1000), *tolerances(policy.service, scene.scene_id), *outside_view()]
+    worst = 1 if any(one.result == "failed" for one in found) else 0
+    if as_json:
+        print(json.dumps({"driver": policy.facts()["driver"], "checks": [one.__dict__ for one in found], "exit_code": worst}))
+    else:
+        print(f"driver  {policy.facts()['driver']}")
+        for one in found:
+            print(f"{one.result:7} {one.name}: {one.text}")
+    raise typer.Exit(worst)

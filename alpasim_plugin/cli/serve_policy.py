@@ -1,0 +1,57 @@
+"""``simrun serve-policy``: a policy of ours as an AlpaSim driver."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from alpasim_plugin.alpasim.server.driver_service import DriverService
+from alpasim_plugin.alpasim.server.hosting import Host, Security
+from alpasim_plugin.parts import resolve
+from alpasim_plugin.runtime.known_scenes import scenario_finder
+from alpasim_plugin.stopping import Stopped
+
+EPILOG = """
+Examples:
+
+- `simrun serve-policy lane-camera`: AlpaSim's runtime drives it with `driver` at 127.0.0.1:50052
+
+- `simrun serve-policy my_package.policies:Mine --listen 0.0.0.0:6000 --scenes scenes/`
+"""
+
+
+def serve_policy(
+    policy: Annotated[str, typer.Argument(help="Policy as for `run --policy`.")],
+    listen: Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Address; port 0 takes a free one.")] = "127.0.0.1:50052",
+    scenes: Annotated[
+        list[str] | None, typer.Option("--scenes", help="Scenes by whose id a policy gets map and vehicle; without it, it gets neither.")
+    ] = None,
+    sessions: Annotated[int, typer.Option("--sessions", min=1, help="Sessions open at a time.")] = 64,
+    tls_cert: Annotated[Path | None, typer.Option("--tls-cert", help="PEM certificate of this server.")] = None,
+    tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM key of this server.")] = None,
+    drain_s: Annotated[float, typer.Option("--drain-s", min=0.0, help="At the end, wait so long for running calls.")] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON line when the port is open, and one at the end.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Serve a policy as AlpaSim's EgodriverService, so that AlpaSim's runtime drives it.
+
+    Each session gets a policy of its own, made for the session's cameras, which must be pinholes.
+    """
+    del debug  # read from the command line by cli.main, before any option is parsed
+    service = DriverService(resolve("policy", policy), scenario_finder(scenes or ()), sessions)
+    host = Host({"EgodriverService": service}, listen, Security(tls_cert, tls_key))
+    what = {"serving": "EgodriverService", "at": host.address, "policy": policy}
+    print(json.dumps(what) if as_json else f"serving EgodriverService at {host.address}: {policy}", flush=True)
+    host.start()
+    try:
+        host.wait()
+    except Stopped:
+        host.stop(drain_s)
+    ms = np.array(service.drives_s) * 1000
+    quantiles = {f"drive_ms_p{q}": round(float(np.percentile(ms, q)), 2) for q in (50, 95, 99)} if len(ms) else {}
+    counts = dict(service.counts) | quantiles
+    print(json.dumps(counts) if as_json else ", ".join(f"{key} {value}" for key, value in counts.items()), flush=True)

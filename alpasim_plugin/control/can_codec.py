@@ -1,0 +1,223 @@
+"""Between quantities and CAN frames: encoding with counters and checksums, decoding with every check that the database allows.
+
+Checksums are those of the manufacturers, as opendbc documents them: Toyota's sum of identifier, length and data bytes; Tesla's sum of
+identifier and data bytes; and CRC-8 SAE J1850 over identifier and data. Nothing of a frame is trusted before all checks have passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.control.can_map import CanMap, Checksum, ChecksumKind, Received, Sent
+from alpasim_plugin.errors import InputError
+
+DOING = "opening a CAN database"
+_POLYNOMIAL, _START = 0x1D, 0xFF  # CRC-8 SAE J1850
+
+
+class BadFrame(Exception):
+    """A frame that fails a check; the text says which."""
+
+
+@dataclass
+class Rounding:
+    """What encoding did to one signal: its resolution and the error, in the signal's unit."""
+
+    resolution: float
+    unit: str
+    count: int = 0
+    worst: float = 0.0
+    squares: float = 0.0
+    saturated: int = 0
+
+    def add(self, wanted: float, carried: float, cut: bool) -> None:
+        """Take in one value; one that was cut to the signal's range counts as saturated, not as rounded."""
+        if cut:
+            self.saturated += 1
+            return
+        error = abs(wanted - carried)
+        self.count, self.worst, self.squares = self.count + 1, max(self.worst, error), self.squares + error * error
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the numbers for a report."""
+        rms = (self.squares / self.count) ** 0.5 if self.count else None
+        return {"resolution": self.resolution, "unit": self.unit, "worst": self.worst, "rms": rms, "saturated": self.saturated}
+
+
+@dataclass
+class Codec:
+    """Encodes and decodes the messages of a map.
+
+    Attributes:
+        rounding: Per ``MESSAGE.SIGNAL`` that was encoded.
+    """
+
+    map: CanMap
+    database: Any
+    rounding: dict[str, Rounding] = field(default_factory=dict)
+    _counters: dict[str, int] = field(default_factory=dict)
+
+    def message(self, name: str) -> Any:
+        """Return a message of the database."""
+        return self.database.get_message_by_name(name)
+
+    def encode(self, sent: Sent, quantities: Mapping[str, float]) -> tuple[int, bytes]:
+        """Return identifier and data of a message, with the next counter and its checksum."""
+        values: dict[str, float] = {}
+        for name, content in sent.contents().items():
+            wanted = quantities[content.quantity] * content.scale
+            if content.rest_of is not None:
+                wanted -= values[content.rest_of]
+            values[name] = self._carried(sent.message, name, wanted)
+        return self.pack(sent.message, values, sent.counter, sent.checksum)
+
+    def encode_command(self, received: Received, value: float) -> tuple[int, bytes]:
+        """Return identifier and data of a command, as a control unit sends it."""
+        values = {received.signal: self._carried(received.message, received.signal, value * received.scale), **received.enabled}
+        return self.pack(received.message, values, received.counter, received.checksum)
+
+    def pack(self, name: str, values: Mapping[str, float], counter: str | None, checksum: Checksum | None) -> tuple[int, bytes]:
+        """Return identifier and data of given signal values; signals that are not named are at their lowest raw value, 0 in most."""
+        message = self.message(name)
+        full = {signal.name: signal.offset for signal in message.signals} | dict(values)
+        if counter is not None:
+            length = message.get_signal_by_name(counter).length
+            full[counter] = self._counters[name] = (self._counters.get(name, -1) + 1) % (1 << length)
+        if checksum is not None:
+            full[checksum.signal] = 0
+        data = bytearray(message.encode(full, strict=False))
+        if checksum is not None:
+            at = _byte_of(message, checksum.signal)
+            data[at] = checksum_of(checksum.kind, message.frame_id, bytes(data), at)
+        return message.frame_id, bytes(data)
+
+    def decode(self, received: Received, data: bytes) -> tuple[float, int | None]:
+        """Return a command's value and counter.
+
+        Raises:
+            BadFrame: Wrong length, wrong checksum, a value that the database does not allow, or a command that is not enabled.
+        """
+        message = self.message(received.message)
+        values = checked_values(message, data, received.checksum)
+        off = [f"{name} = {values[name]}" for name, wanted in received.enabled.items() if values[name] != wanted]
+        if off:
+            raise BadFrame(f"not enabled: {', '.join(off)}")
+        signal, value = message.get_signal_by_name(received.signal), float(values[received.signal])
+        if not _inside(signal, value):
+            low, high = _range(signal)
+            raise BadFrame(f"{received.signal} = {value} outside [{low:g}, {high:g}]")
+        return value / received.scale, None if received.counter is None else int(values[received.counter])
+
+    def _carried(self, message: str, name: str, wanted: float) -> float:
+        """Return the value that a signal can hold nearest to the wanted one, and keep account of the difference."""
+        signal = self.message(message).get_signal_by_name(name)
+        low, high = _range(signal)
+        held = min(max(wanted, low), high)
+        raw = round((held - signal.offset) / signal.scale)
+        first, last = _raw_range(signal)
+        carried = float(min(max(raw, first), last) * signal.scale + signal.offset)
+        account = self.rounding.setdefault(f"{message}.{name}", Rounding(float(signal.scale), signal.unit or ""))
+        account.add(wanted, carried, held != wanted)
+        return carried
+
+
+def open_codec(can_map: CanMap, database: Path) -> Codec:
+    """Load a database and check that the map fits it.
+
+    Raises:
+        InputError: cantools is missing, the file is no database that it accepts, or the map names what the database lacks.
+    """
+    try:
+        import cantools
+    except ImportError as error:
+        raise InputError(DOING, str(database), "cantools is not installed", "pip install 'alpasim-onefixer[can]'") from error
+    try:
+        # Real databases have overlapping signals in messages that nobody uses here; the map's own messages are checked below.
+        loaded = cantools.database.load_file(database, strict=False)
+    except Exception as error:  # the parser raises errors of many kinds
+        found = f"{type(error).__name__}: {error}"
+        raise InputError(DOING, str(database), found, "repair the database, or remove the message that it names") from error
+    codec = Codec(can_map, loaded)
+    parts: list[Sent | Received] = [*can_map.send, *(one for one in (can_map.steer, can_map.accel) if one is not None)]
+    for part in parts:
+        signals = list(part.signals) if isinstance(part, Sent) else [part.signal, *part.enabled]
+        signals += [name for name in (part.counter, part.checksum.signal if part.checksum else None) if name is not None]
+        try:
+            message = codec.message(part.message)
+            for name in signals:
+                message.get_signal_by_name(name)
+        except KeyError as error:
+            do_this = "name a database of the vehicle that the map is for"
+            raise InputError(DOING, str(database), f"no {error} of message {part.message}", do_this) from error
+    return codec
+
+
+def checked_values(message: Any, data: bytes, checksum: Checksum | None) -> dict[str, float]:
+    """Return the signals of a frame.
+
+    Raises:
+        BadFrame: Wrong length or checksum, or bytes that do not decode.
+    """
+    if len(data) != message.length:
+        raise BadFrame(f"{len(data)} bytes, not {message.length}")
+    if checksum is not None:
+        at = _byte_of(message, checksum.signal)
+        wanted = checksum_of(checksum.kind, message.frame_id, data, at)
+        if data[at] != wanted:
+            raise BadFrame(f"checksum {data[at]:#04x}, not {wanted:#04x}")
+    try:
+        values: dict[str, float] = message.decode(data, decode_choices=False)
+    except Exception as error:  # the decoder raises errors of many kinds
+        raise BadFrame(f"{type(error).__name__}: {error}") from error
+    return values
+
+
+def checksum_of(kind: ChecksumKind, frame_id: int, data: bytes, at: int) -> int:
+    """Return the checksum of a frame whose byte ``at`` holds it.
+
+    Example:
+        >>> checksum_of("sum_toyota", 0x25, bytes([0, 1, 0, 0, 0, 0, 0, 0]), 7)  # 1 + 0x25 + a length of 8
+        46
+    """
+    rest = data[:at] + data[at + 1 :]
+    low, high = frame_id & 0xFF, frame_id >> 8
+    if kind == "sum_toyota":
+        return (low + high + len(data) + sum(rest)) & 0xFF
+    if kind == "sum_tesla":
+        return (low + high + sum(rest)) & 0xFF
+    crc = _START
+    for byte in bytes([low, high & 0xFF]) + rest:
+        crc ^= byte
+        for _ in range(8):
+            crc = ((crc << 1) ^ _POLYNOMIAL if crc & 0x80 else crc << 1) & 0xFF
+    return crc ^ 0xFF
+
+
+def _byte_of(message: Any, signal: str) -> int:
+    return int(message.get_signal_by_name(signal).start) // 8
+
+
+def _raw_range(signal: Any) -> tuple[int, int]:
+    n = int(signal.length)
+    return (-(1 << (n - 1)), (1 << (n - 1)) - 1) if signal.is_signed else (0, (1 << n) - 1)
+
+
+def _range(signal: Any) -> tuple[float, float]:
+    """Return the least and the greatest value of a signal.
+
+    The range that a database states counts where the bits can carry it. Databases written by hand often hold one that they cannot, such as
+    0 to 65535 for a yaw rate of 10 bits from -125 deg/s; then the bits decide.
+    """
+    low, high = sorted(raw * float(signal.scale) + float(signal.offset) for raw in _raw_range(signal))
+    least, most, half = signal.minimum, signal.maximum, abs(float(signal.scale)) / 2
+    if least is None or most is None or not (low - half <= least < most <= high + half):
+        return low, high
+    return max(low, float(least)), min(high, float(most))
+
+
+def _inside(signal: Any, value: float) -> bool:
+    (low, high), half = _range(signal), abs(float(signal.scale)) / 2
+    return low - half <= value <= high + half  # false for NaN

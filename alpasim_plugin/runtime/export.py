@@ -1,0 +1,196 @@
+"""A finished run as AlpaSim run folders, one for each renderer and policy, with its scenes: what AlpaSim's own evaluation takes as it is.
+
+    OUT/RENDERER/POLICY/rollouts/SCENE/SESSION/{rollout.asl, _complete}
+    OUT/RENDERER/POLICY/{run_metadata.yaml, eval-config.yaml, wizard-config.yaml}
+    OUT/scenes/SCENE.usdz
+
+The logs are copied entry by entry. What differs: the main camera is called as AlpaSim's image check expects it, the session ids of runs of
+older versions are replaced by ones that sort as their seeds, and a rollout of a policy without cameras gets frames of the main one.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.atomic import atomic_folder, write_json
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.rename import Renaming, Stage, copy_log
+from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.parts import resolve_renderer
+from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.contents import read_contents
+from alpasim_plugin.runtime.execute import thread_budget
+from alpasim_plugin.runtime.export_configs import SCENES, write_configs
+from alpasim_plugin.runtime.export_frames import AddedFrames
+from alpasim_plugin.runtime.export_scenes import scenes_of, write_scene
+from alpasim_plugin.runtime.manifests import read_manifest
+from alpasim_plugin.runtime.plan import RunOptions, slug
+from alpasim_plugin.runtime.recorder import LOG_NAME
+from alpasim_plugin.runtime.score_logs import check_vouched
+from alpasim_plugin.types import RolloutLog, Scenario
+from scenarios.load import load_scenario
+from scenarios.suite import ScenarioRef, expand
+from scenarios.usdz_write import alpasim_cameras
+
+DOING = "exporting to AlpaSim"
+COMPLETE, FAILED = "_complete", "failed_rollouts.json"
+PLAN_US = 5_000_000  # AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
+
+
+@dataclass
+class ExportedRun:
+    """One AlpaSim run folder that was written.
+
+    Attributes:
+        renderer: Its renderer.
+        policy: Its policy.
+        folder: Below the export.
+        rollouts: How many logs it holds.
+        failed: How many rollouts failed in the run and are only named in ``failed_rollouts.json``.
+        notes: What AlpaSim's tables will lack, and what was added.
+    """
+
+    renderer: str
+    policy: str
+    folder: str
+    rollouts: int = 0
+    failed: int = 0
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written: the folder, its runs and its scenes."""
+
+    root: Path
+    runs: tuple[ExportedRun, ...]
+    scenes: tuple[str, ...]
+
+
+def export_scenes(places: Sequence[str], out: Path) -> Export:
+    """Write scenarios as AlpaSim scenes into ``OUT/scenes``.
+
+    Raises:
+        InputError: A scenario is invalid, two share an id, or ``out`` is not empty.
+    """
+    _check_free(out)
+    refs = [ref for place in places for ref in expand(place, (), None)]
+    loaded: dict[str, tuple[ScenarioRef, Scenario]] = {}
+    for ref in refs:
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+        if scenario.scene_id in loaded:
+            raise InputError(DOING, ref.path, f"a second scene with the id {scenario.scene_id!r}", "name every scene once")
+        loaded[scenario.scene_id] = (ref, scenario)
+    with atomic_folder(out, DOING) as partial:
+        return Export(out, (), _write_scenes(partial, loaded))
+
+
+def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
+    """Write a finished run as AlpaSim run folders.
+
+    Args:
+        root: The run folder.
+        out: A new or empty folder; it is complete or not there.
+        say: Called with a line for each rollout.
+
+    Raises:
+        InputError: It is no finished run, it has only scores, a log is damaged, a scenario has changed, or ``out`` is not empty.
+    """
+    _check_free(out)
+    contents = read_contents(root)
+    info = contents.run
+    if info.get("kind") == "score":
+        raise InputError(DOING, str(root), "scores of logs, without the logs", "export the run folder that holds them")
+    manifests = [read_manifest(root / cell)[0] for cell in contents.rollouts]
+    loaded = scenes_of(info)
+    runs: dict[tuple[str, str], ExportedRun] = {}
+    with atomic_folder(out, DOING) as partial:
+        for manifest in manifests:
+            key = (str(manifest["renderer"]), str(manifest["policy"]))
+            run = runs.setdefault(key, ExportedRun(*key, f"{slug(key[0])}/{slug(key[1])}"))
+            if manifest["status"] != "ok":
+                run.failed += 1
+                continue
+            _export_rollout(root, partial / run.folder, manifest, loaded[manifest["scene"]][1], info, run)
+            run.rollouts += 1
+            say(f"{run.folder}/{manifest['scene']}/{manifest['seed']}")
+        for run in runs.values():
+            _finish(partial / run.folder, out, run, info, manifests)
+        scenes = _write_scenes(partial, loaded)
+    return Export(out, tuple(runs.values()), scenes)
+
+
+def _export_rollout(
+    root: Path, folder: Path, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any], run: ExportedRun
+) -> None:
+    """Copy one log, renamed and with images, and mark it complete."""
+    source = root / manifest["path"] / LOG_NAME
+    check_vouched(source)
+    rollout = read_asl(source)
+    uuid = session_uuid(int(manifest["seed"]), str(manifest["rollout_key"]))
+    cameras = {camera.name: name for name, camera in alpasim_cameras(scenario.cameras).items() if name != camera.name}
+    stages: list[Stage] = []
+    if not rollout.images:
+        stages.append(_added(rollout, manifest, scenario, info))
+        _note(run, "the log holds no camera image: frames of the main camera were rendered along the drive")
+    stages.append(Renaming(uuid, cameras))
+    target = folder / "rollouts" / manifest["scene"] / uuid
+    target.mkdir(parents=True)
+    copy_log(source, target / LOG_NAME, *stages)
+    (target / COMPLETE).touch()
+    _note_plans(rollout, run)
+
+
+def _added(rollout: RolloutLog, manifest: Mapping[str, Any], scenario: Scenario, info: Mapping[str, Any]) -> AddedFrames:
+    options = RunOptions(**{f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]})
+    spec = resolve_renderer(manifest["renderer"], tuple(options.fixer))
+    (main,) = list(alpasim_cameras(scenario.cameras).values())[:1] or (None,)
+    if main is None:
+        raise InputError(DOING, manifest["path"], "no camera in the scenario, and no image in the log", "add a camera to the scenario")
+    threads = thread_budget(1, 1).per_worker
+    return AddedFrames(
+        rollout, main, scenario.rates.camera_us, lambda: make_renderer(spec, scenario, int(manifest["seed"]), options.device, threads)
+    )
+
+
+def _note_plans(rollout: RolloutLog, run: ExportedRun) -> None:
+    """Note what AlpaSim's minADE will lack."""
+    samples = [(plan.now_us, sample) for plan in rollout.plans for sample in plan.samples]
+    if not samples:
+        _note(run, "no minADE: the policy gives no sampled plans")
+    elif min(int(sample.t_us[-1]) - now for now, sample in samples) < PLAN_US:
+        shortest = min(int(sample.t_us[-1]) - now for now, sample in samples) * 1e-6
+        _note(run, f"no minADE where a sampled plan ends before 5 s: the shortest reaches {shortest:g} s")
+
+
+def _note(run: ExportedRun, text: str) -> None:
+    run.notes = (*run.notes, text) if text not in run.notes else run.notes
+
+
+def _finish(folder: Path, out: Path, run: ExportedRun, info: Mapping[str, Any], manifests: Sequence[Mapping[str, Any]]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{run.renderer} {run.policy}"
+    write_configs(folder, out, name, f"{info.get('content')}/{run.renderer}/{run.policy}")
+    failed = [m for m in manifests if m["status"] != "ok" and (m["renderer"], m["policy"]) == (run.renderer, run.policy)]
+    if failed:
+        rows = [
+            {"run_name": name, "clipgt_id": m["scene"], "rollout_id": f"seed-{m['seed']}", "error": m["error"]["found"]} for m in failed
+        ]
+        write_json(folder / FAILED, rows)
+
+
+def _write_scenes(partial: Path, loaded: Mapping[str, tuple[ScenarioRef, Scenario]]) -> tuple[str, ...]:
+    (partial / SCENES).mkdir(parents=True, exist_ok=True)
+    for scene_id, (ref, scenario) in loaded.items():
+        write_scene(partial / SCENES / f"{slug(scene_id)}.usdz", ref, scenario)
+    return tuple(f"{SCENES}/{slug(scene_id)}.usdz" for scene_id in loaded)
+
+
+def _check_free(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(os.scandir(out))):
+        raise InputError(DOING, f"--alpasim {out}", "it is there and not empty", "name a new folder, or remove it first")

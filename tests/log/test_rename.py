@@ -1,0 +1,60 @@
+"""Copies of logs: byte-equal where nothing is renamed, and otherwise only what is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from alpasim_plugin.alpasim.asl import AslReader
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.rename import Renaming, copy_log
+from alpasim_plugin.log.session import session_uuid
+
+
+@pytest.fixture(scope="module")
+def logs(shared_data: Path) -> list[Path]:
+    return sorted((shared_data / "alpasim-golden" / "rollouts").glob("*/*/rollout.asl"))
+
+
+def test_alpasims_own_logs_are_copied_byte_by_byte(logs: list[Path], tmp_path: Path) -> None:
+    whole = [log for log in logs if log.parent == min(log.parent.parent.iterdir())][::4]  # complete logs, of a few scenes
+    assert len(whole) > 4
+    for log in whole:
+        copy_log(log, tmp_path / "copy.asl", Renaming())
+        assert (tmp_path / "copy.asl").read_bytes() == log.read_bytes(), log
+
+
+def test_a_renamed_log_differs_in_its_names_alone(logs: list[Path], tmp_path: Path) -> None:
+    source, target = logs[0], tmp_path / "copy.asl"
+    old, camera = source.parent.name, "camera_front_wide_120fov"
+    new = session_uuid(7, "x")
+    copy_log(source, target, Renaming(new, {camera: "other_camera_of_24_bytes"}))
+    assert old.encode() not in target.read_bytes()
+    assert camera.encode() not in target.read_bytes()
+    log = read_asl(target)
+    assert (log.session_uuid, {image.camera for image in log.images}) == (new, {"other_camera_of_24_bytes"})
+    copy_log(target, tmp_path / "back.asl", Renaming(old, {"other_camera_of_24_bytes": camera}))
+    assert (tmp_path / "back.asl").read_bytes() == source.read_bytes()
+
+
+def test_a_cut_log_is_no_source(logs: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "cut.asl").write_bytes(logs[0].read_bytes()[:5000])
+    with pytest.raises(InputError, match="last entry cut"):
+        copy_log(tmp_path / "cut.asl", tmp_path / "copy.asl", Renaming("x"))
+    assert not (tmp_path / "copy.asl").exists()
+
+
+def test_stages_follow_one_another(logs: list[Path], tmp_path: Path) -> None:
+    count = copy_log(logs[0], tmp_path / "copy.asl", lambda entry: [entry, entry], Renaming("x"))
+    assert count == 2 * sum(1 for _ in AslReader(logs[0]))
+
+
+@given(st.lists(st.integers(0, 2**63 - 1), min_size=2, max_size=8, unique=True), st.text(), st.text())
+def test_session_ids_sort_as_their_seeds(seeds: list[int], one: str, other: str) -> None:
+    ids = {seed: session_uuid(seed, one if i % 2 else other) for i, seed in enumerate(seeds)}
+    assert sorted(seeds) == sorted(seeds, key=ids.__getitem__)
+    assert all(len(name) == 36 and name[14] == "8" and name[19] in "89ab" for name in ids.values())

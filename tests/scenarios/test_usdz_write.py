@@ -1,0 +1,169 @@
+"""Scenarios written as AlpaSim scenes: what is read back is what AlpaSim's loader would see, for every source."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import shapely
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry_lanes import lane_polygon
+from alpasim_plugin.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
+from scenarios.alpasim_map import alpasim_view, rails
+from scenarios.load import load_scenario
+from scenarios.usdz import read_usdz
+from scenarios.usdz_calibration import pixel_to_angle
+from scenarios.usdz_tables import table_ids
+from scenarios.usdz_write import alpasim_cameras, write_usdz
+
+TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
+
+
+@pytest.fixture(scope="module")
+def straight() -> Scenario:
+    return load_scenario("smoke/straight")
+
+
+@pytest.fixture(scope="module", params=["smoke/lead_car", "real/us101"])
+def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
+    scenario = load_scenario(request.param)
+    path = tmp_path_factory.mktemp("scenes") / "scene.usdz"
+    write_usdz(path, scenario)
+    return scenario, path
+
+
+def table(path: Path, name: str) -> list[dict]:
+    with zipfile.ZipFile(path) as archive:
+        return pq.read_table(io.BytesIO(archive.read(f"clipgt/{name}.parquet"))).to_pylist()
+
+
+def test_what_is_read_back_is_the_map_that_preset_alpasim_scores(written: tuple[Scenario, Path]) -> None:
+    scenario, path = written
+    read, view = read_usdz(path), scenario.alpasim_map
+    assert view is not None
+    ids = table_ids(list(view.lanes))
+    assert list(read.lane_map.lanes) == [ids[key] for key in view.lanes]
+    for key, lane in view.lanes.items():
+        other = read.lane_map.lanes[ids[key]]
+        for name in ("centre", "left", "right"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(lane, name))  # unrounded
+        assert other.successors == tuple(ids[s] for s in lane.successors)
+        assert other.left_neighbour == ids.get(lane.left_neighbour or "")
+    assert len(read.lane_map.road_edges) == len(view.road_edges)
+    for one, edge in zip(read.lane_map.road_edges, view.road_edges, strict=True):
+        np.testing.assert_array_equal(one, edge)
+    assert read.lane_map.signs == ()  # a row stands in for none, and is no sign
+    assert len(read.lane_map.stop_lines) == len(scenario.lane_map.stop_lines)
+
+
+def test_drive_traffic_and_vehicle_come_back(written: tuple[Scenario, Path]) -> None:
+    scenario, path = written
+    read = read_usdz(path)
+    assert (read.scene_id, read.vehicle.box) == (scenario.scene_id, scenario.vehicle.box)
+    assert read.vehicle.rear_axle_to_centre_m == pytest.approx(scenario.vehicle.rear_axle_to_centre_m, abs=1e-6)
+    np.testing.assert_array_equal(read.ego_log.t_us, scenario.ego_log.t_us)
+    np.testing.assert_array_equal(read.ego_log.xyz, scenario.ego_log.xyz)
+    assert read.first_frame_us == scenario.start_us
+    assert [(a.actor_id, a.label, a.box, a.is_static) for a in read.actors] == [
+        (a.actor_id, a.label, a.box, a.is_static) for a in scenario.actors
+    ]
+    for one, other in zip(read.actors, scenario.actors, strict=True):
+        np.testing.assert_array_equal(one.track.xyz, other.track.xyz)
+        np.testing.assert_allclose(np.abs(np.sum(one.track.quat * other.track.quat, axis=1)), 1.0, atol=1e-12)
+
+
+def test_no_table_is_empty_and_links_go_both_ways(written: tuple[Scenario, Path]) -> None:
+    _, path = written
+    rows = {name: table(path, name) for name in TABLES}
+    assert all(rows.values())
+    lanes = {row["key"]["map_id"] for row in rows["lane"]}
+    clip = rows["clip"][0]["key"]["clip_id"]
+    assert all(row["key"]["clip_id"] == clip for name in TABLES for row in rows[name])
+    links = {(r["key"]["kind"], r["association"]["subjects"], o) for r in rows["association"] for o in r["association"]["objects"]}
+    forward = {(a, b) for kind, a, b in links if kind == "NEXT_LANE"}
+    assert forward == {(b, a) for kind, a, b in links if kind == "PREVIOUS_LANE"}
+    assert {end for pair in forward for end in pair} <= lanes
+    for row in rows["wait_line"]:
+        parts = row["key"]["map_id"].split("-")
+        assert len(parts) == 2
+        assert parts[1] in lanes
+    assert all(len(r["lane"]["left_rail"]) == len(r["lane"]["right_rail"]) for r in rows["lane"])
+
+
+def test_the_same_scenario_gives_the_same_bytes(straight: Scenario, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_usdz(tmp_path / name, straight)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_lane_with_unequal_edges_keeps_its_area() -> None:
+    t = np.linspace(0, np.pi / 2, 40)
+    left = np.column_stack([20 * np.cos(t), 20 * np.sin(t), 0.01 * t])
+    right = np.column_stack([24 * np.cos(t), 24 * np.sin(t), 0.01 * t])[[0, 3, 9, 10, 25, 39]]
+    lane = Lane("a-1", (left[::13] + left[::13]) / 2, left, right)
+    view = alpasim_view(LaneMap({"a-1": lane, "walk": replace(lane, lane_id="walk", kind="sidewalk")}))
+    assert list(view.lanes) == ["a-1"]
+    one, other = rails(lane)
+    assert len(one) == len(other) >= 40
+    before, after = lane_polygon(lane), lane_polygon(view.lanes["a-1"])
+    assert shapely.symmetric_difference(before, after).area < 1e-9 * before.area
+    assert float(np.linalg.norm(np.diff(view.lanes["a-1"].centre, axis=0), axis=1).max()) <= 2.0
+
+
+def test_a_lane_without_edges_is_widened() -> None:
+    centre = np.array([[0.0, 0, 0], [10, 0, 0], [20, 0, 0]])
+    left, right = rails(Lane("a", centre, None, None))
+    np.testing.assert_allclose(left[:, 1], 1.85)
+    np.testing.assert_allclose(right[:, 1], -1.85)
+
+
+def test_a_shoulder_is_a_lane_and_a_single_pose_lasts(straight: Scenario, tmp_path: Path) -> None:
+    first = next(iter(straight.lane_map.lanes.values()))
+    shoulder = replace(first, lane_id="shoulder", kind="shoulder", successors=(), left_neighbour=None, right_neighbour=None)
+    pose = Trajectory(np.array([100_000]), np.array([[5.0, 1.0, 0.8]]), np.array([[1.0, 0, 0, 0]]))
+    cone = Actor("cone", "other", Box(0.4, 0.4, 0.8), pose, is_static=True)
+    scenario = replace(straight, lane_map=LaneMap({**straight.lane_map.lanes, "shoulder": shoulder}), actors=(cone,))
+    write_usdz(tmp_path / "s.usdz", scenario)
+    read = read_usdz(tmp_path / "s.usdz")
+    assert "shoulder" in read.lane_map.lanes
+    assert read.lane_map.road_edges == ()  # an empty table of borders, as AlpaSim accepts it
+    (actor,) = read.actors
+    assert actor.is_static
+    assert actor.track.t_us.tolist() == [int(scenario.ego_log.t_us[0]), int(scenario.ego_log.t_us[-1])]
+
+
+def test_the_main_camera_is_called_as_alpasim_expects_and_its_lens_is_the_pinhole(straight: Scenario, tmp_path: Path) -> None:
+    (camera,) = straight.cameras
+    assert list(alpasim_cameras((replace(camera, name="left"), camera))) == ["left", "camera_front_wide_120fov"]
+    assert list(alpasim_cameras((replace(camera, name="left"),))) == ["camera_front_wide_120fov"]
+    radius = np.linspace(0, np.hypot(camera.width, camera.height) / 2, 50)
+    angle = np.polynomial.polynomial.polyval(radius, pixel_to_angle(camera))
+    focal = float(camera.K[0, 0])
+    assert np.abs(focal * np.tan(angle) - radius).max() < 0.05  # pixels
+    write_usdz(tmp_path / "s.usdz", straight)
+    (read,) = read_usdz(tmp_path / "s.usdz").cameras
+    np.testing.assert_allclose(read.T_rig_camera, camera.T_rig_camera, atol=1e-9)
+    with zipfile.ZipFile(tmp_path / "s.usdz") as archive:
+        (rig,) = json.loads(archive.read("rig_trajectories.json"))["rig_trajectories"]
+        mesh = archive.read("mesh_ground.ply")
+    frames = rig["cameras_frame_timestamps_us"]["camera_front_wide_120fov@0"]
+    assert frames[0] == [straight.start_us - 30_000, straight.start_us]
+    assert all(end - start == 30_000 for start, end in frames)
+    assert mesh.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 4\n")  # level ground: two triangles
+
+
+def test_a_scene_that_alpasim_cannot_drive_is_refused(straight: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no lane"):
+        write_usdz(tmp_path / "s.usdz", replace(straight, lane_map=LaneMap({})))
+    assert not (tmp_path / "s.usdz").exists()
+
+
+def test_names_with_hyphens_stay_apart() -> None:
+    assert table_ids(["a-1", "a~1"]) == {"a-1": "lane0", "a~1": "lane1"}
