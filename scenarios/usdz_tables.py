@@ -90,16 +90,16 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[dict[str, 
     for key, lane in lanes.items():
         for successor in lane.successors:
             before.setdefault(successor, []).append(key)
-    out = []
+    out: list[dict[str, Any]] = []
     for key, lane in lanes.items():
-        found = {
-            "NEXT_LANE": lane.successors,
-            "PREVIOUS_LANE": before.get(key, ()),
+        found: dict[str, tuple[str | None, ...]] = {
+            "NEXT_LANE": tuple(lane.successors),
+            "PREVIOUS_LANE": tuple(before.get(key, ())),
             "LEFT_LANE": (lane.left_neighbour,),
             "RIGHT_LANE": (lane.right_neighbour,),
         }
         for kind, others in found.items():
-            objects = [ids[other] for other in others if other in ids]
+            objects = [ids[other] for other in others if other is not None and other in ids]
             if objects:
                 out.append(_row(f"a{len(out)}", "association", {"subjects": ids[key], "objects": objects}, kind))
     return out or [_row("a0", "association", {"subjects": next(iter(ids.values())), "objects": []}, "SIGN_TO_LANE")]

@@ -46,9 +46,7 @@ def serve(
     kept_scenes: Annotated[int, typer.Option("--kept-scenes", min=1, help="Scenes that stay loaded.")] = 4,
     reliability: Annotated[float | None, typer.Option("--reliability", min=0.0, max=1.0, help="Fixed trust in upstream frames.")] = None,
     mask: Annotated[list[str] | None, typer.Option("--mask", metavar="CAMERA=FILE", help="Grey picture, white is trusted.")] = None,
-    upstream_image: Annotated[
-        Literal["png", "as-asked"], typer.Option("--upstream-image", help="Format to ask the upstream for.")
-    ] = "png",
+    upstream_image: Annotated[Literal["png", "as-asked"], typer.Option("--upstream-image", help="Format to ask the upstream for.")] = "png",
     prefetch: Annotated[bool, typer.Option("--prefetch", help="Load all scenes before the port opens.")] = False,
     drain_s: Annotated[float, typer.Option("--drain-s", min=0.0, help="At the end, wait so long for running calls.")] = 30.0,
     tls_cert: Annotated[Path | None, typer.Option("--tls-cert", help="PEM certificate of this server.")] = None,

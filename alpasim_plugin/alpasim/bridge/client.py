@@ -57,9 +57,7 @@ class RendererClient:
             ValueError: An answer that AlpaSim's runtime would refuse as well.
         """
         item = sensorsim_pb2.BatchRGBRenderRequestItem
-        batch = sensorsim_pb2.BatchRGBRenderRequest(
-            items=[item(camera_name=r.camera_intrinsics.logical_id, request=r) for r in requests]
-        )
+        batch = sensorsim_pb2.BatchRGBRenderRequest(items=[item(camera_name=r.camera_intrinsics.logical_id, request=r) for r in requests])
         reply = self._again(batch)
         names = sorted(i.camera_name for i in reply.items)
         if names != sorted(i.camera_name for i in batch.items) or not all(i.success for i in reply.items):

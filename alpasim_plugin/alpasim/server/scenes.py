@@ -140,5 +140,3 @@ def advertised(scenario: Scenario) -> list[sensorsim_pb2.AvailableCamerasReturn.
         twin.logical_id = twin.intrinsics.logical_id = FRONT_WIDE
         cameras.append(twin)
     return cameras
-
-

@@ -163,9 +163,7 @@ class WorldModel(Failures):
                 session.last = data, self._chunk(session, request, left)
             return session.last[1]
 
-    def _chunk(
-        self, session: Session, request: video_model_pb2.VideoChunkRequest, left: CallTime
-    ) -> video_model_pb2.VideoChunkReturn:
+    def _chunk(self, session: Session, request: video_model_pb2.VideoChunkRequest, left: CallTime) -> video_model_pb2.VideoChunkReturn:
         poses = request.rig_trajectory.poses
         check_length(len(poses), session.end_us is None)
         times = [pose.timestamp_us for pose in poses]
