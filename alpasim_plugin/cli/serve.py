@@ -58,7 +58,7 @@ def serve(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON line when the port is open, and one at the end.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Log every failed call with its traceback.")] = False,
 ) -> None:
-    """Serve AlpaSim's renderer service: our renderer, or OneFixer in front of any other renderer, without a change in AlpaSim.
+    """Serve AlpaSim's renderer service: our renderer, or OneFixer in front of any other renderer.
 
     Frames of all rollouts may come over one connection in any order: each drive's history is found by what is asked (docs/alpasim.md).
     """

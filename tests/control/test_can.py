@@ -257,7 +257,7 @@ def test_a_control_unit_drives_a_curve_and_twice_the_same(curve: Scenario) -> No
     gap = np.linalg.norm(log.ego_log.xyz[:, :2] - ends, axis=1).min()
     assert gap < 2.5  # box centre against rear axle: 1.4 m, and the curve's cut
     turned = 2 * np.arccos(abs(float(np.dot(log.ego.quat[0], log.ego.quat[-1]))))
-    assert turned > 0.1  # it steered
+    assert turned > 0.05  # it steered
     again, _ = drive(curve, "test-drive-two")
     np.testing.assert_array_equal(log.ego.xyz, again.ego.xyz)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.log import read_asl
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute
@@ -87,7 +88,8 @@ def test_the_same_command_again_keeps_the_certificate_until_the_log_is_another(t
     assert certificate(plan_of(images="jpeg"), tmp_path, first) == first  # wall_s included: nothing was repeated
     log = tmp_path / first["path"] / "rollout.asl"
     data = bytearray(log.read_bytes())
-    at = data.rindex(b"\xff\xd9") - 40  # inside the last camera image, before its end mark
+    image = read_asl(log).images[-1].data
+    at = data.rindex(image) + len(image) - 40  # inside the last camera image, before its end mark
     data[at] ^= 1
     log.write_bytes(bytes(data))
     plan = plan_of(images="jpeg")  # a run would drive the damaged rollout again before it is repeated
