@@ -132,9 +132,8 @@ def edit_and_drive_again(installed: Installed, out: str, *parts: str) -> None:
         shutil.copy(TOY / "toy_parts.py", installed.package)
 
 
-@pytest.mark.parametrize(
-    "name", ["policies.mine:Straight", pytest.param("policies/mine.py:Straight", marks=pytest.mark.slow)], ids=["module", "file"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["policies.mine:Straight", "policies/mine.py:Straight"], ids=["module", "file"])
 def test_an_edited_policy_file_is_driven_again(installed: Installed, name: str) -> None:
     mine = installed.work / "policies"
     mine.mkdir(exist_ok=True)
