@@ -16,6 +16,7 @@ def test_answers_under_load_equal_those_alone(overrides: list[str]) -> None:
     assert all(0 < row.p50_ms <= row.p95_ms <= row.p99_ms and row.requests_per_s > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_a_soak_keeps_to_its_memory(overrides: list[str]) -> None:
     row = soak(Settings(overrides=overrides, threads=1, history_bytes=1 << 20), 160, (48, 32))
     assert (row.failed, row.frames) == (0, 160)

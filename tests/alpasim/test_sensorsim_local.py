@@ -122,6 +122,7 @@ def changed(scene_id: str | None = None, track: str | None = None) -> sensorsim_
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_our_own_service_behind_the_fixer_equals_both_in_one(served: tuple[Any, Assembled], overrides: list[str], tmp_path: Path) -> None:
     """Upstream and fixer in two servers give the pictures of one server where the upstream is fully trusted and has no holes."""
     _, behind = served

@@ -102,6 +102,7 @@ def test_chunks_equal_chunks_of_other_lengths_in_another_session(
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_repeated_chunk_is_answered_alike_and_interleaved_sessions_stay_apart(served: tuple[Any, Assembled]) -> None:
     stub, _ = served
     a, b = (stub.start_session(session()) for _ in range(2))
@@ -121,6 +122,7 @@ def test_map_frames_come_on_request_and_alone_if_asked(served: tuple[Any, Assemb
     assert (len(alone.rgb_frames), list(alone.hdmap_condition_frames)) == (0, list(both.hdmap_condition_frames))
 
 
+@pytest.mark.slow
 def test_the_seed_is_the_noises(served: tuple[Any, Assembled]) -> None:
     _, made = served
     assert made.fixers is not None

@@ -48,7 +48,8 @@ def check_no_growth(error: torch.Tensor, precision: Precision) -> None:
     assert float(late / early) < 1.15, (float(early), float(late))
 
 
-@pytest.mark.parametrize("precision", ["bf16", pytest.param("fp16", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_error_does_not_grow_over_900_latents(precision):
     check_no_growth(errors(TINY, precision, 450, 2, 4), precision)
 

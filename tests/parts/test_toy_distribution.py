@@ -93,6 +93,7 @@ def test_parts_of_a_package_are_listed(installed: Installed) -> None:
     assert "toy_wobble_m" in listed["metrics"]
 
 
+@pytest.mark.slow
 def test_a_run_is_driven_scored_compared_and_driven_again_where_it_was_edited(installed: Installed) -> None:
     anew = installed.drive("run", *NAMED, workers=2)
     assert len(anew) == 4

@@ -130,6 +130,7 @@ def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
     assert run(plan, tmp_path)[1].fates == [("failed", False)]  # the file may be there now
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1), marks=pytest.mark.slow)], ids=str)
 def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path, seeds: tuple[int, ...]) -> None:
     refs = expand("smoke/straight", SHORT)
@@ -141,6 +142,7 @@ def test_a_worker_that_dies_takes_only_its_own_rollout(tmp_path: Path, seeds: tu
     assert result.exit_code == 4
 
 
+@pytest.mark.slow
 def test_a_killed_run_loses_no_finished_rollout(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", "clean", "--policy", "lane-camera", "--seeds", "3"]
     command += ["--set", SHORT[0], "--workers", "1", "--certify", "none", "--no-report", "--out", str(tmp_path), "smoke/straight"]
