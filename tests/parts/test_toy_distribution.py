@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
 TOY = Path(__file__).parent / "toy"
 REPO = Path(__file__).resolve().parents[2]
 NAMED = ("--renderer", "toy-grey,toy-brighten+toy-grey", "--policy", "toy-straight", "--controller", "toy-jump")
@@ -93,7 +94,6 @@ def test_parts_of_a_package_are_listed(installed: Installed) -> None:
     assert "toy_wobble_m" in listed["metrics"]
 
 
-@pytest.mark.slow
 def test_a_run_is_driven_scored_compared_and_driven_again_where_it_was_edited(installed: Installed) -> None:
     anew = installed.drive("run", *NAMED, workers=2)
     assert len(anew) == 4
@@ -109,7 +109,6 @@ def test_a_run_is_driven_scored_compared_and_driven_again_where_it_was_edited(in
     edit_and_drive_again(installed, "run", *NAMED)
 
 
-@pytest.mark.slow
 def test_parts_named_by_import_path_are_driven_again_where_they_were_edited(installed: Installed) -> None:
     installed.edit("simrun_toy-1.0.dist-info/entry_points.txt", "toy-wobble = toy_parts:Wobble\n", "")  # or the metric is given twice
     try:
@@ -133,7 +132,6 @@ def edit_and_drive_again(installed: Installed, out: str, *parts: str) -> None:
         shutil.copy(TOY / "toy_parts.py", installed.package)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["policies.mine:Straight", "policies/mine.py:Straight"], ids=["module", "file"])
 def test_an_edited_policy_file_is_driven_again(installed: Installed, name: str) -> None:
     mine = installed.work / "policies"
