@@ -145,7 +145,7 @@ def _other(work: Callable[[Ranks, Report | None], Any], rank: int, count: int, m
     torch.set_num_threads(threads)
     try:
         _ranked(work, rank, count, meeting, None)
-    except SimrunError as error:  # the first rank meets the same and tells it, unless it is this one's alone
+    except SimrunError as error:  # the first rank raises the same, unless it concerns this one alone
         failures.put((rank, str(error)))
     except Exception as error:
         failures.put((rank, f"{type(error).__name__}: {error}"))

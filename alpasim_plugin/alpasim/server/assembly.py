@@ -59,7 +59,7 @@ class Upstream:
 
 @dataclass(frozen=True)
 class Settings:
-    """What `simrun serve` is told.
+    """Options of `simrun serve`.
 
     Attributes:
         renderer: ``onefixer``, ``identity``, ``3dgs``, ``onefixer+clean``, ...; over an upstream only the fixer counts.

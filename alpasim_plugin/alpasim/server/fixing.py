@@ -34,7 +34,7 @@ def resolve_served(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         return resolve_renderer(name, [*overrides, "noise=content"])
     if spec.fixer.name == "identity":
         return RendererSpec(spec.name, spec.base)
-    found = f"{spec.fixer.name} works on blocks of frames, whose poses a render request does not tell"
+    found = f"{spec.fixer.name} works on blocks of frames, whose poses are not part of a render request"
     raise InputError(DOING, f"renderer {name!r}", found, "serve a fixer of single frames, such as onefixer")
 
 

@@ -135,8 +135,8 @@ def advertised(scenario: Scenario) -> list[sensorsim_pb2.AvailableCamerasReturn.
     cameras = [wire_camera(camera) for camera in scenario.cameras]
     if cameras and all(camera.logical_id != FRONT_WIDE for camera in cameras):
         front = next((camera for camera in cameras if camera.logical_id == "front"), cameras[0])
-        twin = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera()
-        twin.CopyFrom(front)
-        twin.logical_id = twin.intrinsics.logical_id = FRONT_WIDE
-        cameras.append(twin)
+        alias = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera()
+        alias.CopyFrom(front)
+        alias.logical_id = alias.intrinsics.logical_id = FRONT_WIDE
+        cameras.append(alias)
     return cameras

@@ -119,7 +119,7 @@ class Sensorsim(Failures):
 
     @answering
     def prefetch_scene(self, request: sensorsim_pb2.ScenePrefetchRequest, context: Any) -> common_pb2.Empty:
-        """Load and build a scene before its first frame is asked for; the upstream is told as well, where it knows the call."""
+        """Load and build a scene before its first frame is asked for; the call is forwarded to an upstream that implements it."""
         if self._shelf is not None:
             self._shelf.get(request.scene_id)
         if self._upstream is not None:

@@ -1,6 +1,6 @@
 """AlpaSim's video-model service, ``WorldModelService``: whole chunks of frames, by the renderer and the fixer of `simrun serve`.
 
-A session is told the map and the cameras, then for each chunk the rig's poses and the road users. The scene is found by the clip's id in
+A session receives the map and the cameras, then for each chunk the rig's poses and the road users. The scene is found by the clip's id in
 the names of the map's tables; our renderer draws it, and the fixer goes over the frames one after another, so that chunks of any length
 give the same frames. The first chunk has 5 frames (1 + 4 k), every later one 8 (4 k): one frame for each pose.
 
@@ -31,6 +31,7 @@ from alpasim_plugin.alpasim.wire import common_pb2, video_model_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate
 from alpasim_plugin.log.images import encode_image
+from alpasim_plugin.reading import parsing
 from alpasim_plugin.reading.images import check_image
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
@@ -230,12 +231,9 @@ def clip_of(archive: bytes) -> str:
     Raises:
         InputError: No ZIP, or names that are not those of one clip.
     """
-    try:
-        with zipfile.ZipFile(BytesIO(archive)) as zipped:
-            names = zipped.namelist()[:MAX_MEMBERS]
-    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        found = f"{len(archive)} bytes that are no ZIP ({error})"
-        raise InputError(DOING, "the map of a session", found, "send zipped parquet tables") from error
+    what = f"{len(archive)} bytes that are no ZIP"
+    with parsing(DOING, "the map of a session", "send zipped parquet tables", what), zipfile.ZipFile(BytesIO(archive)) as zipped:
+        names = zipped.namelist()[:MAX_MEMBERS]
     clips = {name.removesuffix(".parquet").rpartition(".")[0] for name in names if name.endswith(".parquet")}
     if len(clips) != 1 or "" in clips:
         found = f"{len(names)} members of clips {sorted(clips)[:3]}"
