@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from alpasim_plugin.bench.raster import bench_raster
 from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline, bench_serve
+from alpasim_plugin.cli.bench_rows import print_rows
 from alpasim_plugin.cli.quality import EPILOG as QUALITY_EXAMPLES
 from alpasim_plugin.cli.quality import quality
 
@@ -47,12 +45,4 @@ def raster(
         rows = [asdict(row) for row in bench_gradients(repeats=repeats)]
     else:
         rows = [asdict(row) for row in bench_raster(repeats=repeats)]
-    if as_json:
-        print(json.dumps(rows))
-        return
-    table = Table(box=None, header_style="bold")
-    for name in rows[0]:
-        table.add_column(name.replace("_", " "), justify="right")
-    for row in rows:
-        table.add_row(*("-" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
-    Console().print(table)
+    print_rows(rows, as_json)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import Annotated, Literal
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from alpasim_plugin.alpasim.server.assembly import Settings
 from alpasim_plugin.bench.serve import bench_serve, soak
 from alpasim_plugin.cli.bench_fixer import parse_size
+from alpasim_plugin.cli.bench_rows import print_rows
 from alpasim_plugin.errors import InputError
 
 SIDE = 16
@@ -53,15 +51,7 @@ def serve(
         rows = [asdict(soak(settings, soak_frames, shape))]
     else:
         rows = [asdict(row) for row in bench_serve(settings, parse_counts(rollouts), frames, shape)]
-    if as_json:
-        print(json.dumps(rows))
-        return
-    table = Table(box=None, header_style="bold")
-    for name in rows[0]:
-        table.add_column(name.replace("_", " "), justify="right")
-    for row in rows:
-        table.add_row(*(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
-    Console().print(table)
+    print_rows(rows, as_json)
 
 
 def parse_counts(text: str) -> list[int]:

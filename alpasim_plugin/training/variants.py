@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TypeVar
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.shared_rollout import Objectives
 
+V = TypeVar("V")
 BASE, IMAGE = "base", "image"
 
 
@@ -77,6 +79,15 @@ def variant_of(name: str) -> Variant:
     Raises:
         InputError: No such variant.
     """
-    if name not in VARIANTS:
-        raise InputError("choosing what to train", f"variant {name!r}", "no such variant", f"choose one of {', '.join(VARIANTS)}")
-    return VARIANTS[name]
+    return lookup(name, VARIANTS)
+
+
+def lookup(name: str, known: Mapping[str, V]) -> V:
+    """Return one of the known variants, of whichever generator.
+
+    Raises:
+        InputError: No such variant.
+    """
+    if name not in known:
+        raise InputError("choosing what to train", f"variant {name!r}", "no such variant", f"choose one of {', '.join(known)}")
+    return known[name]

@@ -21,6 +21,21 @@ from .protos import (
     video_model_pb2,
 )
 
+#: Every message module, in order of name.
+MODULES = (
+    common_pb2,
+    controller_pb2,
+    egodriver_pb2,
+    health_pb2,
+    logging_pb2,
+    physics_pb2,
+    reflection_pb2,
+    runtime_pb2,
+    sensorsim_pb2,
+    traffic_pb2,
+    video_model_pb2,
+)
+
 #: Full gRPC path prefix of each service as its clients dial it, by the name of our compiled service.
 SERVICE_PATHS = {
     "SensorsimService": "/nre.grpc.protos.sensorsim.SensorsimService/",
@@ -39,6 +54,7 @@ API_VERSION = (0, 54, 0)
 
 __all__ = [
     "API_VERSION",
+    "MODULES",
     "SERVICE_PATHS",
     "common_pb2",
     "controller_pb2",

@@ -16,8 +16,8 @@ from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
 
-from . import SERVICE_PATHS, common_pb2, logging_pb2, reflection_pb2
-from .services import MODULES, handlers
+from . import MODULES, SERVICE_PATHS, reflection_pb2
+from .services import handlers
 
 #: Packages as AlpaSim names them, by the last part of ours; "" is no package.
 PACKAGES = {
@@ -43,7 +43,7 @@ UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
 def public_pool() -> DescriptorPool:
     """Return a pool with every message and service under the names that AlpaSim uses."""
     pool = DescriptorPool()
-    files = {module.DESCRIPTOR.name: module.DESCRIPTOR for module in (common_pb2, logging_pb2, *MODULES)}
+    files = {module.DESCRIPTOR.name: module.DESCRIPTOR for module in MODULES}
     done: set[str] = set()
 
     def add(file: FileDescriptor) -> None:

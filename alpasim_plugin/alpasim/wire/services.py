@@ -15,31 +15,9 @@ from google.protobuf.descriptor_pb2 import ServiceDescriptorProto
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
-from . import (
-    SERVICE_PATHS,
-    controller_pb2,
-    egodriver_pb2,
-    health_pb2,
-    physics_pb2,
-    reflection_pb2,
-    runtime_pb2,
-    sensorsim_pb2,
-    traffic_pb2,
-    video_model_pb2,
-)
+from . import MODULES, SERVICE_PATHS
 
 MESSAGE_BYTES = 64 << 20  # AlpaSim opens its renderer channels with this limit, both ways
-MODULES = (
-    controller_pb2,
-    egodriver_pb2,
-    health_pb2,
-    physics_pb2,
-    reflection_pb2,
-    runtime_pb2,
-    sensorsim_pb2,
-    traffic_pb2,
-    video_model_pb2,
-)
 OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.max_receive_message_length", MESSAGE_BYTES),
     ("grpc.max_send_message_length", MESSAGE_BYTES),
