@@ -37,11 +37,14 @@ from evaluators.video.summary import TRUTH, summarise
 from evaluators.video.table import markdown
 
 DOING = "measuring quality"
+Given = Literal["render", "truth"]  # what the fixers get
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames that are shown, as shares of a clip
 EPILOG = """
 Examples:
 
 - `simrun bench quality data/pairs --split test --fixer 3dgs,onefixer --out runs/quality`
+
+- `simrun bench quality data/video --split held-out --input truth --fixer onefixer --baseline onefixer --out runs/unharmed`
 
 - `simrun bench quality data/pairs --fixer 3dgs,v9=runs/v9/fixer.safetensors,two=onefixer@2 --set two:fixer.window=4 --jobs 2 --out runs/q`
 """
@@ -52,6 +55,7 @@ class Work:
     """One clip under one variant, as sent to a worker process."""
 
     folder: Path  # of the sequence
+    given: Given
     variant: Variant
     frames: int
     seed: int
@@ -77,6 +81,10 @@ def quality(
     out: Annotated[Path, typer.Option("--out", help="Folder for results; the same command continues there.")],
     fixers: Annotated[str, typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE.")] = "3dgs",
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
+    given: Annotated[
+        Given,
+        typer.Option("--input", help="What fixers get: the degraded render, or the ground truth, opaque, which they should leave alone."),
+    ] = "render",
     baseline: Annotated[str, typer.Option("--baseline", help="Variant that the others are compared with.")] = RAW,
     frames: Annotated[int, typer.Option("--frames", min=2, help="First frames of every clip; shorter clips are taken whole.")] = 198,
     clips: Annotated[int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")] = None,
@@ -103,7 +111,7 @@ def quality(
     shown = {s.name for s in evenly(sequences, pictures)} if pictures else set()
     used = threads if jobs == 1 else 1
     todo = [
-        Work(s.folder, variant, frames, seed, device, used, networks, weights, out, s.name in shown)
+        Work(s.folder, given, variant, frames, seed, device, used, networks, weights, out, s.name in shown)
         for s in sequences
         for variant in (*variants, Variant(TRUTH))
     ]
@@ -114,7 +122,7 @@ def quality(
             console.print(f"{i}/{len(todo)} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
     summary = summarise([read_json(work.row_file)["row"] for work in todo], baseline)
     summary["run"] = {
-        "data": str(data), "split": split, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
+        "data": str(data), "split": split, "input": given, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
         "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in variants}, "networks": dict(networks),
         "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
     }  # fmt: skip
@@ -173,7 +181,7 @@ def identity(name: str, folder: Path | None) -> str:
 def finish(work: Work) -> dict[str, Any]:
     """Return the row of one clip under one variant, from disk if it is up to date."""
     sequence = PairSequence(work.folder)
-    clip = quality_clip(sequence).first(work.frames)
+    clip = quality_clip(sequence, work.given).first(work.frames)
     key = row_key(clip, work.variant, work.seed, work.device, dict(work.networks))
     at = shown_frames(len(clip.t_us)) if work.pictured else ()
     if work.row_file.is_file() and all(work.picture_file(i).is_file() for i in at):
@@ -195,10 +203,13 @@ def finish(work: Work) -> dict[str, Any]:
     return row
 
 
-def quality_clip(sequence: PairSequence) -> QualityClip:
-    """Return a sequence of pairs as a clip to measure on."""
+def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip:
+    """Return a sequence of pairs as a clip to measure on; given the truth, its render is the ground truth and opaque."""
     clip = sequence.clip
     facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
+    if given == "truth":
+        opaque = np.full_like(clip.opacity, 255)
+        return QualityClip(sequence.name, {**facts, "input": given}, clip.rgb_gt, clip.rgb_gt, opaque, clip.sdmap, clip.t_us)
     return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
 
 

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.class_colours import OTHERS, swap_class_colours
+from alpasim_plugin.training.lost_resolution import LostResolution, draw_lost_resolution
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence, pairs_digest
 from alpasim_plugin.types import F32, I64, U8
 
@@ -28,6 +30,9 @@ SIDE = 16  # crops are multiples of it
 # Probability of each augmentation of an episode: played backward, every second frame, mirrored, photometric, class colours of the map.
 P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
 GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
+P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
+# Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
+P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class StreamShares:
         pairs: Degraded and clean renders.
         identity: The clean render in both places, opaque: a perfect render stays as it is.
         video: Recorded video in both places, opaque, without a map.
-        damaged_video: Recorded video with synthetic damage (`training.video_damage`), without a map.
+        damaged_video: Recorded video with synthetic damage (`training.video_damage`, `training.lost_resolution`), without a map.
 
     Raises:
         InputError: A negative share, or shares that do not add up to one.
@@ -89,6 +94,9 @@ class Episode:
         flip: Whether it is mirrored.
         levels: ``(256, 3)`` float32 in [-1, 1], what an image's levels become, by channel.
         car_class: Class in whose colours the map's cars are shown; None leaves them.
+        sharpness, grain: Of the detail that undamaged frames get; zero leaves them.
+        key: Of the grain's random stream.
+        lost: In the place of the damage that the sequence was recorded with; None keeps that one.
     """
 
     kind: int
@@ -100,6 +108,10 @@ class Episode:
     flip: bool
     levels: F32
     car_class: str | None
+    sharpness: float
+    grain: float
+    key: str
+    lost: LostResolution | None
 
 
 class TrainingStreams:
@@ -178,7 +190,12 @@ class TrainingStreams:
         shown = np.clip(gain * channels * grey**gamma, 0, 1) if photometric else np.repeat(grey, 3, axis=1)
         levels: F32 = (shown * 2 - 1).astype(np.float32)
         step = (-1 if reverse else 1) * (2 if stride_2 else 1)
-        return Episode(kind, sequence, start, step, top, left, flip, levels, other if class_colours else None)
+        detailed = rng.random() < P_DETAIL
+        sharpness, grain = (float(rng.uniform(*span)) if detailed else 0.0 for span in (SHARPNESS, GRAIN))
+        key = f"streams.{slot}.{number}"
+        loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
+        lost = draw_lost_resolution(rng, *self.crop) if loses else None
+        return Episode(kind, sequence, start, step, top, left, flip, levels, other if class_colours else None, sharpness, grain, key, lost)
 
     def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32]:
         """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map and target of an episode's update."""
@@ -193,9 +210,13 @@ class TrainingStreams:
 
         target = _lit(cut(clip.rgb_gt), episode.levels)
         damaged = kind in ("pairs", "damaged_video")
-        render = _lit(cut(clip.rgb_input), episode.levels) if damaged else target
+        if not damaged:
+            target = _detailed(target, episode.sharpness, episode.grain, stream("training", self.seed, f"{episode.key}.grain", at))
+        render = _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
         opacity: F32 = np.ones((len(index), 1, *self.crop), np.float32)
-        if damaged:
+        if episode.lost:
+            render, opacity = episode.lost.apply(target), opacity * episode.lost.opacity
+        elif damaged:
             opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
         return render, opacity, self._map(cut(clip.sdmap), episode), target
 
@@ -219,6 +240,16 @@ def there_and_back(index: I64, length: int) -> I64:
 def _lit(frames: U8, levels: F32) -> F32:
     """Map frames ``(T, h, w, 3)`` to ``(T, 3, h, w)`` by a table of levels."""
     return np.stack([levels[frames[..., c], c] for c in range(3)], axis=1)
+
+
+def _detailed(frames: F32, sharpness: float, grain: float, rng: np.random.Generator) -> F32:
+    """Sharpen frames ``(T, 3, h, w)`` in [-1, 1] and add independent noise to every value."""
+    if not sharpness and not grain:
+        return frames
+    blurred = np.stack([[cv2.GaussianBlur(channel, (0, 0), 1.0) for channel in frame] for frame in frames])
+    noise = np.float32(grain) * rng.standard_normal(frames.shape, np.float32)
+    detailed: F32 = np.clip(frames + np.float32(sharpness) * (frames - blurred) + noise, -1, 1)
+    return detailed
 
 
 def _in_order(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:

@@ -77,7 +77,7 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
 def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: Path) -> None:
     networks = (("perceptual-syn", identity("perceptual-syn", None)),)
     variant = parse_variants("identity", [])[0]
-    work = Work(data / "test-known" / "b", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
+    work = Work(data / "test-known" / "b", "render", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
     row = finish(work)
     stamp = work.row_file.stat().st_mtime_ns
     assert finish(work) == row
@@ -88,9 +88,18 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
     assert picture.is_file()
     key = json.loads(work.row_file.read_text())["key"]
     other = parse_variants("identity", ["fixer.block_latents=3"])[0]
-    for changed in (replace(work, seed=1), replace(work, frames=9), replace(work, variant=other)):
+    for changed in (replace(work, seed=1), replace(work, frames=9), replace(work, variant=other), replace(work, given="truth")):
         assert finish(changed)["frames"] == changed.frames
         assert json.loads(work.row_file.read_text())["key"] != key
+
+
+def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(data: Path, bundle: Path, tmp_path: Path) -> None:
+    command = ["bench", "quality", str(data), "--input", "truth", "--baseline", "small", "--pictures", "0", "--out", str(tmp_path)]
+    assert run_command([*command, "--fixer", f"identity,small={bundle}"]) == 0
+    rows = {label: json.loads((tmp_path / "clips" / label / "a.json").read_text())["row"] for label in ("identity", "small")}
+    assert rows["identity"]["identical"] == FRAMES
+    assert rows["small"]["values"]["psnr_db"] < rows["identity"]["values"]["psnr_db"]
+    assert json.loads((tmp_path / "quality.json").read_text())["run"]["input"] == "truth"
 
 
 def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.training.streams import KINDS, StreamBatch, StreamShares, TrainingStreams, there_and_back
+from alpasim_plugin.training.streams import KINDS, StreamBatch, StreamShares, TrainingStreams, _detailed, there_and_back
 from tests.training.pair_files import make
 
 ALL_KINDS = StreamShares(0.25, 0.25, 0.25, 0.25)
@@ -86,6 +86,30 @@ def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root
             if same:
                 assert (batch.opacity[slot] == 1).all()
     assert seen == set(KINDS)
+
+
+def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
+    made = streams(root)
+    seen = set()
+    for i in range(0, 48, 4):
+        batch = made.update(i)
+        for slot, kind in enumerate(batch.kind.tolist()):
+            (episode, at) = made.episode_of(slot, i)
+            index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
+            raw = episode.sequence.clip.rgb_gt[index, episode.top : episode.top + 32, episode.left : episode.left + 48]
+            raw = raw[:, :, ::-1] if episode.flip else raw
+            plain = np.stack([episode.levels[raw[..., c], c] for c in range(3)], axis=1)
+            changed = not np.array_equal(batch.target[slot].numpy(), plain)
+            assert changed == (KINDS[kind] in ("identity", "video") and episode.grain > 0)
+            seen.add((KINDS[kind], changed))
+    assert {("identity", True), ("identity", False), ("pairs", False)} <= seen
+    rng = np.random.default_rng(0)
+    grey = np.zeros((2, 3, 64, 64), np.float32)
+    noisy = _detailed(grey, 1.0, 0.05, rng)
+    assert noisy.std() == pytest.approx(0.05, rel=0.02)  # flat: nothing to sharpen
+    assert abs(np.corrcoef(noisy[0].ravel(), noisy[1].ravel())[0, 1]) < 0.05  # no pattern that stays
+    edge = np.where(np.arange(64) < 32, -0.5, 0.5).astype(np.float32) * np.ones((1, 3, 64, 1), np.float32)
+    assert np.ptp(_detailed(edge, 1.0, 0.0, rng)) > 1.2 * np.ptp(edge)
 
 
 def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
