@@ -1,4 +1,4 @@
-"""Drive the held-out scenes behind three renderers and put the tables into docs/experiments/fixer-closed-loop.md.
+"""Drive the held-out scenes behind four renderers and put the tables into docs/experiments/onefixer-closed-loop.md.
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:2] [--set KEY=VALUE]...
 
@@ -22,8 +22,10 @@ from results import DOCS, number, replace
 from alpasim_plugin.training.frozen_scenes import check_scenes
 
 VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
-RENDERERS = ("clean", "3dgs", "onefixer")
-SHOWN = ("collision_at_fault", "offroad", "offroad_or_collision_at_fault", "route_distance_m", "progress", "min_distance_to_obstacle_m")
+BASELINE = "3dgs"
+RENDERERS = ("clean", BASELINE, "onefixer", "onefixer-dit-tiny")
+EVENT = "offroad_or_collision_at_fault"
+SHOWN = ("collision_at_fault", "offroad", EVENT, "lateral_distance_m", "progress", "min_distance_to_obstacle_m")
 
 
 def drive(out: Path, arguments: list[str]) -> dict[str, Any]:
@@ -47,15 +49,18 @@ def paired_cell(entry: dict[str, Any] | None, rate: bool) -> str:
 
 
 def table(summary: dict[str, Any]) -> str:
-    """Return metrics x renderers, with the paired differences of the others from 3dgs."""
-    lines = ["| metric | " + " | ".join(RENDERERS) + " | clean - 3dgs | onefixer - 3dgs |", "|---" * (len(RENDERERS) + 3) + "|"]
+    """Return metrics x renderers, and below it the paired differences from the baseline."""
+    others = [name for name in RENDERERS if name != BASELINE]
+    means = ["| metric | " + " | ".join(RENDERERS) + " |", "|---" * (len(RENDERERS) + 1) + "|"]
+    pairs = [f"| minus {BASELINE} | " + " | ".join(others) + " |", "|---" * (len(others) + 1) + "|"]
     for metric in SHOWN:
         entries = [summary["metrics"][name][metric] for name in RENDERERS]
         rate = entries[0]["unit"] == ""
         unit = " (%)" if rate else f" ({entries[0]['unit']})" if entries[0]["unit"] else ""
-        pairs = [paired_cell(summary["paired"].get(name, {}).get(metric), rate) for name in ("clean", "onefixer")]
-        lines.append(f"| `{metric}`{unit} | " + " | ".join([number(e, rate) for e in entries] + pairs) + " |")
-    return "\n".join(lines)
+        means.append(f"| `{metric}`{unit} | " + " | ".join(number(entry, rate) for entry in entries) + " |")
+        differences = [paired_cell(summary["paired"].get(name, {}).get(metric), rate) for name in others]
+        pairs.append(f"| `{metric}`{unit} | " + " | ".join(differences) + " |")
+    return "\n".join(means) + "\n\n" + "\n".join(pairs)
 
 
 def families(rows: list[dict[str, Any]]) -> str:
@@ -65,11 +70,28 @@ def families(rows: list[dict[str, Any]]) -> str:
     for name in names:
         cells = []
         for renderer in RENDERERS:
-            events = [row["offroad_or_collision_at_fault"] for row in rows if family(row) == name and row["renderer"] == renderer]
+            events = [row[EVENT] for row in rows if family(row) == name and row["renderer"] == renderer]
             known = [event for event in events if event is not None]
             cells.append(f"{int(sum(known))} of {len(known)}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def events(rows: list[dict[str, Any]]) -> str:
+    """Return the rollouts with an event behind ``onefixer``, and what happened in the same rollout behind the others."""
+    happened = {(row["scene"], row["seed"], row["renderer"]): word(row) for row in rows}
+    named = sorted({(scene, seed) for scene, seed, renderer in happened if renderer == "onefixer" and happened[scene, seed, renderer]})
+    lines = ["| scene | seed | " + " | ".join(RENDERERS) + " |", "|---" * (len(RENDERERS) + 2) + "|"]
+    for scene, seed in named:
+        lines.append(f"| `{scene}` | {seed} | " + " | ".join(happened[scene, seed, name] or "-" for name in RENDERERS) + " |")
+    return "\n".join(lines) if named else "No rollout behind `onefixer` has an event."
+
+
+def word(row: dict[str, Any]) -> str:
+    """Return what happened in a rollout; empty for nothing."""
+    if row[EVENT] is None:
+        return "failed"
+    return " and ".join(text for metric, text in (("offroad", "off the road"), ("collision_at_fault", "contact at fault")) if row[metric])
 
 
 def family(row: dict[str, Any]) -> str:
@@ -90,12 +112,12 @@ def main() -> None:
     parts = []
     for name in given.policies.split(","):
         policy, _, seeds = name.partition(":")
-        options = ["--renderer", ",".join(RENDERERS), "--baseline", "3dgs", "--policy", policy, "--seeds", seeds or "5", *settings]
+        options = ["--renderer", ",".join(RENDERERS), "--baseline", BASELINE, "--policy", policy, "--seeds", seeds or "5", *settings]
         summary = drive(given.runs / policy, [*options, "--images", "none", "--resume", *scenes])
         rows = pq.read_table(given.runs / policy / "rollouts.parquet").to_pylist()
         head = f"**{policy}**: {len(scenes)} scenes x {seeds or '5'} seeds"
-        parts.append("\n\n".join((head, table(summary), families(rows))))
-    page = DOCS / "experiments" / "fixer-closed-loop.md"
+        parts.append("\n\n".join((head, table(summary), families(rows), events(rows))))
+    page = DOCS / "experiments" / "onefixer-closed-loop.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
 
 
