@@ -1,4 +1,4 @@
-"""Drive the held-out scenes behind four renderers and put the tables into docs/experiments/onefixer-closed-loop.md.
+"""Drive the held-out scenes behind four renderers and put the tables into docs/experiments/fixer-closed-loop.md.
 
     python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:2] [--set KEY=VALUE]...
 
@@ -117,7 +117,7 @@ def main() -> None:
         rows = pq.read_table(given.runs / policy / "rollouts.parquet").to_pylist()
         head = f"**{policy}**: {len(scenes)} scenes x {seeds or '5'} seeds"
         parts.append("\n\n".join((head, table(summary), families(rows), events(rows))))
-    page = DOCS / "experiments" / "onefixer-closed-loop.md"
+    page = DOCS / "experiments" / "fixer-closed-loop.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
 
 
