@@ -89,13 +89,18 @@ class SceneView:
         return self.height < 0.45 * self.width
 
 
+def chord_angle(log: F64) -> float:
+    """Return the direction in radians from the first to the last of ``(N, 2)`` points; 0 where they are hardly apart."""
+    chord = log[-1] - log[0]
+    return math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
+
+
 class _Frame:
     """The turn, shift and scale from world metres to drawing units."""
 
     def __init__(self, log: F64, paths: Sequence[F64]) -> None:
         self.log_at = log[0]
-        chord = log[-1] - log[0]
-        angle = math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
+        angle = chord_angle(log)
         c, s = math.cos(angle), math.sin(angle)
         self.turn = np.array([[c, s], [-s, c]])  # world to drawing, still metres and y up
         self.north_deg = math.degrees(angle)
@@ -187,8 +192,8 @@ def scene_view(
         width=UNITS_ACROSS,
         height=frame.height,
         unit_per_m=frame.scale,
-        lanes=_areas([_ring(lane) for lane in lanes], frame),
-        lines=_lines([edge for lane in lanes for edge in _painted(lane)], frame),
+        lanes=_areas([lane_ring(lane) for lane in lanes], frame),
+        lines=_lines([edge for lane in lanes for edge in painted_edges(lane)], frame),
         edges=_lines(content.get("road_edges") or [], frame),
         crosswalks=_areas(content.get("crosswalks") or [], frame),
         log=path_data(frame.units(log)),
@@ -229,12 +234,13 @@ def _driven(own: Mapping[str, tuple[Any, F64]]) -> F64 | None:
     return np.stack([x, y], 1) if len(x) > 1 and np.array_equal(tx, ty) else None
 
 
-def _ring(lane: Mapping[str, Any]) -> list[list[float]]:
+def lane_ring(lane: Mapping[str, Any]) -> list[list[float]]:
+    """Return a lane's outline, its left edge first; empty where an edge is not known."""
     left, right = lane.get("left"), lane.get("right")
     return [*left, *reversed(right)] if left and right else []
 
 
-def _painted(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
+def painted_edges(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
     """List a lane's edges without those that carry no paint, such as the paths across an intersection."""
     sides = zip((lane.get("left"), lane.get("right")), lane.get("paint") or ("unknown", "unknown"), strict=True)
     return [edge for edge, paint in sides if paint != "none"]

@@ -21,6 +21,7 @@ class Event:
 
     Attributes:
         t_s: Seconds since the rollout's first step; None where no step shows the event that the rollout's metric counts.
+        t_us: The same instant on the rollout's own clock; None with ``t_s``.
         x_m, y_m, yaw_rad: Pose of the ego's rear axle at that time, world; None with ``t_s`` or where poses are not logged.
         side: Which part of the ego was touched, or "".
     """
@@ -32,6 +33,7 @@ class Event:
     y_m: float | None = None
     yaw_rad: float | None = None
     side: str = ""
+    t_us: int | None = None
 
     @property
     def what(self) -> str:
@@ -68,7 +70,7 @@ def _event(kind: Literal["collision", "offroad"], rollout: Rollout, own: Own, me
     t_us = min(firsts.values())
     zero_us = min(int(t[0]) for t, _ in own.values())
     x_m, y_m, yaw_rad = (_at(own, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad"))
-    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side)
+    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side, t_us)
 
 
 def _first(own: Own, metric: str) -> int | None:

@@ -65,7 +65,7 @@ def write_report(run_dir: Path | str) -> Path:
 def render_report(run: Run) -> str:
     """Render the report as a string."""
     environment = _environment()
-    style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
+    style, script = ("\n".join(asset(environment, f"{name}.{kind}") for name in ("theme", "report")) for kind in ("css", "js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return environment.get_template("report.html.j2").render(
         style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, **context(run)
@@ -175,7 +175,8 @@ def scene_views(
     return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
 
 
-def _asset(environment: Environment, name: str) -> str:
+def asset(environment: Environment, name: str) -> str:
+    """Return the source of a style sheet or a script among the templates."""
     if environment.loader is None:
         raise RuntimeError("the template environment has no loader")
     return environment.loader.get_source(environment, name)[0]
