@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import cell_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness, estimated_bytes, sources
@@ -57,14 +58,17 @@ def fit(run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Finen
         wanted: The finest that is kept.
         camera: As for `cell_data`.
     """
-    costs = [_cost(run, cell, wanted.width_px, camera) for cell in cells]
-
-    def room(count: int, stride: int) -> bool:
-        return sum(cost.total(stride) for cost in costs[:count]) <= budget_bytes
-
     coarsest = max(wanted.stride, MOST_STRIDE)
-    count = next((n for n in range(len(cells), 1, -1) if room(n, coarsest)), min(1, len(cells)))
-    stride = next((k for k in range(wanted.stride, coarsest) if room(count, k)), coarsest)
+    costs: list[Cost] = []
+    for cell in cells:
+        costs.append(_cost(run, cell, wanted.width_px, camera))
+        if sum(cost.total(coarsest) for cost in costs) > budget_bytes:  # logs of cells that cannot fit are not read
+            break
+    count = len(costs)
+    while count > 1 and sum(cost.total(coarsest) for cost in costs[:count]) > budget_bytes:
+        count -= 1
+    strides = range(wanted.stride, coarsest)
+    stride = next((k for k in strides if sum(cost.total(k) for cost in costs[:count]) <= budget_bytes), coarsest)
     fine = replace(wanted, stride=stride)
     documents: list[str] = []
     for cell in cells[:count]:
@@ -78,7 +82,8 @@ def fit(run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Finen
 
 def _cost(run: Run, cell: WatchedCell, width_px: int, camera: str | None) -> Cost:
     logs = read_logs(run, cell)
-    found = [one for rollout in cell.rollouts if rollout.ok for one in sources(run, rollout, logs[rollout.path])]
+    readable = [(r, logs[r.path]) for r in cell.rollouts if r.ok]
+    found = [one for rollout, log in readable if not isinstance(log, SimrunError) for one in sources(run, rollout, log)]
     estimates = [estimated_bytes(one, width_px) for one in found if camera in (None, one.camera)]
     frames = sum(count for count, _ in estimates)
     each = round(sum(count * size for count, size in estimates) / frames) if frames else 0

@@ -79,19 +79,26 @@ class Wanted:
         return not (self.scenes or self.policies or self.seeds or self.renderers)
 
 
-def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
-    """List the cells of a run that were asked for, the most telling first.
+def check_wanted(run: Run, wanted: Wanted) -> None:
+    """Refuse what the run neither has nor plans.
 
     Raises:
-        InputError: Something was asked for that the run does not have, or nothing is left.
+        InputError: Something of that kind was asked for.
     """
     for flag, asked, known in (
         ("--scene", wanted.scenes, run.scenes),
         ("--policy", wanted.policies, run.policies),
         ("--renderer", wanted.renderers, run.renderers),
-        ("--seed", wanted.seeds, sorted({r.seed for r in run.rollouts})),
+        ("--seed", wanted.seeds, sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)})),
     ):
-        _check_known(flag, asked, known)
+        strange = [one for one in asked if one not in known]
+        if strange:
+            found = f"the run has none; it has {', '.join(map(str, known[:8]))}"
+            raise InputError(DOING, f"{flag} {strange[0]}", found, "name one of these")
+
+
+def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
+    """List the cells of a run that were asked for, the most telling first."""
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     for rollout in _ordered(run):
         if not _asked(rollout, wanted):
@@ -105,8 +112,6 @@ def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
         if _asked(flip.other, wanted):
             flips.setdefault((flip.other.scene, flip.other.policy, flip.other.seed), []).append(flip)
     cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ()))) for key, members in grouped.items()]
-    if not cells:
-        raise InputError(DOING, str(run.folder), "no rollout that was asked for", "leave out --scene, --policy, --seed or --renderer")
     place = {cell.id: i for i, cell in enumerate(cells)}
     return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), place[cell.id]))
 
@@ -148,10 +153,4 @@ def _asked(rollout: Rollout, wanted: Wanted) -> bool:
         (rollout.renderer, wanted.renderers),
     )
     return all(not asked or value in asked for value, asked in pairs)
-
-
-def _check_known(flag: str, asked: Sequence[object], known: Sequence[object]) -> None:
-    strange = [one for one in asked if one not in known]
-    if strange:
-        raise InputError(DOING, f"{flag} {strange[0]}", f"the run has none; it has {', '.join(map(str, known[:8]))}", "name one of these")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.errors import InputError, SimrunError
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.types import RolloutLog
 from alpasim_plugin.viewer.cells import WatchedCell
@@ -22,24 +22,23 @@ LOG = "rollout.asl"
 FIRST_CURVES = ("lateral_offset_m", "ego_speed_mps", "min_distance_to_obstacle_m", "plan_deviation", "opacity_mean")
 
 
-Logs = Mapping[str, RolloutLog | None]  # folder of a rollout -> its log
+Logs = Mapping[str, RolloutLog | SimrunError | None]  # folder of a rollout -> its log, or why it cannot be read
 
 
 def read_logs(run: Run, cell: WatchedCell) -> Logs:
-    """Read the logs of a cell's finished rollouts: their own, or those that they were scored from; None where neither is there.
-
-    Raises:
-        InputError: One is damaged.
-    """
+    """Read the logs of a cell's finished rollouts: their own, or those that they were scored from; None where neither is there."""
     return {rollout.path: _read_log(run, rollout) for rollout in cell.rollouts if rollout.ok}
 
 
-def _read_log(run: Run, rollout: Rollout) -> RolloutLog | None:
+def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
     path = run.file_of(rollout, LOG)
     if path is None:
         stated = run.manifest(rollout).get("log")
         path = None if stated is None else run.folder / str(stated)
-    return read_asl(path) if path is not None and path.is_file() else None
+    try:
+        return read_asl(path) if path is not None and path.is_file() else None
+    except SimrunError as error:
+        return error  # the page says so in this rollout's place; the others are still shown
 
 
 def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, camera: str | None = None) -> dict[str, Any]:
@@ -67,6 +66,9 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
             drives.append({"renderer": rollout.renderer, "failed": f"{rollout.failure_class}: {rollout.failure}"})
             continue
         log = logs[rollout.path]
+        if isinstance(log, SimrunError):
+            drives.append({"renderer": rollout.renderer, "failed": f"its log cannot be read: {log.found}"})
+            continue
         drive = drive_data(run, rollout, log, content, place, tracks)
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]

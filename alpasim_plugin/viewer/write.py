@@ -8,13 +8,16 @@ from pathlib import Path
 from urllib.parse import urlencode
 
 from alpasim_plugin.atomic import write_text
-from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, shown_by_default, telling
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted, shown_by_default, telling
 from alpasim_plugin.viewer.page import MB, Options, make_page
+from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.report.run_folder import Run, read_run, reporting
 
 DOING = "writing a page to watch"
 FLIPS_PAGE = "flips.html"
-FLIPS_OPTIONS = Options(max_bytes=6 * MB)
+FLIPS_OPTIONS = Options(max_bytes=6 * MB, fine=Fineness(stride=2, width_px=384))
+MAX_FLIP_CELLS = 8  # a run must not wait for its page
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,10 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
         InputError: Nothing was asked for that the run has, or a file of the run is damaged.
         InfrastructureError: The page cannot be written.
     """
+    check_wanted(run, wanted)
     cells = cells_of(run, wanted)
+    if not any(cell.watchable for cell in cells):
+        raise InputError(DOING, str(run.folder), "no finished rollout that was asked for", "ask for others; simrun report lists failures")
     with reporting(run):
         page = make_page(run, cells, shown_by_default(cells, wanted, at_most), options)
     write_text(path, page.html, DOING)
@@ -67,12 +73,12 @@ def write_flips_page(root: Path) -> Mapping[tuple[str, str, str, int], str]:
         InputError: The run folder is not complete enough to be read.
     """
     run = read_run(root)
-    flipped = telling(cells_of(run)) if run.rollouts else []
+    flipped = telling(cells_of(run))
     if not flipped:
         (root / FLIPS_PAGE).unlink(missing_ok=True)
         return {}
     with reporting(run):
-        page = make_page(run, flipped, flipped, FLIPS_OPTIONS)
+        page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS)
     write_text(root / FLIPS_PAGE, page.html, DOING)
     return {flip.key: f"{FLIPS_PAGE}#{address(cell, flip.other.renderer)}" for cell in page.cells for flip in cell.flips}
 

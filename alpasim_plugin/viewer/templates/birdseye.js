@@ -127,6 +127,7 @@ class Birdseye {
     if (!this.cell) return;
     const began = performance.now();
     this.resize();
+    if (!this.canvas.width || !this.canvas.height) return; // not laid out yet
     const view = this.view(t, focus), { context } = this;
     this.ground(view);
     const px = this.world(context, view, this.canvas.width, this.canvas.height);

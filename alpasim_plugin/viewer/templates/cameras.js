@@ -98,7 +98,7 @@ class Cameras {
       stage.append(canvas);
       camera = new Camera(canvas, frames);
     } else {
-      const why = drive.failed ? "This rollout failed. " + drive.failed : drive.no_frames || "No camera frames.";
+      const why = drive.failed ? "Nothing to show. " + drive.failed : drive.no_frames || "No camera frames.";
       stage.append(make("p", "none", why));
     }
     const ended = make("span", "ended");
