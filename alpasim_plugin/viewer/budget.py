@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import cell_data, read_logs
-from alpasim_plugin.viewer.pictures import Fineness, estimated_bytes, sources
+from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.report.run_folder import Run
 
 MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What a cell is about to cost: bytes without camera frames, number of frames, and bytes of one on the page."""
-
-    bare_bytes: int
-    frames: int
-    frame_bytes: int
-
-    def total(self, stride: int) -> int:
-        """Return the bytes at a stride."""
-        return self.bare_bytes + self.frame_bytes * -(-self.frames // stride)
 
 
 @dataclass(frozen=True)
@@ -58,36 +44,31 @@ def fit(run: Run, cells: Sequence[WatchedCell], budget_bytes: int, wanted: Finen
         wanted: The finest that is kept.
         camera: As for `cell_data`.
     """
-    coarsest = max(wanted.stride, MOST_STRIDE)
-    costs: list[Cost] = []
+    factors = range(1, max(1, MOST_STRIDE // wanted.stride) + 1)
+    made: list[dict[str, Any]] = []
+    used = dict.fromkeys(factors, 0)  # bytes of what is made, by how much it is thinned
     for cell in cells:
-        costs.append(_cost(run, cell, wanted.width_px, camera))
-        if sum(cost.total(coarsest) for cost in costs) > budget_bytes:  # logs of cells that cannot fit are not read
+        document = cell_data(run, cell, read_logs(run, cell), wanted, camera)
+        sizes = {factor: len(as_json(thinned(document, factor))) for factor in factors}
+        if made and used[factors[-1]] + sizes[factors[-1]] > budget_bytes:
             break
-    count = len(costs)
-    while count > 1 and sum(cost.total(coarsest) for cost in costs[:count]) > budget_bytes:
-        count -= 1
-    strides = range(wanted.stride, coarsest)
-    stride = next((k for k in strides if sum(cost.total(k) for cost in costs[:count]) <= budget_bytes), coarsest)
-    fine = replace(wanted, stride=stride)
-    documents: list[str] = []
-    for cell in cells[:count]:
-        document = as_json(cell_data(run, cell, read_logs(run, cell), fine, camera))
-        if documents and sum(map(len, documents)) + len(document) > budget_bytes:  # frames that are larger than the sampled ones
-            break
-        documents.append(document)
-    kept = len(documents)
-    return Fitted(tuple(cells[:kept]), tuple(documents), fine, tuple(cells[kept:]))
+        made.append(document)
+        used = {factor: used[factor] + sizes[factor] for factor in factors}
+    factor = next((factor for factor in factors if used[factor] <= budget_bytes), factors[-1])
+    fine = replace(wanted, stride=wanted.stride * factor)
+    kept = len(made)
+    return Fitted(tuple(cells[:kept]), tuple(as_json(thinned(one, factor)) for one in made), fine, tuple(cells[kept:]))
 
 
-def _cost(run: Run, cell: WatchedCell, width_px: int, camera: str | None) -> Cost:
-    logs = read_logs(run, cell)
-    readable = [(r, logs[r.path]) for r in cell.rollouts if r.ok]
-    found = [one for rollout, log in readable if not isinstance(log, SimrunError) for one in sources(run, rollout, log)]
-    estimates = [estimated_bytes(one, width_px) for one in found if camera in (None, one.camera)]
-    frames = sum(count for count, _ in estimates)
-    each = round(sum(count * size for count, size in estimates) / frames) if frames else 0
-    return Cost(len(as_json(cell_data(run, cell, logs, None))), frames, each)
+def thinned(document: Mapping[str, Any], factor: int) -> dict[str, Any]:
+    """Return a cell's document with every factor-th camera frame alone."""
+    drives = [
+        {**drive, "cameras": [{**one, "t": one["t"][::factor], "jpeg": one["jpeg"][::factor]} for one in drive["cameras"]]}
+        if "cameras" in drive
+        else drive
+        for drive in document["drives"]
+    ]
+    return {**document, "drives": drives}
 
 
 def as_json(value: Any) -> str:

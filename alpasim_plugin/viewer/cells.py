@@ -153,4 +153,3 @@ def _asked(rollout: Rollout, wanted: Wanted) -> bool:
         (rollout.renderer, wanted.renderers),
     )
     return all(not asked or value in asked for value, asked in pairs)
-

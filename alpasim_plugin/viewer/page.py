@@ -101,9 +101,7 @@ def _sha256(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def _notes(
-    cells: Sequence[WatchedCell], shown: Sequence[WatchedCell], too_many: Sequence[WatchedCell], fine: Fineness
-) -> list[str]:
+def _notes(cells: Sequence[WatchedCell], shown: Sequence[WatchedCell], too_many: Sequence[WatchedCell], fine: Fineness) -> list[str]:
     """Say what the page does not hold, one sentence each."""
     ids = {cell.id for cell in shown}
     left = [cell for cell in cells if cell.id not in ids and cell.watchable]

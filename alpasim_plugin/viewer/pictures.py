@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from evaluators.report.run_folder import Rollout, Run
 
 VIDEO = "front.mp4"
 JPEG_QUALITY = 76
-SAMPLED = 3  # frames that are encoded to estimate the size of the others
 NO_FRAMES = "This rollout kept no camera frames. Run it again with --images jpeg (the default) or with --video all."
 
 
@@ -86,20 +85,6 @@ def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
         t_ms.append(round((t_us - zero_us) / 1000))
         data.append(base64.b64encode(_jpeg(picture)).decode())
     return {"name": source.camera, "width": size[0], "height": size[1], "t": t_ms, "jpeg": data}
-
-
-def estimated_bytes(source: Source, width_px: int) -> tuple[int, int]:
-    """Estimate the number of frames, and the bytes of one in base64."""
-    if source.video is None:
-        count = len(source.images)
-        some: Sequence[LoggedImage] = [source.images[i] for i in np.unique(np.linspace(0, count - 1, SAMPLED).astype(int))]
-        pictures = [rgb for _, rgb in Source(source.camera, tuple(some)).frames()]
-    else:
-        with VideoReader(source.video[0]) as video:
-            count = video.format.frames or sum(1 for _ in video)
-            pictures = [] if video.format.frames is None else [next(iter(video)).image]
-    sizes = [len(_jpeg(smaller(rgb, width_px))) for rgb in pictures]
-    return count, round(4 / 3 * (sum(sizes) / len(sizes) if sizes else 20_000))
 
 
 def smaller(rgb: U8, width_px: int) -> U8:

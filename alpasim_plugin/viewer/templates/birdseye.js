@@ -6,6 +6,10 @@ const LAYER = 1.5; // size of the layer over that of the view
 const FOLLOW_M = 90; // metres across when the view follows the ego
 const HALO = 2.5;
 
+// What a label of a log is drawn as: simrun's and AlpaSim's words.
+const kindOf = (label) => (/pedestrian|person/.test(label) ? "pedestrian" : /cyclist|rider|bicycle/.test(label) ? "cyclist" : label);
+const onFoot = (label) => ["pedestrian", "cyclist"].includes(kindOf(label));
+
 class Birdseye {
   constructor(canvas, index) {
     Object.assign(this, { canvas, index, cell: null, follow: true, zoom: 1, pan: [0, 0], layer: null, timing: [] });
@@ -174,17 +178,16 @@ class Birdseye {
     for (const drive of seen) for (const i of drive.users) if (!filled.has(i)) put(drive, cell.users[i]);
     for (const [key, all] of groups) {
       const own = typeof key === "string";
-      const walks = key === "pedestrian" || key === "cyclist";
       context.beginPath();
       for (const [user, pose] of all) this.body(user, pose, px);
       context.globalAlpha = own ? 1 : 0.7;
       context.lineWidth = (own ? 1 : 1.2) * px;
       context.strokeStyle = own ? this.colours.card : key.colour;
-      if (own) { context.fillStyle = this.colours[walks ? "ink" : "muted"]; context.fill(); }
+      if (own) { context.fillStyle = this.colours[onFoot(key) ? "ink" : "muted"]; context.fill(); }
       context.stroke();
       if (!own) continue;
       context.beginPath(); // headings
-      for (const [user, pose] of all) if (user.label !== "pedestrian") this.nose(user, pose);
+      for (const [user, pose] of all) if (kindOf(user.label) !== "pedestrian") this.nose(user, pose);
       context.lineWidth = 1.4 * px;
       context.stroke();
     }
@@ -194,7 +197,7 @@ class Birdseye {
   body(user, pose, px) {
     const { context } = this, small = 3 * px; // nothing is smaller than a few pixels
     const half = Math.max(user.size[0] / 2, small), wide = Math.max(user.size[1] / 2, small);
-    if (user.label === "pedestrian") {
+    if (kindOf(user.label) === "pedestrian") {
       const r = Math.max(half, wide);
       context.moveTo(pose.x + r, pose.y);
       context.arc(pose.x, pose.y, r, 0, 2 * Math.PI);

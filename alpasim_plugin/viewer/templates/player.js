@@ -106,9 +106,8 @@ const player = {
   legend() {
     const drive = this.cell.drives[this.focus], kinds = new Set((drive?.users ?? []).map((i) => this.cell.users[i].label));
     byId("kinds").replaceChildren(...[...kinds].sort().map((kind) => {
-      const walks = kind === "pedestrian" || kind === "cyclist";
       const item = make("span", "item");
-      item.append(make("i", `kind ${kind === "pedestrian" ? "disc" : "box"}${walks ? " strong" : ""}`), kind);
+      item.append(make("i", `kind ${kindOf(kind) === "pedestrian" ? "disc" : "box"}${onFoot(kind) ? " strong" : ""}`), kind);
       return item;
     }));
     byId("as-recorded").hidden = drive?.as_driven !== false;
