@@ -30,7 +30,7 @@ Examples:
 
 - `simrun view runs/us101`: runs/us101/view.html, an offline page with changed outcomes and events first
 
-- `simrun view runs/us101 --scene smoke/curve --seed 0 --out curve.html`: one scene and seed, behind every renderer
+- `simrun view runs/smoke --scene smoke/curve --seed 0 --out curve.html`: one scene and seed, behind every renderer
 
 - `simrun view runs/us101/rollouts/3dgs/lane-camera/smoke-curve/0`: the same by a rollout's folder
 

@@ -66,7 +66,7 @@ class WatchedCell:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What was asked for; an empty tuple is everything."""
+    """What was asked for; an empty tuple is everything. A scene may be named as on the command line of a run: smoke/curve is smoke-curve."""
 
     scenes: tuple[str, ...] = ()
     policies: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
         ("--renderer", wanted.renderers, run.renderers),
         ("--seed", wanted.seeds, sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)})),
     ):
-        strange = [one for one in asked if one not in known]
+        strange = [one for one in asked if not _spellings(one) & {*known}]
         if strange:
             found = f"the run has none; it has {', '.join(map(str, known[:8]))}"
             raise InputError(DOING, f"{flag} {strange[0]}", found, "name one of these")
@@ -152,4 +152,9 @@ def _asked(rollout: Rollout, wanted: Wanted) -> bool:
         (rollout.seed, wanted.seeds),
         (rollout.renderer, wanted.renderers),
     )
-    return all(not asked or value in asked for value, asked in pairs)
+    return all(not asked or any(value in _spellings(one) for one in asked) for value, asked in pairs)
+
+
+def _spellings(asked: object) -> set[object]:
+    """Return what a name that was asked for may be in the tables."""
+    return {asked, asked.replace("/", "-")} if isinstance(asked, str) else {asked}

@@ -10,7 +10,7 @@ import shapely
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64
-from alpasim_plugin.viewer.units import Place, place_of
+from alpasim_plugin.viewer.units import Place
 from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
 
 AROUND_M = 120.0  # what is farther from the recorded drive is not drawn
@@ -29,15 +29,14 @@ def recorded_drive(content: Mapping[str, Any], scene: str) -> F64:
     return log
 
 
-def map_data(content: Mapping[str, Any], scene: str) -> tuple[dict[str, Any], Place]:
-    """Return the map in whole centimetres, and where they count from.
+def map_data(content: Mapping[str, Any], log: F64, place: Place) -> dict[str, Any]:
+    """Return the map in whole centimetres.
 
     Args:
         content: ``scenes/SCENE.json``.
-        scene: Its id, for messages.
+        log: As `recorded_drive` returns it.
+        place: Where numbers count from.
     """
-    log = recorded_drive(content, scene)
-    place = place_of(content, log)
     low, high = log.min(axis=0) - AROUND_M, log.max(axis=0) + AROUND_M
     window = shapely.box(*low, *high)
 
@@ -49,7 +48,7 @@ def map_data(content: Mapping[str, Any], scene: str) -> tuple[dict[str, Any], Pl
         return [place.cm(shapely.get_coordinates(shape)) for shape in kept.values()]
 
     lanes = content.get("lanes") or []
-    data = {
+    return {
         "turn": round(chord_angle(log), 4),
         "lanes": near([lane_ring(lane) for lane in lanes], 3),
         "paint": near([edge for lane in lanes for edge in painted_edges(lane)], 2),
@@ -58,4 +57,3 @@ def map_data(content: Mapping[str, Any], scene: str) -> tuple[dict[str, Any], Pl
         "log": place.cm(log),
         "source": str(content.get("source") or ""),
     }
-    return data, place

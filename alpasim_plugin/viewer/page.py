@@ -49,7 +49,7 @@ class Page:
     notes: tuple[str, ...]
 
 
-def make_page(run: Run, cells: Sequence[WatchedCell], shown: Sequence[WatchedCell], options: Options) -> Page:
+def make_page(run: Run, cells: Sequence[WatchedCell], shown: Sequence[WatchedCell], options: Options, report: str = "") -> Page:
     """Return an offline page.
 
     Args:
@@ -57,14 +57,15 @@ def make_page(run: Run, cells: Sequence[WatchedCell], shown: Sequence[WatchedCel
         cells: All that were asked for, the most telling first.
         shown: Those that the page holds as far as its size allows.
         options: Bounds.
+        report: Address of the run's report, relative to the page.
 
     Raises:
         InputError: A rollout's files are damaged.
     """
-    shell = len(render(as_json(index_data(run, cells, (), {"live": False, "notes": []})), {}))
+    shell = len(render(as_json(index_data(run, cells, (), {"live": False, "notes": [], "report": report})), {}))
     fitted = fit(run, shown, options.max_bytes - shell, options.fine, options.camera)
     notes = _notes(cells, shown, fitted.too_many, fitted.fine)
-    index = index_data(run, cells, fitted.cells, {"live": False, "notes": notes})
+    index = index_data(run, cells, fitted.cells, {"live": False, "notes": notes, "report": report})
     documents = dict(zip((cell.id for cell in fitted.cells), fitted.documents, strict=True))
     return Page(render(as_json(index), documents), fitted.cells, tuple(notes))
 

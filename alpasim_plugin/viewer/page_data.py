@@ -10,9 +10,11 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.types import RolloutLog
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
-from alpasim_plugin.viewer.map_data import map_data
+from alpasim_plugin.viewer.map_data import map_data, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
+from alpasim_plugin.viewer.units import Place
 from evaluators.metrics import METRICS
+from evaluators.report.events import clock_zero_us
 from evaluators.report.flips import FLIPS_NAME, baseline_of
 from evaluators.report.metric_info import meaning, ordered
 from evaluators.report.run_folder import Rollout, Run, read_json
@@ -58,7 +60,8 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
     if content is None:
         found = f"no file of scene {cell.scene} in {run.folder / 'scenes'}"
         raise InputError(DOING, cell.name, found, "make the run again; runs of earlier versions kept no maps")
-    drawn, place = map_data(content, cell.scene)
+    recorded = recorded_drive(content, cell.scene)
+    place = Place(recorded[0], clock_zero_us(content, _first_us(run, cell, logs)))
     tracks = Tracks()
     drives: list[dict[str, Any]] = []
     for rollout in cell.rollouts:
@@ -78,13 +81,20 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
     return {
         "id": cell.id,
-        "map": drawn,
+        "map": map_data(content, recorded, place),
         "users": tracks.all,
         "drives": drives,
         "parts": plans_part(_flip_entries(run, cell), place),
         "end": max([*ends, 1]),
         "warmup": round(int(content.get("warmup_us") or 0) / 1000),
     }
+
+
+def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
+    """Return the time of a cell's first logged pose."""
+    firsts = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
+    tables = (run.steps_of(rollout)["t_us"] for rollout in cell.rollouts if logs.get(rollout.path, "") is None)
+    return min([*firsts, *(min(t.to_pylist()) for t in tables if len(t))], default=0)
 
 
 def no_frames(camera: str | None) -> str:
@@ -99,7 +109,8 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         run: The run.
         cells: All cells that were asked for, the most telling first.
         here: Those whose documents the page has or can get.
-        state: ``live``, ``notes`` (what was left out, one sentence each) and, of a run that goes on, ``done`` and ``planned``.
+        state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address, or "") and, of a run that goes on,
+            ``done`` and ``planned``.
     """
     ids = {cell.id for cell in here}
     units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}

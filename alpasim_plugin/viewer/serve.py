@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import socket
 import threading
 import time
@@ -22,6 +23,7 @@ from alpasim_plugin.viewer.so_far import RunSoFar
 
 DOING = "serving a run"
 LEAST_AGE_S = 1.0  # the folder is not looked through more often than this
+PIECE = 1 << 20  # bytes
 PATIENCE_S = 30.0  # for a client that says nothing
 TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -183,16 +185,30 @@ class _Handler(BaseHTTPRequestHandler):
         elif folder == "cells" and (cell := self.server.cell(name.removesuffix(".json"))) is not None:
             self._send(as_json(cell).encode(), TYPES[".json"])
         elif folder == "run" and (file := file_below(self.server.root, name)) is not None:
-            self._send(file.read_bytes(), TYPES[file.suffix])
+            self._send_file(file)
         else:
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
 
     def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self._head(len(body), kind, status)
+        self.wfile.write(body)
+
+    def _send_file(self, path: Path) -> None:
+        """Send a file piece by piece: a log or a video may be larger than the memory."""
+        with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            self._head(size, TYPES[path.suffix], HTTPStatus.OK)
+            left = size
+            while left and (piece := stream.read(min(left, PIECE))):
+                self.wfile.write(piece)
+                left -= len(piece)
+            self.close_connection = left > 0  # it was cut meanwhile: the client sees too few bytes
+
+    def _head(self, size: int, kind: str, status: HTTPStatus) -> None:
         self.send_response(status)
-        for name, value in {"Content-Type": kind, "Content-Length": str(len(body)), **HEADERS}.items():
+        for name, value in {"Content-Type": kind, "Content-Length": str(size), **HEADERS}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(body)
 
     def _refuse(self, status: HTTPStatus, why: str) -> None:
         self._send(f"{why}\n".encode(), TYPES[".md"], status)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +20,7 @@ class Place:
 
     Attributes:
         origin: ``(2,)`` metres, world: the first point of the recorded drive.
-        zero_us: The first camera frame, on the scene's clock.
+        zero_us: The first camera frame (`evaluators.report.events.clock_zero_us`), on the scene's clock.
     """
 
     origin: F64
@@ -57,13 +56,3 @@ def rounded(values: F64) -> list[float | None]:
         [0.12346, None, 3.0]
     """
     return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
-
-
-def place_of(content: Mapping[str, Any], log: F64) -> Place:
-    """Return where a scene's page counts from.
-
-    Args:
-        content: ``scenes/SCENE.json``.
-        log: ``(N, 2)`` the recorded drive.
-    """
-    return Place(log[0], int(content.get("start_us") or 0))

@@ -15,7 +15,7 @@ from alpasim_plugin.viewer.pictures import Fineness
 from evaluators.report.run_folder import Run, read_run, reporting
 
 DOING = "writing a page to watch"
-FLIPS_PAGE = "flips.html"
+FLIPS_PAGE, REPORT = "flips.html", "report.html"
 FLIPS_OPTIONS = Options(max_bytes=6 * MB, fine=Fineness(stride=2, width_px=384))
 MAX_FLIP_CELLS = 8  # a run must not wait for its page
 
@@ -58,9 +58,14 @@ def write_page(run: Run, path: Path, wanted: Wanted, options: Options, at_most: 
     if not any(cell.watchable for cell in cells):
         raise InputError(DOING, str(run.folder), "no finished rollout that was asked for", "ask for others; simrun report lists failures")
     with reporting(run):
-        page = make_page(run, cells, shown_by_default(cells, wanted, at_most), options)
+        page = make_page(run, cells, shown_by_default(cells, wanted, at_most), options, _report_beside(run, path))
     write_text(path, page.html, DOING)
     return Written(path, path.stat().st_size, page.cells, tuple(cells), page.notes)
+
+
+def _report_beside(run: Run, path: Path) -> str:
+    """Return the address of the run's report for a page in its folder; "" for other pages and without a report."""
+    return REPORT if path.resolve().parent == run.folder.resolve() and (run.folder / REPORT).is_file() else ""
 
 
 def write_flips_page(root: Path) -> Mapping[tuple[str, str, str, int], str]:
@@ -78,7 +83,7 @@ def write_flips_page(root: Path) -> Mapping[tuple[str, str, str, int], str]:
         (root / FLIPS_PAGE).unlink(missing_ok=True)
         return {}
     with reporting(run):
-        page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS)
+        page = make_page(run, flipped, flipped[:MAX_FLIP_CELLS], FLIPS_OPTIONS, REPORT)
     write_text(root / FLIPS_PAGE, page.html, DOING)
     return {flip.key: f"{FLIPS_PAGE}#{address(cell, flip.other.renderer)}" for cell in page.cells for flip in cell.flips}
 

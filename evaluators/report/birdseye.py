@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from evaluators.report.events import Event, events_of
+from evaluators.report.events import Event, clock_zero_us, events_of
 from evaluators.report.numbers import fixed
 from evaluators.report.road_users import RoadUser, corners, road_users
 from evaluators.report.run_folder import Rollout, Series
@@ -182,10 +182,11 @@ def scene_view(
         if r.cell in driven and (r.renderer, r.policy) in variant_of
     ]
     vehicle = content.get("vehicle") or {}
-    marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout)) for r in rollouts for e in events_of(r, series)]
+    zero_us = clock_zero_us(content, _first_us(rollouts, series))
+    marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout), zero_us) for r in rollouts for e in events_of(r, series)]
     bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
     lanes = content.get("lanes") or []
-    at_us, at_text = _moment(rollouts, series)
+    at_us, at_text = _moment(rollouts, series, zero_us)
     return SceneView(
         scene=scene,
         source=str(content.get("source") or ""),
@@ -208,18 +209,22 @@ def scene_view(
     )
 
 
-def _moment(rollouts: Sequence[Rollout], series: Series) -> tuple[int, str]:
+def _first_us(rollouts: Sequence[Rollout], series: Series) -> int:
+    """Return the time of the first logged pose; 0 where none is logged."""
+    return min((int(series[r.cell]["ego_x_m"][0][0]) for r in rollouts if "ego_x_m" in series.get(r.cell, {})), default=0)
+
+
+def _moment(rollouts: Sequence[Rollout], series: Series, zero_us: int) -> tuple[int, str]:
     """Return when road users are drawn: at the scene's first event, else half way through."""
     times = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
     if not times:
         return 0, ""
-    start_us = min(int(t[0]) for t in times)
-    firsts = [(e.t_s, e.what) for r in rollouts for e in events_of(r, series) if e.t_s is not None]
+    firsts = [(e.t_us, e.what) for r in rollouts for e in events_of(r, series) if e.t_us is not None]
     if firsts:
-        t_s, what = min(firsts)
-        return start_us + round(t_s * 1e6), f"at {fixed(t_s, 1)}\u00a0s, when the first {what} happens"
-    middle_us = (start_us + max(int(t[-1]) for t in times)) // 2
-    return middle_us, f"at {fixed((middle_us - start_us) * 1e-6, 1)}\u00a0s, half way"
+        t_us, what = min(firsts)
+        return t_us, f"at {fixed((t_us - zero_us) * 1e-6, 1)}\u00a0s, when the first {what} happens"
+    middle_us = (min(int(t[0]) for t in times) + max(int(t[-1]) for t in times)) // 2
+    return middle_us, f"at {fixed((middle_us - zero_us) * 1e-6, 1)}\u00a0s, half way"
 
 
 def _seen(xy: F64, closed: bool, frame: _Frame) -> str:
@@ -270,9 +275,9 @@ def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
     return "".join(drawn)
 
 
-def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: Variants, label: str) -> Mark:
+def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: Variants, label: str, zero_us: int) -> Mark:
     variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
-    when = f"at {fixed(event.t_s, 1)}\u00a0s" if event.t_s is not None else "at a time that no step shows"
+    when = f"at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s" if event.t_us is not None else "at a time that no step shows"
     if event.x_m is None or event.y_m is None:
         return Mark(variant, event.kind, f"{label}: {event.what} {when}", None, None)
     yaw = event.yaw_rad or 0.0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,6 +41,16 @@ class Event:
         if self.kind == "offroad":
             return "off-road"
         return f"collision ({self.side})" if self.side else "collision"
+
+
+def clock_zero_us(content: Mapping[str, Any], first_us: int) -> int:
+    """Return the instant that the times of a scene count from: its first camera frame.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+        first_us: The first logged pose, which counts where the scene does not say when it runs (scored logs of others).
+    """
+    return max(int(content.get("start_us") or 0), first_us)
 
 
 def read_series(run: Run, scenes: Sequence[str] | None = None) -> Series:

@@ -103,7 +103,7 @@ def test_events_are_at_the_times_that_the_report_states(watched_run: Path) -> No
             stated = [(event.kind, round(event.t_s * 1000)) for event in events_of(rollout, series) if event.t_s is not None]
             assert [(one["kind"], one["t"]) for one in drive["moments"] if one["kind"] != "frame"] == stated
             frames = [(one["text"], one["t"]) for one in drive["moments"] if one["kind"] == "frame"]
-            assert frames == [("replaced", 100 * (WATCHED.steps // 3))]
+            assert frames == [("frame: replaced", 100 * (WATCHED.steps // 3))]
             seen += len(stated)
     assert seen >= 3
 
@@ -159,7 +159,7 @@ def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run: Path) 
     assert [cell.seed for cell in shown_by_default(many, Wanted(), None)] == [*(cell.seed for cell in cells), 10, 11]
     assert len(shown_by_default(many, Wanted(scenes=("smoke-straight",)), None)) == 14
     assert len(shown_by_default(many, Wanted(), 2)) == 2
-    (chosen,) = cells_of(run, Wanted(scenes=("smoke-straight",), seeds=(1,), renderers=("clean", "3dgs")))
+    (chosen,) = cells_of(run, Wanted(scenes=("smoke/straight",), seeds=(1,), renderers=("clean", "3dgs")))
     assert [rollout.renderer for rollout in chosen.rollouts] == ["clean", "3dgs"]
     with pytest.raises(InputError, match=r"(?s)--renderer nobody.*clean, 3dgs, onefixer") as caught:
         check_wanted(run, Wanted(renderers=("nobody",)))

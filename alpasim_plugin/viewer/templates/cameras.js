@@ -77,10 +77,11 @@ class Cameras {
     const head = make("figcaption");
     const focus = make("button", "focus");
     focus.type = "button";
-    focus.title = "Follow this renderer's ego, and show its samples and road users" + (i < 9 ? " (" + (i + 1) + ")" : "");
+    focus.title = drive.renderer + ": follow this renderer's ego, and show its samples and road users" + (i < 9 ? " (" + (i + 1) + ")" : "");
     focus.append(make("span", "swatch"), make("b", "name", drive.renderer));
     focus.addEventListener("click", () => this.onFocus(i));
     const said = make("span", "outcome" + (outcome === "no event" ? "" : " bad"), outcome);
+    said.title = outcome;
     const eye = make("button", "eye", "Hide");
     eye.type = "button";
     eye.setAttribute("aria-pressed", "false");

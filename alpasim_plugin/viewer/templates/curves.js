@@ -92,7 +92,8 @@ class Curves {
       now.append(read);
       return { curve, text, said: "" };
     });
-    plot.append(svg, make("span", "limit top", shortNumber(high)), make("span", "limit bottom", shortNumber(low)), make("i", "playhead"));
+    plot.append(svg, make("i", "playhead"));
+    if (values.length) plot.append(make("span", "limit top", shortNumber(high)), make("span", "limit bottom", shortNumber(low)));
     node.append(head, plot);
     const whys = [...new Set(drives.map(({ curve }) => curve.why).filter(Boolean))];
     if (!values.length && whys.length) node.append(make("p", "why small muted", "no valid value: " + whys.join("; ")));

@@ -35,6 +35,8 @@ const player = {
     const { live, done, planned } = this.index;
     byId("live").hidden = !live;
     if (live) byId("live").textContent = done < planned ? `Live: ${done} of ${planned} rollouts` : `Finished: ${done} rollouts`;
+    byId("report").hidden = !this.index.report;
+    byId("report").href = this.index.report;
     byId("empty").hidden = this.here().length > 0;
     byId("empty").textContent = live ? "Waiting for the first rollout to finish." : "No rollout of this run ran to its end, so there is nothing to watch.";
     byId("main").hidden = !this.here().length;
@@ -105,9 +107,11 @@ const player = {
 
   legend() {
     const drive = this.cell.drives[this.focus], kinds = new Set((drive?.users ?? []).map((i) => this.cell.users[i].label));
-    byId("kinds").replaceChildren(...[...kinds].sort().map((kind) => {
+    const shapes = { disc: [], "box strong": [], box: [] };
+    for (const kind of [...kinds].sort()) shapes[kindOf(kind) === "pedestrian" ? "disc" : onFoot(kind) ? "box strong" : "box"].push(kind);
+    byId("kinds").replaceChildren(...Object.entries(shapes).filter(([, named]) => named.length).map(([shape, named]) => {
       const item = make("span", "item");
-      item.append(make("i", `kind ${kindOf(kind) === "pedestrian" ? "disc" : "box"}${onFoot(kind) ? " strong" : ""}`), kind);
+      item.append(make("i", `kind ${shape}${shape === "disc" ? " strong" : ""}`), named.join(", "));
       return item;
     }));
     byId("as-recorded").hidden = drive?.as_driven !== false;
