@@ -66,7 +66,7 @@ class WatchedCell:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What was asked for; an empty tuple is everything. A scene may be named as on the command line of a run: smoke/curve is smoke-curve."""
+    """What was asked for; an empty tuple is everything. A scene may be named as when it was driven: smoke/curve is smoke-curve."""
 
     scenes: tuple[str, ...] = ()
     policies: tuple[str, ...] = ()

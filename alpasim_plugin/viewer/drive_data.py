@@ -170,7 +170,8 @@ def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, An
         now = set(str(row.get("events") or "").split())
         t_us = row.get("t_us")
         if isinstance(t_us, int):
-            found += [{"t": round((t_us - place.zero_us) / 1000), "kind": "frame", "text": f"frame: {name}"} for name in sorted(now - before)]
+            t_ms = round((t_us - place.zero_us) / 1000)
+            found += [{"t": t_ms, "kind": "frame", "text": f"frame: {name}"} for name in sorted(now - before)]
         before = now
     return found[:MAX_FRAME_EVENTS]
 
