@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.errors import InputError, SimrunError
@@ -35,8 +36,8 @@ def read_logs(run: Run, cell: WatchedCell) -> Logs:
 def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
     path = run.file_of(rollout, LOG)
     if path is None:
-        stated = run.manifest(rollout).get("log")
-        path = None if stated is None else run.folder / str(stated)
+        stated = run.manifest(rollout).get("log")  # as it was named to simrun score, so from the same working directory
+        path = None if stated is None else Path(str(stated))
     try:
         return read_asl(path) if path is not None and path.is_file() else None
     except SimrunError as error:
@@ -76,7 +77,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, ca
         if fine is not None:
             kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
             drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
-            drive["no_frames"] = "" if kept else no_frames(camera)
+            drive["no_frames"] = "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
         drives.append(drive)
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
     return {
@@ -97,8 +98,10 @@ def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
     return min([*firsts, *(min(t.to_pylist()) for t in tables if len(t))], default=0)
 
 
-def no_frames(camera: str | None) -> str:
+def no_frames(manifest: Mapping[str, Any], has_log: bool, camera: str | None) -> str:
     """Say why a rollout has no pictures, and how to get them."""
+    if not has_log and manifest.get("log"):
+        return f"The log that this rollout was scored from is not at {manifest['log']}. Run simrun view where simrun score was run."
     return NO_FRAMES if camera is None else f"This rollout has no frames of a camera {camera}."
 
 

@@ -19,7 +19,7 @@ from evaluators.report.run_folder import Rollout, Run
 
 VIDEO = "front.mp4"
 JPEG_QUALITY = 76
-NO_FRAMES = "This rollout kept no camera frames. Run it again with --images jpeg (the default) or with --video all."
+NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ def test_a_running_run_fills_up(browser: Browser, watched_run: Path, tmp_path: P
             (root / path / "manifest.json").write_bytes(later[path])
             if path == every[0]:
                 wait(browser, "player.cell !== null && player.cell.drives.length === 1")
-        wait(browser, f"{said} === 'Live: {len(every)} of {len(every)} rollouts' || {said} === 'Finished: {len(every)} rollouts'")
+        wait(browser, f"{said} === 'Live: {len(every)} of {len(every)} rollouts'")
         wait(browser, "player.cell.drives.length === 3")
         settled(browser)
         assert len(browser.evaluate(SEEN)) == 3

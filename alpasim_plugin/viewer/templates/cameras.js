@@ -70,6 +70,7 @@ class Cameras {
     this.root.replaceChildren();
     this.shown = cell.drives.map((drive, i) => this.figure(drive, i, outcomes[drive.renderer] ?? "", cameraName));
     this.root.dataset.count = String(cell.drives.length);
+    this.root.classList.toggle("bare", this.shown.every((one) => !one.camera)); // words alone need no room for pictures
   }
 
   figure(drive, i, outcome, cameraName) {

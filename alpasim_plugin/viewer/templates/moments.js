@@ -69,7 +69,8 @@ class Moments {
       item.append(button);
       return item;
     }));
-    if (!rows.length) this.flips.append(make("li", "small muted none", "None: every pair of rollouts ends alike."));
+    const none = this.index.renderers.length > 1 ? "None: every pair of rollouts ends alike." : "Nothing to compare: the run has one renderer.";
+    if (!rows.length) this.flips.append(make("li", "small muted none", none));
   }
 
   markCell(id) {

@@ -32,9 +32,9 @@ const player = {
     this.moments.loadFlips(this.index.cells);
     this.moments.loadNotes(this.index.notes);
     this.fillPickers();
-    const { live, done, planned } = this.index;
+    const { live, done, planned, finished } = this.index;
     byId("live").hidden = !live;
-    if (live) byId("live").textContent = done < planned ? `Live: ${done} of ${planned} rollouts` : `Finished: ${done} rollouts`;
+    if (live) byId("live").textContent = !finished ? `Live: ${done} of ${planned} rollouts` : `Finished: ${done} rollouts`;
     byId("report").hidden = !this.index.report;
     byId("report").href = this.index.report;
     byId("empty").hidden = this.here().length > 0;
@@ -245,7 +245,7 @@ const player = {
       if (!this.cell && this.here().length) await this.open(this.here()[0].id);
       else if (after && JSON.stringify(after.outcomes) !== JSON.stringify(before.outcomes)) await this.open(after.id, { again: true });
     }
-    if (!next || next.done < next.planned) setTimeout(() => this.poll(), POLL_MS);
+    if (!next?.finished) setTimeout(() => this.poll(), POLL_MS);
   },
 
   bind() {
