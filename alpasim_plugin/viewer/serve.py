@@ -22,7 +22,8 @@ from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
 from alpasim_plugin.viewer.so_far import RunSoFar
 
 DOING = "serving a run"
-LEAST_AGE_S = 1.0  # the folder is not looked through more often than this
+LEAST_AGE_S = 1.0  # the folder is not looked through more often than this,
+MOST_SHARE = 0.05  # and looking takes no more than this share of the time: the run needs the cores
 PIECE = 1 << 20  # bytes
 PATIENCE_S = 30.0  # for a client that says nothing
 TYPES = {
@@ -91,7 +92,7 @@ class RunServer(ThreadingHTTPServer):
             self.address_family = socket.AF_INET6
         self._read, self._wanted, self._options = read, wanted, options
         self._lock = threading.Lock()
-        self._seen: tuple[float, RunSoFar] | None = None
+        self._seen: tuple[float, RunSoFar] | None = None  # until when it is young enough
         check_wanted(self.seen().run, wanted)
         self.root = self.seen().run.folder.resolve()
         try:
@@ -114,8 +115,11 @@ class RunServer(ThreadingHTTPServer):
     def seen(self) -> RunSoFar:
         """Return the run as it was a moment ago."""
         with self._lock:
-            if self._seen is None or time.monotonic() - self._seen[0] > LEAST_AGE_S:
-                self._seen = (time.monotonic(), self._read())
+            if self._seen is None or time.monotonic() >= self._seen[0]:
+                began = time.monotonic()
+                now = self._read()
+                done = time.monotonic()
+                self._seen = (done + max(LEAST_AGE_S, (done - began) / MOST_SHARE), now)
             return self._seen[1]
 
     def cells(self) -> list[WatchedCell]:

@@ -30,14 +30,14 @@ WATCHED = Plan(scenes=("urban-left_turn", "smoke-straight"), seeds=(0, 1), steps
 POSES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
 
 
-def make_watched(folder: Path, plan: Plan = WATCHED, actors: int = 6, images: bool = True) -> Path:
+def make_watched(folder: Path, plan: Plan = WATCHED, actors: int = 6, cameras: Sequence[str] = ("front",)) -> Path:
     """Write a run folder whose finished rollouts have logs, and return it.
 
     Args:
         folder: Where.
         plan: What drives there are; with `WATCHED`, outcomes change between renderers.
         actors: Road users in every scene; every third one goes elsewhere behind every renderer.
-        images: Whether the logs keep camera frames.
+        cameras: Whose frames the logs keep; frames of the second one are numbered from 100 on.
     """
     make_run(folder, replace(plan, clips=False))
     run = read_run(folder)
@@ -50,7 +50,7 @@ def make_watched(folder: Path, plan: Plan = WATCHED, actors: int = 6, images: bo
             keys = zip(("renderer", "policy", "scene", "seed"), rollout.cell, strict=True)
             own = steps.filter(reduce(operator.and_, (pc.field(name) == value for name, value in keys)))
             pq.write_table(own, place / "steps.parquet")
-            write_log(place, rollout, content, ego_of(own), actors, images)
+            write_log(place, rollout, content, ego_of(own), actors, cameras)
     return folder
 
 
@@ -62,7 +62,7 @@ def ego_of(steps: Any) -> Trajectory:
     return Trajectory(t_us, np.column_stack([x, y, np.zeros_like(x)]), quat_from_yaw(yaw))
 
 
-def write_log(place: Path, rollout: Rollout, content: Mapping[str, Any], ego: Trajectory, actors: int, images: bool) -> None:
+def write_log(place: Path, rollout: Rollout, content: Mapping[str, Any], ego: Trajectory, actors: int, cameras: Sequence[str]) -> None:
     """Write ``rollout.asl`` and ``frames.jsonl``."""
     header = RolloutHeader(
         scene_id=rollout.scene,
@@ -76,12 +76,12 @@ def write_log(place: Path, rollout: Rollout, content: Mapping[str, Any], ego: Tr
         n_steps=len(ego) - 1,
     )
     with AslWriter(place / "rollout.asl", header) as log:
-        log.begin([CAMERA] if images else [])
+        log.begin([replace(CAMERA, name=name) for name in cameras])
         for k, t_us in enumerate(ego.t_us.tolist()):
             pose = se3(ego.xyz[k], ego.quat[k])
             log.actor_poses(t_us, pose, {actor.actor_id: se3(actor.track.xyz[k], actor.track.quat[k]) for actor in header.actors})
-            if images:
-                log.camera_image(Frame(t_us, CAMERA.name, picture(k)), "png")
+            for number, name in enumerate(cameras):
+                log.camera_image(Frame(t_us, name, picture(k + 100 * number)), "png")
             if k + 1 < len(ego):
                 log.ego_trajectory([EgoState(t_us, pose, 8.0)])
                 log.driver_request(t_us, t_us + DT_US)

@@ -234,8 +234,21 @@ def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(brow
     assert browser.evaluate("document.querySelectorAll('#curves .curve').length") == chosen - 1
 
 
+def test_another_camera_is_chosen_for_all_renderers(browser: Browser, tmp_path: Path) -> None:
+    plan = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8)
+    root = make_watched(tmp_path / "run", plan, cameras=("front", "left"))
+    browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
+    settled(browser)
+    seek(browser, 300)
+    assert browser.evaluate(SEEN) == [3, 3]
+    browser.evaluate("document.getElementById('camera').value = 'left'")
+    browser.evaluate("document.getElementById('camera').dispatchEvent(new Event('change'))")
+    settled(browser)
+    assert browser.evaluate(SEEN) == [103, 103]
+
+
 def test_a_page_without_frames_says_so(browser: Browser, tmp_path: Path) -> None:
-    root = make_watched(tmp_path / "run", Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8), images=False)
+    root = make_watched(tmp_path / "run", Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=8), cameras=())
     browser.open(write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None).path)
     settled(browser)
     assert browser.evaluate("[...document.querySelectorAll('.stage .none')].filter(p => p.textContent.includes('--video all')).length") == 2

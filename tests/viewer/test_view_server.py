@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import os
 import shutil
 import threading
@@ -20,6 +21,7 @@ from alpasim_plugin.viewer import serve
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import Options
 from alpasim_plugin.viewer.serve import RunServer, file_below, loopback
+from alpasim_plugin.viewer.so_far import RunSoFar
 from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched, unfinished
 
@@ -46,6 +48,7 @@ def running(made: Path, tmp_path: Path) -> tuple[Path, dict[str, bytes]]:
 @pytest.fixture
 def server(running: tuple[Path, dict[str, bytes]], monkeypatch: pytest.MonkeyPatch) -> Iterator[RunServer]:
     monkeypatch.setattr(serve, "LEAST_AGE_S", 0.0)
+    monkeypatch.setattr(serve, "MOST_SHARE", math.inf)
     with RunServer(("127.0.0.1", 0), lambda: read_so_far(running[0]), Wanted(), Options()) as opened:
         thread = threading.Thread(target=opened.serve_forever, args=(0.02,), daemon=True)
         thread.start()
@@ -157,17 +160,23 @@ def test_files_of_the_run_are_given(server: RunServer, running: tuple[Path, Any]
     assert file_below(running[0], "run.json") == running[0] / "run.json"
 
 
-def test_many_askers_wait_for_one_look_at_the_folder(server: RunServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serve, "LEAST_AGE_S", 60.0)
+def test_many_askers_wait_for_one_look_at_the_folder(running: tuple[Path, Any]) -> None:
     looks = []
-    read = server._read
-    monkeypatch.setattr(server, "_read", lambda: (looks.append(time.monotonic()), read())[1])
-    threads = [threading.Thread(target=get_json, args=(server, "/index.json")) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(looks) <= 1
+
+    def slow() -> RunSoFar:
+        looks.append(time.monotonic())
+        time.sleep(0.05)
+        return read_so_far(running[0])
+
+    with RunServer(("127.0.0.1", 0), slow, Wanted(), Options()) as server:
+        threads = [threading.Thread(target=server.seen) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(looks) == 1  # the one of the beginning is young enough
+        assert server._seen is not None
+        assert server._seen[0] - looks[0] >= 0.05 / serve.MOST_SHARE
 
 
 def test_addresses_of_this_machine_alone() -> None:

@@ -173,7 +173,10 @@ class Birdseye {
     const { context, cell } = this, first = seen.find((drive) => drive.i === focus) ?? seen[0];
     if (!first) return;
     const filled = new Set(first.users), groups = new Map();
-    const put = (key, user) => { const pose = poseAt(user, t, 60); if (pose) (groups.get(key) ?? groups.set(key, []).get(key)).push([user, pose]); };
+    const put = (key, user) => {
+      const pose = poseAt(user, t, 60);
+      if (pose) (groups.get(key) ?? groups.set(key, []).get(key)).push([user, pose]);
+    };
     for (const i of first.users) put(cell.users[i].label, cell.users[i]);
     for (const drive of seen) for (const i of drive.users) if (!filled.has(i)) put(drive, cell.users[i]);
     for (const [key, all] of groups) {
@@ -241,7 +244,10 @@ class Birdseye {
     context.setLineDash([]);
     context.fillStyle = drive.colour;
     context.beginPath(); // a dot for every second: points are half a second apart
-    for (let k = 2; k < plan[0].length; k += 2) { context.moveTo(plan[0][k], plan[1][k]); context.arc(plan[0][k], plan[1][k], 3 * px, 0, 7); }
+    for (let k = 2; k < plan[0].length; k += 2) {
+      context.moveTo(plan[0][k], plan[1][k]);
+      context.arc(plan[0][k], plan[1][k], 3 * px, 0, 7);
+    }
     context.fill();
     context.globalAlpha = 1;
   }
@@ -308,7 +314,11 @@ class Birdseye {
   bindPointer() {
     let last = null;
     const { canvas } = this;
-    canvas.addEventListener("pointerdown", (event) => { if (event.button === 0) { last = [event.clientX, event.clientY]; canvas.setPointerCapture(event.pointerId); } });
+    canvas.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
+      last = [event.clientX, event.clientY];
+      canvas.setPointerCapture(event.pointerId);
+    });
     canvas.addEventListener("pointermove", (event) => {
       if (!last || !this.layer) return;
       const cm = this.ratio / this.layer.view.scale;

@@ -20,8 +20,8 @@ class Curves {
   load(cell, from, to) {
     Object.assign(this, { cell, from, to });
     const known = new Set(cell.drives.flatMap((drive) => Object.keys(drive.curves ?? {})));
-    const order = Object.keys(this.index.metrics);
-    const rank = (name) => { const first = this.index.first_curves.indexOf(name); return first >= 0 ? first - 1000 : order.includes(name) ? order.indexOf(name) : 999; };
+    const order = [...new Set([...this.index.first_curves, ...Object.keys(this.index.metrics)])];
+    const rank = (name) => (order.includes(name) ? order.indexOf(name) : order.length);
     this.names = [...known].sort((a, b) => rank(a) - rank(b) || (a < b ? -1 : 1));
     this.chooser.replaceChildren(...this.names.map((name) => this.choice(name)));
     this.draw();
@@ -31,7 +31,11 @@ class Curves {
     const label = make("label"), box = make("input");
     box.type = "checkbox";
     box.checked = this.chosen.has(name);
-    box.addEventListener("change", () => { if (box.checked) this.chosen.add(name); else this.chosen.delete(name); this.draw(); this.show(this.t); });
+    box.addEventListener("change", () => {
+      if (box.checked) this.chosen.add(name); else this.chosen.delete(name);
+      this.draw();
+      this.show(this.t);
+    });
     label.title = this.index.metrics[name]?.help ?? "";
     label.append(box, make("span", "", name));
     return label;
@@ -53,7 +57,8 @@ class Curves {
 
   chart(name) {
     const facts = this.index.metrics[name] ?? { unit: "", help: "" };
-    const drives = this.cell.drives.map((drive, i) => ({ i, renderer: drive.renderer, curve: drive.curves?.[name] })).filter((one) => one.curve);
+    const all = this.cell.drives.map((drive, i) => ({ i, renderer: drive.renderer, curve: drive.curves?.[name] }));
+    const drives = all.filter((one) => one.curve);
     const values = drives.flatMap(({ curve }) => curve.v.filter((v) => v !== null));
     let low = facts.flag ? 0 : Math.min(...values), high = facts.flag ? 1 : Math.max(...values);
     if (!values.length) [low, high] = [0, 1];
@@ -72,13 +77,16 @@ class Curves {
     const plot = make("div", "plot");
     const svg = svgNode("svg", { viewBox: `0 0 ${CHART.width} ${CHART.height}`, preserveAspectRatio: "none", role: "img" });
     svg.setAttribute("aria-label", this.inWords(name, facts, drives));
-    for (const [start, end] of this.unscored()) svg.append(svgNode("rect", { class: "unscored", x: x(start), y: 0, width: x(end) - x(start), height: CHART.height }));
+    for (const [start, end] of this.unscored()) {
+      svg.append(svgNode("rect", { class: "unscored", x: x(start), y: 0, width: x(end) - x(start), height: CHART.height }));
+    }
     if (low < 0 && high > 0) svg.append(svgNode("line", { class: "zero", x1: 0, x2: CHART.width, y1: y(0), y2: y(0) }));
     const reads = drives.map(({ i, renderer, curve }, row) => {
       const group = svgNode("g", { class: variantClass(this.index, renderer), "data-drive": i });
       group.append(svgNode("path", { class: "line", d: linePath(curve, x, y) }));
       for (const [start, end] of invalidParts(curve)) {
-        const bar = svgNode("rect", { class: "invalid", x: x(start), width: Math.max(4, x(end) - x(start)), y: CHART.height - 7 * (row + 1), height: 6 });
+        const width = Math.max(4, x(end) - x(start));
+        const bar = svgNode("rect", { class: "invalid", x: x(start), width, y: CHART.height - 7 * (row + 1), height: 6 });
         bar.append(svgNode("title"));
         bar.firstChild.textContent = `${renderer}: no valid value from ${seconds(start)} to ${seconds(end)} s. ${curve.why ?? ""}`;
         group.append(bar);

@@ -38,7 +38,8 @@ const player = {
     byId("report").hidden = !this.index.report;
     byId("report").href = this.index.report;
     byId("empty").hidden = this.here().length > 0;
-    byId("empty").textContent = live ? "Waiting for the first rollout to finish." : "No rollout of this run ran to its end, so there is nothing to watch.";
+    const nothing = "No rollout of this run ran to its end, so there is nothing to watch.";
+    byId("empty").textContent = live ? "Waiting for the first rollout to finish." : nothing;
     byId("main").hidden = !this.here().length;
   },
 
@@ -265,10 +266,17 @@ const player = {
     click("close-help", () => byId("keys").close());
     byId("scrub").addEventListener("input", (event) => { this.play(false); this.seek(Number(event.target.value)); });
     byId("scrub").addEventListener("change", () => this.remember());
-    byId("speed").replaceChildren(...SPEEDS.map((speed) => Object.assign(make("option", "", speed + "\u00d7"), { value: String(speed), selected: speed === 1 })));
+    byId("speed").replaceChildren(...SPEEDS.map((speed) => {
+      const option = make("option", "", speed + "\u00d7");
+      return Object.assign(option, { value: String(speed), selected: speed === 1 });
+    }));
     byId("speed").addEventListener("change", (event) => this.setSpeed(Number(event.target.value)));
     for (const key of ["scene", "policy", "seed"]) byId(key).addEventListener("change", (event) => this.pick(key, event.target.value));
-    byId("camera").addEventListener("change", (event) => { this.camera = event.target.value; this.cameras.load(this.cell, this.entry(this.cell.id).outcomes, this.camera); this.refresh(); });
+    byId("camera").addEventListener("change", (event) => {
+      this.camera = event.target.value;
+      this.cameras.load(this.cell, this.entry(this.cell.id).outcomes, this.camera);
+      this.refresh();
+    });
     document.addEventListener("keydown", (event) => this.key(event));
     const redraw = () => { this.birdseye.readColours(); if (this.cell) this.show(); };
     new ResizeObserver(redraw).observe(byId("birdseye"));
