@@ -1,4 +1,4 @@
-"""Which cells of a run a page replays: changed outcomes first, then events, then a few quiet ones."""
+"""Which cells of a run a page replays: changed outcomes first, then events, then a few quiet ones, the most different drives first."""
 
 from __future__ import annotations
 
@@ -53,6 +53,13 @@ class WatchedCell:
         if any(events(rollout) for rollout in self.rollouts if rollout.ok):
             return "event"
         return "quiet" if all(rollout.ok for rollout in self.rollouts) else "failure"
+
+    @property
+    def apart_m(self) -> float:
+        """Say how different the drives are: between the longest and the shortest, and the largest distance from the recorded path."""
+        driven = [m for r in self.rollouts if (m := r.metrics.get("dist_traveled_m")) is not None]
+        aside = [m for r in self.rollouts if (m := r.metrics.get("lateral_distance_m")) is not None]
+        return max(driven, default=0.0) - min(driven, default=0.0) + max(aside, default=0.0)
 
     @property
     def watchable(self) -> bool:
@@ -112,8 +119,7 @@ def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
         if _asked(flip.other, wanted):
             flips.setdefault((flip.other.scene, flip.other.policy, flip.other.seed), []).append(flip)
     cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ()))) for key, members in grouped.items()]
-    place = {cell.id: i for i, cell in enumerate(cells)}
-    return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), place[cell.id]))
+    return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))  # stable: equal ones stay in the run's order
 
 
 def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted, at_most: int | None) -> list[WatchedCell]:

@@ -191,6 +191,9 @@ def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run: Path) 
     assert len(shown_by_default(many, Wanted(), 2)) == 2
     (chosen,) = cells_of(run, Wanted(scenes=("smoke/straight",), seeds=(1,), renderers=("clean", "3dgs")))
     assert [rollout.renderer for rollout in chosen.rollouts] == ["clean", "3dgs"]
+    far = replace(cells[-1].rollouts[0], metrics={"dist_traveled_m": 90.0})
+    near = replace(cells[-1].rollouts[1], metrics={"dist_traveled_m": 20.0, "lateral_distance_m": 3.0})
+    assert replace(cells[-1], rollouts=(far, near)).apart_m == 73.0
     with pytest.raises(InputError, match=r"(?s)--renderer nobody.*clean, 3dgs, onefixer") as caught:
         check_wanted(run, Wanted(renderers=("nobody",)))
     assert caught.value.exit_code == 2
