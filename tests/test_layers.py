@@ -44,6 +44,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "alpasim_plugin.log": {"alpasim_plugin.alpasim"},
     "evaluators": set(),
+    "alpasim_plugin.viewer": {"alpasim_plugin.log", "evaluators"},
     "alpasim_plugin.runtime": {
         "alpasim_plugin.alpasim",  # the messages of logs that it exports
         "alpasim_plugin.fixers",
@@ -51,6 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "alpasim_plugin.renderers",
         "alpasim_plugin.control",
         "alpasim_plugin.log",
+        "alpasim_plugin.viewer",
         "evaluators",
         "policies",
         "scenarios",

@@ -35,6 +35,10 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
     "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
     "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),
+    "view": (
+        "view", "view", "EPILOG",
+        "Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run.",
+    ),
     "export": (
         "export", "export", "EPILOG",
         "Write a run as AlpaSim run folders, one for each renderer and policy, and its scenes as .usdz; or scenes alone.",

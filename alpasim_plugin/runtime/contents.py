@@ -21,7 +21,8 @@ from alpasim_plugin.vouched import FileFacts, problem_of, read_sealed, vouch, wr
 CONTENTS, RUN_INFO, SCENES, AGGREGATE = "contents.json", "run.json", "scenes", "aggregate"
 SUMMARY, ROLLOUTS, STEPS = "summary.json", "rollouts.parquet", "steps.parquet"
 TABLES = (SUMMARY, ROLLOUTS, STEPS)  # made from the manifests
-REPORTS = ("report.html", "summary.md", "junit.xml")  # made from the tables; nothing reads them
+PAGES = ("report.html", "flips.html")
+REPORTS = (*PAGES, "summary.md", "junit.xml")  # made from the tables; nothing reads them
 DOING = "reading a run folder"
 AGAIN = "give the command of the run again: finished rollouts are kept"
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from evaluators.report.events import Event, events_of
+from evaluators.report.events import Event, clock_zero_us, events_of
 from evaluators.report.numbers import fixed
 from evaluators.report.road_users import RoadUser, corners, road_users
 from evaluators.report.run_folder import Rollout, Series
@@ -89,13 +89,18 @@ class SceneView:
         return self.height < 0.45 * self.width
 
 
+def chord_angle(log: F64) -> float:
+    """Return the direction in radians from the first to the last of ``(N, 2)`` points; 0 where they are hardly apart."""
+    chord = log[-1] - log[0]
+    return math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
+
+
 class _Frame:
     """The turn, shift and scale from world metres to drawing units."""
 
     def __init__(self, log: F64, paths: Sequence[F64]) -> None:
         self.log_at = log[0]
-        chord = log[-1] - log[0]
-        angle = math.atan2(chord[1], chord[0]) if float(np.hypot(*chord)) > 1.0 else 0.0
+        angle = chord_angle(log)
         c, s = math.cos(angle), math.sin(angle)
         self.turn = np.array([[c, s], [-s, c]])  # world to drawing, still metres and y up
         self.north_deg = math.degrees(angle)
@@ -177,18 +182,19 @@ def scene_view(
         if r.cell in driven and (r.renderer, r.policy) in variant_of
     ]
     vehicle = content.get("vehicle") or {}
-    marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout)) for r in rollouts for e in events_of(r, series)]
+    zero_us = clock_zero_us(content, _first_us(rollouts, series))
+    marks = [_mark(e, frame, vehicle, variant_of, label(e.rollout), zero_us) for r in rollouts for e in events_of(r, series)]
     bar_m = next(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 1e9) if b * frame.scale > 0.08 * UNITS_ACROSS)
     lanes = content.get("lanes") or []
-    at_us, at_text = _moment(rollouts, series)
+    at_us, at_text = _moment(rollouts, series, zero_us)
     return SceneView(
         scene=scene,
         source=str(content.get("source") or ""),
         width=UNITS_ACROSS,
         height=frame.height,
         unit_per_m=frame.scale,
-        lanes=_areas([_ring(lane) for lane in lanes], frame),
-        lines=_lines([edge for lane in lanes for edge in _painted(lane)], frame),
+        lanes=_areas([lane_ring(lane) for lane in lanes], frame),
+        lines=_lines([edge for lane in lanes for edge in painted_edges(lane)], frame),
         edges=_lines(content.get("road_edges") or [], frame),
         crosswalks=_areas(content.get("crosswalks") or [], frame),
         log=path_data(frame.units(log)),
@@ -203,18 +209,22 @@ def scene_view(
     )
 
 
-def _moment(rollouts: Sequence[Rollout], series: Series) -> tuple[int, str]:
+def _first_us(rollouts: Sequence[Rollout], series: Series) -> int:
+    """Return the time of the first logged pose; 0 where none is logged."""
+    return min((int(series[r.cell]["ego_x_m"][0][0]) for r in rollouts if "ego_x_m" in series.get(r.cell, {})), default=0)
+
+
+def _moment(rollouts: Sequence[Rollout], series: Series, zero_us: int) -> tuple[int, str]:
     """Return when road users are drawn: at the scene's first event, else half way through."""
     times = [series[r.cell]["ego_x_m"][0] for r in rollouts if "ego_x_m" in series.get(r.cell, {})]
     if not times:
         return 0, ""
-    start_us = min(int(t[0]) for t in times)
-    firsts = [(e.t_s, e.what) for r in rollouts for e in events_of(r, series) if e.t_s is not None]
+    firsts = [(e.t_us, e.what) for r in rollouts for e in events_of(r, series) if e.t_us is not None]
     if firsts:
-        t_s, what = min(firsts)
-        return start_us + round(t_s * 1e6), f"at {fixed(t_s, 1)}\u00a0s, when the first {what} happens"
-    middle_us = (start_us + max(int(t[-1]) for t in times)) // 2
-    return middle_us, f"at {fixed((middle_us - start_us) * 1e-6, 1)}\u00a0s, half way"
+        t_us, what = min(firsts)
+        return t_us, f"at {fixed((t_us - zero_us) * 1e-6, 1)}\u00a0s, when the first {what} happens"
+    middle_us = (min(int(t[0]) for t in times) + max(int(t[-1]) for t in times)) // 2
+    return middle_us, f"at {fixed((middle_us - zero_us) * 1e-6, 1)}\u00a0s, half way"
 
 
 def _seen(xy: F64, closed: bool, frame: _Frame) -> str:
@@ -229,12 +239,13 @@ def _driven(own: Mapping[str, tuple[Any, F64]]) -> F64 | None:
     return np.stack([x, y], 1) if len(x) > 1 and np.array_equal(tx, ty) else None
 
 
-def _ring(lane: Mapping[str, Any]) -> list[list[float]]:
+def lane_ring(lane: Mapping[str, Any]) -> list[list[float]]:
+    """Return a lane's outline, its left edge first; empty where an edge is not known."""
     left, right = lane.get("left"), lane.get("right")
     return [*left, *reversed(right)] if left and right else []
 
 
-def _painted(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
+def painted_edges(lane: Mapping[str, Any]) -> list[list[list[float]] | None]:
     """List a lane's edges without those that carry no paint, such as the paths across an intersection."""
     sides = zip((lane.get("left"), lane.get("right")), lane.get("paint") or ("unknown", "unknown"), strict=True)
     return [edge for edge, paint in sides if paint != "none"]
@@ -264,9 +275,9 @@ def _areas(rings: Sequence[Sequence[Sequence[float]]], frame: _Frame) -> str:
     return "".join(drawn)
 
 
-def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: Variants, label: str) -> Mark:
+def _mark(event: Event, frame: _Frame, vehicle: Mapping[str, Any], variant_of: Variants, label: str, zero_us: int) -> Mark:
     variant = variant_of.get((event.rollout.renderer, event.rollout.policy), (0, 0))[0]
-    when = f"at {fixed(event.t_s, 1)}\u00a0s" if event.t_s is not None else "at a time that no step shows"
+    when = f"at {fixed((event.t_us - zero_us) * 1e-6, 1)}\u00a0s" if event.t_us is not None else "at a time that no step shows"
     if event.x_m is None or event.y_m is None:
         return Mark(variant, event.kind, f"{label}: {event.what} {when}", None, None)
     yaw = event.yaw_rad or 0.0

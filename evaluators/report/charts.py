@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -60,6 +61,11 @@ class Chart:
     title: str
     note: str
     svg: str
+
+    @property
+    def picture(self) -> Markup:
+        """Give the SVG element with a name for screen readers."""
+        return Markup(self.svg.replace(' role="img"', Markup(' role="img" aria-label="{}. {}"').format(self.title, self.note), 1))
 
 
 @dataclass(frozen=True)

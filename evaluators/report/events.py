@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ class Event:
 
     Attributes:
         t_s: Seconds since the rollout's first step; None where no step shows the event that the rollout's metric counts.
+        t_us: The same instant on the rollout's own clock; None with ``t_s``.
         x_m, y_m, yaw_rad: Pose of the ego's rear axle at that time, world; None with ``t_s`` or where poses are not logged.
         side: Which part of the ego was touched, or "".
     """
@@ -32,6 +33,7 @@ class Event:
     y_m: float | None = None
     yaw_rad: float | None = None
     side: str = ""
+    t_us: int | None = None
 
     @property
     def what(self) -> str:
@@ -39,6 +41,16 @@ class Event:
         if self.kind == "offroad":
             return "off-road"
         return f"collision ({self.side})" if self.side else "collision"
+
+
+def clock_zero_us(content: Mapping[str, Any], first_us: int) -> int:
+    """Return the instant that the times of a scene count from: its first camera frame.
+
+    Args:
+        content: ``scenes/SCENE.json``.
+        first_us: The first logged pose, which counts where the scene does not say when it runs (scored logs of others).
+    """
+    return max(int(content.get("start_us") or 0), first_us)
 
 
 def read_series(run: Run, scenes: Sequence[str] | None = None) -> Series:
@@ -68,7 +80,7 @@ def _event(kind: Literal["collision", "offroad"], rollout: Rollout, own: Own, me
     t_us = min(firsts.values())
     zero_us = min(int(t[0]) for t, _ in own.values())
     x_m, y_m, yaw_rad = (_at(own, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad"))
-    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side)
+    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side, t_us)
 
 
 def _first(own: Own, metric: str) -> int | None:

@@ -40,13 +40,15 @@ LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
 FLIP_BUDGET_BYTES = 2_000_000
+NO_REPLAYS: Mapping[tuple[str, str, str, int], str] = {}
 
 
-def write_report(run_dir: Path | str) -> Path:
+def write_report(run_dir: Path | str, replays: Mapping[tuple[str, str, str, int], str] = NO_REPLAYS) -> Path:
     """Write ``report.html`` into a run folder.
 
     Args:
         run_dir: A run folder (docs/architecture.md). Nothing else is read.
+        replays: Renderer, policy, scene and seed of a changed outcome -> where it is replayed, relative to the run folder.
 
     Returns:
         Path of the report.
@@ -57,18 +59,18 @@ def write_report(run_dir: Path | str) -> Path:
     run = read_run(run_dir)
     path = run.folder / "report.html"
     with reporting(run):
-        text = render_report(run)
+        text = render_report(run, replays)
     write_text(path, text, "writing a report")
     return path
 
 
-def render_report(run: Run) -> str:
-    """Render the report as a string."""
+def render_report(run: Run, replays: Mapping[tuple[str, str, str, int], str] = NO_REPLAYS) -> str:
+    """Render the report as a string; ``replays`` as in `write_report`."""
     environment = _environment()
-    style, script = (_asset(environment, name) for name in ("report.css", "report.js"))
+    style, script = ("\n".join(asset(environment, f"{name}.{kind}") for name in ("theme", "report")) for kind in ("css", "js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return environment.get_template("report.html.j2").render(
-        style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, **context(run)
+        style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, replays=replays, **context(run)
     )
 
 
@@ -175,7 +177,8 @@ def scene_views(
     return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
 
 
-def _asset(environment: Environment, name: str) -> str:
+def asset(environment: Environment, name: str) -> str:
+    """Return the source of a style sheet or a script among the templates."""
     if environment.loader is None:
         raise RuntimeError("the template environment has no loader")
     return environment.loader.get_source(environment, name)[0]

@@ -5,10 +5,11 @@ The report is a pure reader: it works on a folder that was copied from another m
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -179,6 +180,22 @@ class Run:
         with parsing(DOING, path, AGAIN, "no readable parquet"):
             return pads.dataset(path, format=TEXT_AS_CODES).to_table(columns=wanted, filter=keep)
 
+    def steps_of(self, rollout: Rollout) -> pa.Table:
+        """Read all series of one rollout, from the table in its own folder or else from the run's.
+
+        Returns:
+            A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason; empty where neither exists.
+        """
+        own = self.file_of(rollout, "steps.parquet")
+        path = own or self.folder / "steps.parquet"
+        if not path.is_file():
+            return pa.table({name: pa.array([], pa.string()) for name in (*STEP_COLUMNS, "reason")})
+        self._check_steps(path)
+        keys = zip(KEY_COLUMNS, rollout.cell, strict=True)
+        keep = reduce(operator.and_, (pc.field(name) == value for name, value in keys)) if own is None else None
+        with parsing(DOING, path, AGAIN, "no readable parquet"):
+            return pads.dataset(path, format=TEXT_AS_CODES).to_table(columns=[*STEP_COLUMNS, "reason"], filter=keep)
+
     @cached_property
     def _steps_checked(self) -> set[Path]:
         return set()
@@ -284,17 +301,15 @@ def read_run(run_dir: Path | str) -> Run:
     info: Mapping[str, Any] = read_json_as(RunInfo, folder / "run.json", DOING, do_this=AGAIN)
     declare_from(info)
     summary: Mapping[str, Any] = read_json_as(Summary, folder / "summary.json", DOING, do_this=AGAIN)
-    rollouts, names = _read_rollouts(folder / "rollouts.parquet")
+    path = folder / "rollouts.parquet"
+    table = read_parquet(path, DOING, ROLLOUT_COLUMNS, AGAIN)
+    with parsing(DOING, path, AGAIN, "rows that are none of a run"):
+        rollouts, names = rollouts_of_table(table)
     return Run(folder, info, summary, rollouts, names)
 
 
-def _read_rollouts(path: Path) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
-    table = read_parquet(path, DOING, ROLLOUT_COLUMNS, AGAIN)
-    with parsing(DOING, path, AGAIN, "rows that are none of a run"):
-        return _rollouts_of(table)
-
-
-def _rollouts_of(table: pa.Table) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
+def rollouts_of_table(table: pa.Table) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
+    """Return the rollouts of a table with the columns of ``rollouts.parquet``, and the names of their metrics."""
     names = tuple(name.removesuffix("_valid") for name in table.column_names if name.endswith("_valid"))
     rows = []
     for row in table.to_pylist():

@@ -22,6 +22,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         "trains or measures for minutes to days, or needs what that made",
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
+    (r"view .*--serve", "goes on until it is stopped; tests/viewer/test_view_server.py asks it"),
     (r"--images folder/", "needs the reader's own pictures"),
     (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
 )

@@ -91,15 +91,26 @@ class Browser:
 
     def open(self, path: Path, width: int = 1400, height: int = 900, dark: bool = False) -> None:
         """Open a file and wait until it is loaded."""
+        self.visit(path.resolve().as_uri(), width, height, dark)
+
+    def visit(self, url: str, width: int = 1400, height: int = 900, dark: bool = False) -> None:
+        """Open an address and wait until it is loaded."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
         scheme = "dark" if dark else "light"
         self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.call("Page.navigate", url=url)
         deadline = time.monotonic() + PATIENCE_S
-        while self.evaluate("document.readyState") != "complete" or self.evaluate("location.protocol") != "file:":
+        while self.evaluate("document.readyState") != "complete" or self.evaluate("location.href.split('#')[0]") != url.split("#")[0]:
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{path} did not load in {PATIENCE_S} s")
+                raise TimeoutError(f"{url} did not load in {PATIENCE_S} s")
             time.sleep(0.05)
+
+    def press(self, key: str, code: int = 0, shift: bool = False) -> None:
+        """Press and release a key as a person does, with what the page's element in focus makes of it."""
+        stroke = {"key": key, "modifiers": 8 if shift else 0, "windowsVirtualKeyCode": code}
+        text = {"text": key} if len(key) == 1 else {}
+        self.call("Input.dispatchKeyEvent", type="keyDown", **stroke, **text)
+        self.call("Input.dispatchKeyEvent", type="keyUp", **stroke)
 
     def evaluate(self, expression: str) -> Any:
         """Evaluate JavaScript in the page and return its value."""

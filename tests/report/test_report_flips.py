@@ -97,3 +97,15 @@ def test_a_run_whose_pairs_all_end_alike_says_so(tmp_path: Path) -> None:
     flips: tuple[list[Flip], int] = find_flips(read_run(folder))
     assert flips == ([], 1)
     assert "None: all 1\u00a0pair of rollouts end as they do behind clean." in write_report(folder).read_text()
+
+
+def test_a_changed_outcome_links_to_its_replay_where_there_is_one(usual_run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(usual_run, tmp_path / "run"))
+    flips, _ = find_flips(read_run(folder))
+    text = write_report(folder, {flips[0].key: 'flips.html#scene=a&seed="0"'}).read_text()
+    assert text.count('class="replay"') == 1
+    assert '<a class="replay" href="flips.html#scene=a&amp;seed=&#34;0&#34;">' in text
+    assert '<a href="flips.html">' in text
+    without = write_report(folder).read_text()
+    assert "flips.html" not in without
+    assert "simrun view run" in without

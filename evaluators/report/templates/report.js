@@ -1,21 +1,6 @@
 "use strict";
 (() => {
-  const root = document.documentElement;
   const all = (selector, from = document) => [...from.querySelectorAll(selector)];
-
-  // Theme: automatic, dark, light. Storage may be refused for files; the choice then lasts as long as the page.
-  const themes = ["auto", "dark", "light"];
-  const button = document.getElementById("theme");
-  const store = (act) => { try { return act(window.localStorage); } catch { return null; } };
-  const setTheme = (name) => {
-    if (name === "auto") delete root.dataset.theme; else root.dataset.theme = name;
-    button.textContent = "Theme: " + name;
-    button.dataset.name = name;
-    store((s) => s.setItem("simrun-theme", name));
-  };
-  const saved = store((s) => s.getItem("simrun-theme"));
-  setTheme(themes.includes(saved) ? saved : "auto");
-  button.addEventListener("click", () => setTheme(themes[(themes.indexOf(button.dataset.name) + 1) % 3]));
 
   // Sorting: numbers by data-v, text by the alphabet with numbers in it; cells without a value stay last.
   const compare = new Intl.Collator("en", { numeric: true }).compare;

@@ -1,0 +1,166 @@
+"""Which cells of a run a page replays: changed outcomes first, then events, then a few quiet ones, the most different drives first."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from alpasim_plugin.errors import InputError
+from evaluators.report.flips import Flip, baseline_of, events, find_flips, in_words
+from evaluators.report.run_folder import Rollout, Run
+
+DOING = "choosing rollouts to watch"
+QUIET_CELLS = 3  # cells in which nothing happened, shown by default
+
+Interest = Literal["flip", "event", "failure", "quiet"]
+ORDER: tuple[Interest, ...] = ("flip", "event", "failure", "quiet")
+
+
+@dataclass(frozen=True)
+class WatchedCell:
+    """The rollouts of one scene, policy and seed, one for each renderer, which are replayed side by side.
+
+    Attributes:
+        take: 0, except where several logs of one renderer have the same scene, policy and seed.
+        rollouts: In the order of the run's renderers; the failed ones too.
+        flips: Changed outcomes among them.
+    """
+
+    scene: str
+    policy: str
+    seed: int
+    take: int
+    rollouts: tuple[Rollout, ...]
+    flips: tuple[Flip, ...]
+
+    @property
+    def id(self) -> str:
+        """Give a name for addresses and elements: letters and digits."""
+        return hashlib.sha256(repr((self.scene, self.policy, self.seed, self.take)).encode()).hexdigest()[:12]
+
+    @property
+    def name(self) -> str:
+        """Give the name for people."""
+        return f"{self.scene}, {self.policy}, seed {self.seed}" + (f", log {self.take + 1}" if self.take else "")
+
+    @property
+    def interest(self) -> Interest:
+        """Say why somebody would look at it."""
+        if self.flips:
+            return "flip"
+        if any(events(rollout) for rollout in self.rollouts if rollout.ok):
+            return "event"
+        return "quiet" if all(rollout.ok for rollout in self.rollouts) else "failure"
+
+    @property
+    def apart_m(self) -> float:
+        """Say how different the drives are: between the longest and the shortest, and the largest distance from the recorded path."""
+        driven = [m for r in self.rollouts if (m := r.metrics.get("dist_traveled_m")) is not None]
+        aside = [m for r in self.rollouts if (m := r.metrics.get("lateral_distance_m")) is not None]
+        return max(driven, default=0.0) - min(driven, default=0.0) + max(aside, default=0.0)
+
+    @property
+    def watchable(self) -> bool:
+        """Tell whether any of its rollouts ran to its end."""
+        return any(rollout.ok for rollout in self.rollouts)
+
+    def outcomes(self) -> dict[str, str]:
+        """Give the outcome of each renderer in words."""
+        return {r.renderer: in_words(events(r)) if r.ok else f"failed: {r.failure_class or 'unknown'}" for r in self.rollouts}
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What was asked for; an empty tuple is everything. A scene may be named as when it was driven: smoke/curve is smoke-curve."""
+
+    scenes: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+    renderers: tuple[str, ...] = ()
+
+    @property
+    def is_all(self) -> bool:
+        """Tell whether nothing was asked for."""
+        return not (self.scenes or self.policies or self.seeds or self.renderers)
+
+
+def check_wanted(run: Run, wanted: Wanted) -> None:
+    """Refuse what the run neither has nor plans.
+
+    Raises:
+        InputError: Something of that kind was asked for.
+    """
+    for flag, asked, known in (
+        ("--scene", wanted.scenes, run.scenes),
+        ("--policy", wanted.policies, run.policies),
+        ("--renderer", wanted.renderers, run.renderers),
+        ("--seed", wanted.seeds, sorted({*(run.info.get("seeds") or ()), *(r.seed for r in run.rollouts)})),
+    ):
+        strange = [one for one in asked if not _spellings(one) & {*known}]
+        if strange:
+            found = f"the run has none; it has {', '.join(map(str, known[:8]))}"
+            raise InputError(DOING, f"{flag} {strange[0]}", found, "name one of these")
+
+
+def cells_of(run: Run, wanted: Wanted = Wanted()) -> list[WatchedCell]:
+    """List the cells of a run that were asked for, the most telling first."""
+    grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
+    for rollout in _ordered(run):
+        if not _asked(rollout, wanted):
+            continue
+        key, take = (rollout.scene, rollout.policy, rollout.seed), 0
+        while any(r.renderer == rollout.renderer for r in grouped.get((*key, take), ())):
+            take += 1
+        grouped.setdefault((*key, take), []).append(rollout)
+    flips: dict[tuple[str, str, int], list[Flip]] = {}
+    for flip in find_flips(run)[0]:
+        if _asked(flip.other, wanted):
+            flips.setdefault((flip.other.scene, flip.other.policy, flip.other.seed), []).append(flip)
+    cells = [WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ()))) for key, members in grouped.items()]
+    return sorted(cells, key=lambda cell: (ORDER.index(cell.interest), -cell.apart_m))  # stable: equal ones stay in the run's order
+
+
+def shown_by_default(cells: Sequence[WatchedCell], wanted: Wanted, at_most: int | None) -> list[WatchedCell]:
+    """Return the cells that a page tries to hold: all that are telling and `QUIET_CELLS` others, or all that were asked for.
+
+    Args:
+        cells: As `cells_of` returns them.
+        wanted: What was asked for.
+        at_most: Most cells; None is no limit.
+    """
+    watchable = [cell for cell in cells if cell.watchable]
+    if wanted.is_all and at_most is None:
+        quiet = [cell for cell in watchable if cell.interest == "quiet"]
+        dropped = {cell.id for cell in quiet[QUIET_CELLS:]}
+        watchable = [cell for cell in watchable if cell.id not in dropped]
+    return watchable[:at_most]
+
+
+def telling(cells: Iterable[WatchedCell], kinds: Sequence[Interest] = ("flip",)) -> list[WatchedCell]:
+    """Return the watchable cells of some kinds."""
+    return [cell for cell in cells if cell.interest in kinds and cell.watchable]
+
+
+def _ordered(run: Run) -> list[Rollout]:
+    """List rollouts by scene, then in the order of renderers, the baseline first."""
+    base = baseline_of(run)
+    rank = {name: i for i, name in enumerate(sorted(run.renderers, key=lambda name: name != base))}
+    scene = {name: i for i, name in enumerate(run.scenes)}
+    return sorted(run.rollouts, key=lambda r: (scene[r.scene], r.policy, r.seed, rank[r.renderer]))
+
+
+def _asked(rollout: Rollout, wanted: Wanted) -> bool:
+    pairs: tuple[tuple[object, Sequence[object]], ...] = (
+        (rollout.scene, wanted.scenes),
+        (rollout.policy, wanted.policies),
+        (rollout.seed, wanted.seeds),
+        (rollout.renderer, wanted.renderers),
+    )
+    return all(not asked or any(value in _spellings(one) for one in asked) for value, asked in pairs)
+
+
+def _spellings(asked: object) -> set[object]:
+    """Return what a name that was asked for may be in the tables."""
+    return {asked, asked.replace("/", "-")} if isinstance(asked, str) else {asked}

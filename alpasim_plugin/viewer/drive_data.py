@@ -1,0 +1,190 @@
+"""One rollout for a page: where the ego and the others were, what was planned, every metric over time, and what happened when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import read_facts
+from alpasim_plugin.types import F64, LoggedPlan, RolloutLog, Trajectory
+from alpasim_plugin.viewer.units import Place, mrad, rounded
+from evaluators.report.events import SERIES, Event, events_of
+from evaluators.report.run_folder import Rollout, Run, series_by_cell
+
+PLAN_STEP_US = 500_000
+MAX_SAMPLES = 8  # of a plan; the first ones
+POSE_SERIES = ("ego_x_m", "ego_y_m", "ego_yaw_rad")
+FRAME_FACTS = "frames.jsonl"
+MAX_FRAME_EVENTS = 20
+CONTACT_TOLERANCE_S = 0.25  # between a contact and the step that counts it
+
+
+class Tracks:
+    """The ways of all road users of a cell; one that several rollouts share is kept once."""
+
+    def __init__(self) -> None:
+        self.all: list[dict[str, Any]] = []
+        self._known: dict[str, int] = {}
+
+    def add(self, track: dict[str, Any]) -> int:
+        """Return a track's place in the list."""
+        key = repr(track)
+        if key not in self._known:
+            self._known[key] = len(self.all)
+            self.all.append(track)
+        return self._known[key]
+
+
+def drive_data(
+    run: Run, rollout: Rollout, log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks
+) -> dict[str, Any]:
+    """Return what a page draws of a rollout, without its camera frames.
+
+    Args:
+        run: The run.
+        rollout: One that ran to its end.
+        log: Its log; None where the run folder has none: then nothing is planned and road users go as recorded.
+        content: ``scenes/SCENE.json``.
+        place: Where numbers count from.
+        tracks: Gets the ways of the road users.
+    """
+    steps = run.steps_of(rollout)
+    manifest = run.manifest(rollout)
+    ego, size_m = _ego(log, steps, content, place)
+    return {
+        "renderer": rollout.renderer,
+        "ego": ego,
+        "size": [round(100 * side) for side in size_m],
+        "users": _road_users(log, content, place, tracks),
+        "as_driven": log is not None,
+        "plans": [] if log is None else [_plan(plan, place) for plan in log.plans],
+        "curves": curves(steps, place),
+        "moments": moments(run, rollout, steps, manifest, place),
+    }
+
+
+def _ego(log: RolloutLog | None, steps: pa.Table, content: Mapping[str, Any], place: Place) -> tuple[dict[str, list[int]], F64]:
+    """Return the way of the ego's box centre, and its length and width in metres."""
+    if log is not None:
+        return place.track(log.ego), np.array([log.ego_box.length_m, log.ego_box.width_m])
+    vehicle = content.get("vehicle") or {}
+    own = next(iter(series_by_cell(steps.filter(pc.is_in(steps["metric"], pa.array(POSE_SERIES)))).values()), {}) if len(steps) else {}
+    if any(name not in own for name in POSE_SERIES) or "length_m" not in vehicle:
+        raise InputError("reading a rollout to watch", "the table of steps", "neither a log nor the ego's poses", "run it again")
+    (t_us, x), (_, y), (_, yaw) = (own[name] for name in POSE_SERIES)
+    ahead_m = float(vehicle["rear_axle_to_centre_m"])
+    x_cm, y_cm = place.cm(np.stack([x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw)], axis=1))
+    return {"t": place.ms(t_us), "x": x_cm, "y": y_cm, "a": mrad(yaw)}, np.array([vehicle["length_m"], vehicle["width_m"]])
+
+
+def _road_users(log: RolloutLog | None, content: Mapping[str, Any], place: Place, tracks: Tracks) -> list[int]:
+    if log is not None:
+        return [
+            tracks.add(_user(actor.actor_id, actor.label, (actor.box.length_m, actor.box.width_m), place.track(actor.track)))
+            for actor in log.actors.values()
+        ]
+    found = []
+    for actor in content.get("actors") or []:
+        if actor.get("x_m") and actor.get("length_m"):
+            x, y = place.cm(np.column_stack([actor["x_m"], actor["y_m"]]))
+            way = {"t": place.ms(actor["t_us"]), "x": x, "y": y, "a": mrad(actor["yaw_rad"])}
+            found.append(tracks.add(_user(actor.get("id") or "", actor.get("label") or "", (actor["length_m"], actor["width_m"]), way)))
+    return found
+
+
+def _user(name: str, label: str, size_m: tuple[float, float], way: dict[str, list[int]]) -> dict[str, Any]:
+    if len({*zip(way["x"], way["y"], way["a"], strict=True)}) == 1:  # it stands: two poses say when it is there
+        way = {key: [values[0], values[-1]] for key, values in way.items()}
+    return {"id": name, "label": label or "other", "size": [round(100 * side) for side in size_m], **way}
+
+
+def _plan(plan: LoggedPlan, place: Place) -> dict[str, Any]:
+    """Return a plan and its samples, every half second: points from now on."""
+    lines = [plan.trajectory, *plan.samples[:MAX_SAMPLES]]
+    return {"t": round((plan.now_us - place.zero_us) / 1000), "lines": [_points(line, place) for line in lines]}
+
+
+def _points(line: Trajectory, place: Place) -> list[list[int]]:
+    times = np.arange(line.t_us[0], line.t_us[-1] + 1, PLAN_STEP_US) if len(line) else np.empty(0)
+    return place.cm(np.stack([np.interp(times, line.t_us, line.xyz[:, k]) for k in (0, 1)], axis=1))
+
+
+def curves(steps: pa.Table, place: Place) -> dict[str, Any]:
+    """Return every metric over time: t (ms), v (null where invalid), and why it is invalid where it is.
+
+    Args:
+        steps: As `Run.steps_of` returns them.
+        place: Where times count from.
+    """
+    if not steps.num_rows:
+        return {}
+    names = np.asarray(steps["metric"].to_pylist())
+    order = np.lexsort((steps["t_us"].to_numpy(), names))
+    names, t_us = names[order], steps["t_us"].to_numpy()[order]
+    value = np.where(steps["valid"].to_numpy(), steps["value"].to_numpy(), np.nan)[order]
+    reason = np.asarray([text or "" for text in steps["reason"].to_pylist()])[order]
+    borders = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
+    out = {}
+    for start, stop in pairwise(borders):
+        if names[start] in POSE_SERIES:
+            continue
+        here = slice(start, stop)
+        why = list(dict.fromkeys(str(text) for text in reason[here] if text))
+        out[str(names[start])] = {"t": place.ms(t_us[here]), "v": rounded(value[here])} | ({"why": "; ".join(why)} if why else {})
+    return out
+
+
+def moments(run: Run, rollout: Rollout, steps: pa.Table, manifest: Mapping[str, Any], place: Place) -> list[dict[str, Any]]:
+    """List what happened when: counted collisions and departures from the road, and frames that a guard replaced or named."""
+    known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
+    series = series_by_cell(known)
+    first_us = min((int(t[0]) for own in series.values() for t, _ in own.values()), default=place.zero_us)
+    found: list[dict[str, Any]] = []
+    for event in events_of(rollout, series):
+        ms = None if event.t_us is None else round((event.t_us - place.zero_us) / 1000)
+        text = event.what + _with_whom(event, manifest, first_us)
+        found.append({"t": ms, "kind": event.kind, "text": text})
+    return found + _frame_events(run, rollout, place)
+
+
+def _with_whom(event: Event, manifest: Mapping[str, Any], first_us: int) -> str:
+    if event.kind != "collision" or event.t_us is None:
+        return ""
+    at_s = (event.t_us - first_us) * 1e-6
+    near = [c for c in manifest.get("contacts") or [] if abs(float(c["t_s"]) - at_s) <= CONTACT_TOLERANCE_S]
+    return f" with {near[0]['actor_id']}" if near else ""
+
+
+def _frame_events(run: Run, rollout: Rollout, place: Place) -> list[dict[str, Any]]:
+    """Return when an event of the frames began, such as a fixer's frame that was replaced; one that goes on is told once."""
+    path = run.file_of(rollout, FRAME_FACTS)
+    found: list[dict[str, Any]] = []
+    before: set[str] = set()
+    for row in read_facts(path) if path is not None else []:
+        now = set(str(row.get("events") or "").split())
+        t_us = row.get("t_us")
+        if isinstance(t_us, int):
+            t_ms = round((t_us - place.zero_us) / 1000)
+            found += [{"t": t_ms, "kind": "frame", "text": f"frame: {name}"} for name in sorted(now - before)]
+        before = now
+    return found[:MAX_FRAME_EVENTS]
+
+
+def plans_part(flips: Sequence[Mapping[str, Any]], place: Place) -> list[dict[str, Any]]:
+    """Return when plans first diverged, of entries of ``flips.json``."""
+    return [
+        {
+            "t": round((int(entry["t_us"]) - place.zero_us) / 1000),
+            "kind": "plans",
+            "text": f"plans part by {float(entry['gap_m']):.2f} m from {entry['baseline']}",
+            "renderer": entry["renderer"],
+        }
+        for entry in flips
+        if entry.get("t_us") is not None
+    ]

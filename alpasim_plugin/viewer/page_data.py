@@ -1,0 +1,157 @@
+"""What a page replays, as JSON: an index of the run, and one document for each cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.errors import InputError, SimrunError
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.types import RolloutLog
+from alpasim_plugin.viewer.cells import WatchedCell
+from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
+from alpasim_plugin.viewer.map_data import map_data, recorded_drive
+from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
+from alpasim_plugin.viewer.units import Place
+from evaluators.metrics import METRICS
+from evaluators.report.events import clock_zero_us
+from evaluators.report.flips import FLIPS_NAME, baseline_of
+from evaluators.report.metric_info import meaning, ordered
+from evaluators.report.run_folder import Rollout, Run, read_json
+
+DOING = "reading a rollout to watch"
+LOG = "rollout.asl"
+FIRST_CURVES = ("lateral_offset_m", "ego_speed_mps", "min_distance_to_obstacle_m", "plan_deviation", "opacity_mean")
+
+
+Logs = Mapping[str, RolloutLog | SimrunError | None]  # folder of a rollout -> its log, or why it cannot be read
+
+
+def read_logs(run: Run, cell: WatchedCell) -> Logs:
+    """Read the logs of a cell's finished rollouts: their own, or those that they were scored from; None where neither is there."""
+    return {rollout.path: _read_log(run, rollout) for rollout in cell.rollouts if rollout.ok}
+
+
+def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
+    path = run.file_of(rollout, LOG)
+    if path is None:
+        stated = run.manifest(rollout).get("log")  # as it was named to simrun score, so from the same working directory
+        path = None if stated is None else Path(str(stated))
+    try:
+        return read_asl(path) if path is not None and path.is_file() else None
+    except SimrunError as error:
+        return error  # the page says so in this rollout's place; the others are still shown
+
+
+def cell_data(run: Run, cell: WatchedCell, logs: Logs, fine: Fineness | None, camera: str | None = None) -> dict[str, Any]:
+    """Return everything that a page shows of a cell.
+
+    Args:
+        run: The run.
+        cell: One of its cells.
+        logs: Its logs.
+        fine: How finely camera frames are kept; None for none.
+        camera: The camera whose frames are kept; None is all.
+
+    Raises:
+        InputError: A file is damaged, or the run has no map of the scene.
+    """
+    content = run.scene_data(cell.scene)
+    if content is None:
+        found = f"no file of scene {cell.scene} in {run.folder / 'scenes'}"
+        raise InputError(DOING, cell.name, found, "make the run again; runs of earlier versions kept no maps")
+    recorded = recorded_drive(content, cell.scene)
+    place = Place(recorded[0], clock_zero_us(content, _first_us(run, cell, logs)))
+    tracks = Tracks()
+    drives: list[dict[str, Any]] = []
+    for rollout in cell.rollouts:
+        if not rollout.ok:
+            drives.append({"renderer": rollout.renderer, "failed": f"{rollout.failure_class}: {rollout.failure}"})
+            continue
+        log = logs[rollout.path]
+        if isinstance(log, SimrunError):
+            drives.append({"renderer": rollout.renderer, "failed": f"its log cannot be read: {log.found}"})
+            continue
+        drive = drive_data(run, rollout, log, content, place, tracks)
+        if fine is not None:
+            kept = [one for one in sources(run, rollout, log) if camera in (None, one.camera)]
+            drive["cameras"] = [encoded(one, fine, place.zero_us) for one in kept]
+            drive["no_frames"] = "" if kept else no_frames(run.manifest(rollout), log is not None, camera)
+        drives.append(drive)
+    ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
+    return {
+        "id": cell.id,
+        "map": map_data(content, recorded, place),
+        "users": tracks.all,
+        "drives": drives,
+        "parts": plans_part(_flip_entries(run, cell), place),
+        "end": max([*ends, 1]),
+        "warmup": round(int(content.get("warmup_us") or 0) / 1000),
+    }
+
+
+def _first_us(run: Run, cell: WatchedCell, logs: Logs) -> int:
+    """Return the time of a cell's first logged pose."""
+    firsts = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
+    tables = (run.steps_of(rollout)["t_us"] for rollout in cell.rollouts if logs.get(rollout.path, "") is None)
+    return min([*firsts, *(min(t.to_pylist()) for t in tables if len(t))], default=0)
+
+
+def no_frames(manifest: Mapping[str, Any], has_log: bool, camera: str | None) -> str:
+    """Say why a rollout has no pictures, and how to get them."""
+    if not has_log and manifest.get("log"):
+        return f"The log that this rollout was scored from is not at {manifest['log']}. Run simrun view where simrun score was run."
+    return NO_FRAMES if camera is None else f"This rollout has no frames of a camera {camera}."
+
+
+def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCell], state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a page must know before it shows a cell.
+
+    Args:
+        run: The run.
+        cells: All cells that were asked for, the most telling first.
+        here: Those whose documents the page has or can get.
+        state: ``live``, ``notes`` (what was left out, one sentence each), ``report`` (its address, or "") and, of a run that goes on,
+            ``done`` and ``planned``.
+    """
+    ids = {cell.id for cell in here}
+    units = {name: facts for table in (run.summary.get("metrics") or {}).values() for name, facts in table.items()}
+    base = baseline_of(run)
+    return {
+        "run": run.folder.resolve().name,
+        "renderers": run.renderers,
+        "baseline": base,
+        "first_curves": FIRST_CURVES,
+        "metrics": {name: _metric(name, units.get(name) or {}) for name in ordered({*METRICS, *units})},
+        "cells": [
+            {
+                "id": cell.id,
+                "scene": cell.scene,
+                "policy": cell.policy,
+                "seed": cell.seed,
+                "take": cell.take,
+                "interest": cell.interest,
+                "outcomes": cell.outcomes(),
+                "flips": [{"renderer": flip.other.renderer, "was": flip.was, "now": flip.now, "tone": flip.tone} for flip in cell.flips],
+                "here": cell.id in ids,
+            }
+            for cell in cells
+        ],
+        **state,
+    }
+
+
+def _metric(name: str, stated: Mapping[str, Any]) -> dict[str, Any]:
+    facts = METRICS.get(name)
+    unit = facts.unit if facts is not None else str(stated.get("unit") or "")
+    return {"unit": unit, "help": meaning(name), "flag": facts is not None and facts.is_flag}
+
+
+def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:
+    path = run.folder / FLIPS_NAME
+    if not cell.flips or not path.is_file():
+        return []
+    keys = {flip.key for flip in cell.flips}
+    entries = read_json(path).get("cells") or []
+    return [entry for entry in entries if (entry["renderer"], entry["policy"], entry["scene"], entry["seed"]) in keys]

@@ -1,0 +1,104 @@
+"""The camera frames of a rollout, from its log or else its video, made small enough for a page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import decode_image
+from alpasim_plugin.log.video_reader import VideoReader
+from alpasim_plugin.types import U8, LoggedImage, RolloutLog
+from evaluators.report.run_folder import Rollout, Run
+
+VIDEO = "front.mp4"
+JPEG_QUALITY = 76
+NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
+
+
+@dataclass(frozen=True)
+class Fineness:
+    """How finely frames are kept.
+
+    Attributes:
+        stride: Every how manieth frame is kept.
+        width_px: Frames wider than this are made smaller.
+    """
+
+    stride: int = 1
+    width_px: int = 512
+
+
+@dataclass(frozen=True)
+class Source:
+    """The frames that a rollout has of one camera: encoded ones of a log, or a video's.
+
+    Attributes:
+        images: In order of time; empty for a video.
+        video: The file, and the time of its first frame in microseconds.
+    """
+
+    camera: str
+    images: tuple[LoggedImage, ...] = ()
+    video: tuple[Path, int] | None = None
+
+    def frames(self, stride: int = 1) -> Iterator[tuple[int, U8]]:
+        """Yield time in microseconds and ``(H, W, 3)`` uint8 sRGB of every stride-th frame.
+
+        Raises:
+            InputError: A frame cannot be decoded.
+        """
+        if self.video is None:
+            for image in self.images[::stride]:
+                yield image.end_us, decode_image(image.data, f"camera {self.camera!r} at {image.end_us} us")
+            return
+        path, start_us = self.video
+        with VideoReader(path) as video:
+            for index, frame in enumerate(video):
+                if index % stride == 0:
+                    yield start_us + round(frame.time * video.format.time_base * 1_000_000), frame.image
+
+
+def sources(run: Run, rollout: Rollout, log: RolloutLog | None) -> list[Source]:
+    """Return the cameras of a rollout that have frames, in the log's order; empty where none was kept."""
+    if log is not None and log.images:
+        cameras = dict.fromkeys(image.camera for image in log.images)
+        return [Source(name, tuple(image for image in log.images if image.camera == name)) for name in cameras]
+    video = run.file_of(rollout, VIDEO)
+    if video is None:
+        return []
+    return [Source(VIDEO.removesuffix(".mp4"), video=(video, log.render_start_us if log is not None else 0))]
+
+
+def encoded(source: Source, fine: Fineness, zero_us: int) -> dict[str, Any]:
+    """Return a camera's frames for a page: name, size in pixels, times in milliseconds, and JPEG in base64."""
+    t_ms, data, size = [], [], (0, 0)
+    for t_us, rgb in source.frames(fine.stride):
+        picture = smaller(rgb, fine.width_px)
+        size = (picture.shape[1], picture.shape[0])
+        t_ms.append(round((t_us - zero_us) / 1000))
+        data.append(base64.b64encode(_jpeg(picture)).decode())
+    return {"name": source.camera, "width": size[0], "height": size[1], "t": t_ms, "jpeg": data}
+
+
+def smaller(rgb: U8, width_px: int) -> U8:
+    """Return a picture no wider than this, with its shape kept."""
+    height, width = rgb.shape[:2]
+    if width <= width_px:
+        return rgb
+    size = (width_px, max(1, round(height * width_px / width)))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _jpeg(rgb: U8) -> bytes:
+    """Encode with halved colour resolution and optimised tables; a page is looked at, not measured."""
+    done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1])
+    if not done:
+        raise InputError("encoding a camera frame", f"array {rgb.shape}", "the encoder refused", "use smaller images")
+    return bytes(data.tobytes())

@@ -1,0 +1,134 @@
+"use strict";
+// Camera frames: JPEG in base64, decoded shortly before they are shown, and forgotten again.
+
+const AHEAD = 10; // frames decoded before they are due
+const KEPT = 48; // decoded frames kept a camera
+
+class Camera {
+  constructor(canvas, frames) {
+    this.canvas = canvas;
+    this.frames = frames;
+    this.decoded = new Map(); // index -> ImageBitmap, or a promise of one
+    this.wanted = -1;
+    this.shown = -1;
+    canvas.width = frames.width;
+    canvas.height = frames.height;
+    this.context = canvas.getContext("2d", { alpha: false });
+  }
+
+  // Show the newest frame that is not after t. Resolves once it stands on the canvas.
+  async show(t) {
+    const i = lastAt(this.frames.t, t);
+    this.canvas.dataset.wanted = String(i < 0 ? "" : this.frames.t[i]);
+    if (i === this.wanted) return;
+    this.wanted = i;
+    if (i < 0) { this.clear(); return; }
+    for (let k = i; k < Math.min(i + AHEAD, this.frames.t.length); k += 1) this.decode(k);
+    const picture = await this.decode(i);
+    if (this.wanted !== i) return; // a newer frame is due by now
+    this.context.drawImage(picture, 0, 0);
+    this.shown = i;
+    this.canvas.dataset.shown = String(this.frames.t[i]);
+    this.forget(i);
+  }
+
+  decode(i) {
+    if (!this.decoded.has(i)) {
+      const bytes = Uint8Array.from(atob(this.frames.jpeg[i]), (c) => c.charCodeAt(0));
+      this.decoded.set(i, createImageBitmap(new Blob([bytes], { type: "image/jpeg" })));
+    }
+    return this.decoded.get(i);
+  }
+
+  forget(i) {
+    for (const [k, picture] of this.decoded) {
+      if (this.decoded.size <= KEPT) return;
+      if (k < i || k > i + AHEAD) { this.decoded.delete(k); picture.then((one) => one.close()); }
+    }
+  }
+
+  clear() {
+    this.context.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    this.shown = -1;
+    this.canvas.dataset.shown = "";
+  }
+
+  close() {
+    for (const picture of this.decoded.values()) picture.then((one) => one.close());
+    this.decoded.clear();
+  }
+}
+
+// The row of cameras: one figure for each renderer of the cell.
+class Cameras {
+  constructor(root, index, onFocus, onToggle) {
+    Object.assign(this, { root, index, onFocus, onToggle, shown: [] });
+  }
+
+  load(cell, outcomes, cameraName) {
+    this.shown.forEach((one) => one.camera?.close());
+    this.root.replaceChildren();
+    this.shown = cell.drives.map((drive, i) => this.figure(drive, i, outcomes[drive.renderer] ?? "", cameraName));
+    this.root.dataset.count = String(cell.drives.length);
+    this.root.classList.toggle("bare", this.shown.every((one) => !one.camera)); // words alone need no room for pictures
+  }
+
+  figure(drive, i, outcome, cameraName) {
+    const figure = make("figure", "camera " + variantClass(this.index, drive.renderer));
+    const head = make("figcaption");
+    const focus = make("button", "focus");
+    focus.type = "button";
+    focus.title = drive.renderer + ": follow this renderer's ego, and show its samples and road users" + (i < 9 ? " (" + (i + 1) + ")" : "");
+    focus.append(make("span", "swatch"), make("b", "name", drive.renderer));
+    focus.addEventListener("click", () => this.onFocus(i));
+    const said = make("span", "outcome" + (outcome === "no event" ? "" : " bad"), outcome);
+    said.title = outcome;
+    const eye = make("button", "eye", "Hide");
+    eye.type = "button";
+    eye.setAttribute("aria-pressed", "false");
+    eye.setAttribute("aria-label", "Hide " + drive.renderer);
+    eye.addEventListener("click", () => this.onToggle(i));
+    head.append(focus, said, eye);
+    const stage = make("div", "stage");
+    figure.append(head, stage);
+    const frames = (drive.cameras ?? []).find((one) => one.name === cameraName) ?? drive.cameras?.[0];
+    let camera = null;
+    if (frames?.t.length) {
+      const canvas = make("canvas");
+      canvas.setAttribute("role", "img");
+      canvas.setAttribute("aria-label", "Camera " + frames.name + " behind " + drive.renderer);
+      stage.append(canvas);
+      camera = new Camera(canvas, frames);
+    } else {
+      const why = drive.failed ? "Nothing to show. " + drive.failed : drive.no_frames || "No camera frames.";
+      stage.append(make("p", "none", why));
+    }
+    const ended = make("span", "ended");
+    ended.hidden = true;
+    stage.append(ended);
+    this.root.append(figure);
+    return { figure, focus, eye, camera, ended, end: drive.ego ? drive.ego.t.at(-1) : null };
+  }
+
+  // Resolves once every camera shows its frame of t.
+  show(t) {
+    return Promise.all(this.shown.map((one) => {
+      const over = one.end !== null && t > one.end;
+      if (one.ended.hidden === over) {
+        one.ended.hidden = !over;
+        one.ended.textContent = over ? "ended at " + seconds(one.end) + " s" : "";
+      }
+      return one.camera?.show(t);
+    }));
+  }
+
+  mark(focus, hidden) {
+    this.shown.forEach((one, i) => {
+      one.focus.setAttribute("aria-pressed", String(i === focus));
+      one.figure.classList.toggle("focused", i === focus);
+      one.figure.classList.toggle("off", hidden.has(i));
+      one.eye.setAttribute("aria-pressed", String(hidden.has(i)));
+      one.eye.textContent = hidden.has(i) ? "Show" : "Hide";
+    });
+  }
+}

@@ -1,0 +1,65 @@
+"""``simrun view``: which page it writes of which rollouts, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from tests.report.make_run import Plan
+from tests.viewer.make_watched import make_watched, unfinished
+
+PLAN = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight", "urban-left_turn"), seeds=(0,), steps=10)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = make_watched(tmp_path_factory.mktemp("run") / "run", PLAN)
+    unfinished(root, ["rollouts/3dgs/lane-camera/urban-left_turn/0"])
+    return root
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
+
+
+def test_an_unfinished_run_is_shown_as_far_as_it_has_got(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["view", str(run), "--json"]) == 0
+    printed = capsys.readouterr()
+    facts = json.loads(printed.out)
+    assert facts["page"] == str(run / "view.html")
+    assert facts["bytes"] == (run / "view.html").stat().st_size
+    assert [cell["scene"] for cell in facts["cells"]] == ["smoke-straight", "urban-left_turn"]
+    assert "3 of 4 rollouts" in printed.err
+    assert run_command(["view", str(run)]) == 0  # its own page is replaced
+
+
+def test_a_rollout_is_shown_beside_the_others_of_its_cell(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, out = run / "rollouts/3dgs/lane-camera/smoke-straight/0", tmp_path / "one.html"
+    assert run_command(["view", str(folder), "--out", str(out), "--every", "2"]) == 0
+    assert "1 of 1 cells" in capsys.readouterr().out
+    text = out.read_text()
+    assert '"scene":"smoke-straight"' in text
+    assert "urban-left_turn" not in text[text.index('id="index"') :]
+    assert run_command(["view", str(folder), "--out", str(out)]) == 2
+    assert "it exists already" in capsys.readouterr().err
+    assert run_command(["view", str(folder), "--seed", "0"]) == 2
+    assert "name its run folder" in capsys.readouterr().err
+
+
+def test_what_cannot_be_shown_is_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, said in (
+        ([str(tmp_path / "nowhere")], "no such folder"),
+        ([str(tmp_path)], "no run.json and no manifest.json"),
+        ([str(run), "--scene", "nowhere"], "it has smoke-straight, urban-left_turn"),
+        ([str(run), "--seed", "7"], "it has 0"),
+        ([str(run), "--serve", "0.0.0.0:80"], "not an address of this machine alone"),
+        ([str(run), "--serve", "80", "--out", "x.html"], "give one of them"),
+        ([str(run), "--scene", "urban-left_turn", "--renderer", "3dgs"], "no finished rollout that was asked for"),
+    ):
+        assert run_command(["view", *arguments]) == 2
+        assert said in capsys.readouterr().err

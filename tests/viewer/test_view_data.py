@@ -1,0 +1,260 @@
+"""What a page is told of a run: poses, frames, road users, curves and events are those of the logs and tables."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import read_asl, write_mp4
+from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, shown_by_default
+from alpasim_plugin.viewer.page import Options, make_page
+from alpasim_plugin.viewer.page_data import cell_data, read_logs
+from alpasim_plugin.viewer.pictures import Fineness
+from alpasim_plugin.viewer.write import FLIPS_PAGE, write_flips_page, write_page
+from evaluators.report.events import SERIES, clock_zero_us, events_of
+from evaluators.report.run_folder import read_run, series_by_cell
+from tests.report.make_run import DT_US, Plan
+from tests.viewer.make_watched import BARS, WATCHED, make_watched, picture
+
+SMALL = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0,), steps=12)
+
+
+def documents(html: str) -> dict[str, Any]:
+    """Return the JSON of a page by the id of its element."""
+    found = re.findall(r'<script type="application/json" id="([\w-]+)">(.*?)</script>', html, re.S)
+    return {name: json.loads(text) for name, text in found}
+
+
+def number_of(jpeg: str) -> int:
+    """Read which frame a picture is."""
+    grey = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_GRAYSCALE)
+    wide = grey.shape[1] // BARS
+    return sum(1 << (BARS - 1 - bit) for bit in range(BARS) if grey[4:-4, bit * wide + 2 : (bit + 1) * wide - 2].mean() > 127)
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_watched(tmp_path_factory.mktemp("small"), SMALL)
+
+
+def only_cell(root: Path, fine: Fineness | None = Fineness()) -> dict[str, Any]:
+    run = read_run(root)
+    (cell,) = cells_of(run)
+    return cell_data(run, cell, read_logs(run, cell), fine)
+
+
+def test_poses_are_those_of_the_log(watched_run: Path) -> None:
+    run = read_run(watched_run)
+    cell = cells_of(run)[0]
+    data = cell_data(run, cell, read_logs(run, cell), None)
+    content = run.scene_data(cell.scene)
+    assert content is not None
+    origin = np.array([content["ego_log"][key][0] for key in ("x_m", "y_m")])
+    for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
+        log = read_asl(watched_run / rollout.path / "rollout.asl", images=False)
+        drawn = np.column_stack([drive["ego"]["x"], drive["ego"]["y"]]) / 100 + origin
+        assert np.abs(drawn - log.ego.xyz[:, :2]).max() < 0.006
+        assert drive["ego"]["t"] == (log.ego.t_us // 1000).tolist()
+        plan = np.column_stack(drive["plans"][3]["lines"][0]) / 100 + origin
+        assert drive["plans"][3]["t"] == 300
+        assert np.abs(plan - log.plans[3].trajectory.xyz[::5, :2]).max() < 0.006  # one point every half second
+        assert len(drive["plans"][3]["lines"]) == 3  # the plan and two samples
+
+
+def test_every_frame_comes_with_its_own_time(small_run: Path) -> None:
+    for drive in only_cell(small_run)["drives"]:
+        (camera,) = drive["cameras"]
+        assert [number_of(jpeg) for jpeg in camera["jpeg"]] == [t // (DT_US // 1000) for t in camera["t"]] == list(range(SMALL.steps))
+    thinned = only_cell(small_run, Fineness(stride=3))["drives"][1]["cameras"][0]
+    assert [number_of(jpeg) for jpeg in thinned["jpeg"]] == [0, 3, 6, 9]
+    assert thinned["t"] == [0, 300, 600, 900]
+
+
+def test_every_camera_is_kept_or_the_one_that_was_asked_for(tmp_path: Path) -> None:
+    run = read_run(make_watched(tmp_path, SMALL, cameras=("front", "left")))
+    (cell,) = cells_of(run)
+    for camera, kept in ((None, [("front", 5), ("left", 105)]), ("left", [("left", 105)]), ("nobody", [])):
+        for drive in cell_data(run, cell, read_logs(run, cell), Fineness(), camera)["drives"]:
+            assert [(one["name"], number_of(one["jpeg"][5])) for one in drive["cameras"]] == kept
+            assert drive["no_frames"] == ("" if kept else "This rollout has no frames of a camera nobody.")
+
+
+def test_wide_frames_are_made_smaller_and_keep_their_shape(small_run: Path) -> None:
+    camera = only_cell(small_run, Fineness(width_px=32))["drives"][0]["cameras"][0]
+    assert (camera["width"], camera["height"]) == (32, 18)
+
+
+def test_times_count_from_the_first_frame_or_from_the_first_pose_where_that_is_not_known() -> None:
+    assert clock_zero_us({"start_us": 500_000}, 0) == 500_000
+    assert clock_zero_us({"start_us": 0}, 1_689_697_803_493_732) == 1_689_697_803_493_732  # a scored log of AlpaSim
+    assert clock_zero_us({}, 70) == 70
+
+
+def test_two_logs_of_one_cell_are_two_cells(small_run: Path) -> None:
+    run = read_run(small_run)
+    twice = replace(run, rollouts=(*run.rollouts, *(replace(one, path=f"{one.path}-2") for one in run.rollouts)))
+    first, second = cells_of(twice)
+    assert (first.take, second.take) == (0, 1)
+    assert [rollout.renderer for rollout in second.rollouts] == ["clean", "3dgs"]
+    assert first.id != second.id
+    assert second.name.endswith(", log 2")
+
+
+def test_a_road_user_that_goes_the_same_way_everywhere_is_kept_once(small_run: Path) -> None:
+    data = only_cell(small_run, None)
+    base, other = (set(drive["users"]) for drive in data["drives"])
+    assert len(base) == len(other) == 6
+    assert len(base & other) == 5  # of every third one, the first moves and the second stands
+    assert len(data["users"]) == 7
+    standing = next(user for user in data["users"] if user["id"] == "user-3")
+    assert standing["x"][0] == standing["x"][-1]
+    assert len(standing["t"]) == 2
+
+
+def test_events_are_at_the_times_that_the_report_states(watched_run: Path) -> None:
+    run = read_run(watched_run)
+    seen = 0
+    for cell in cells_of(run):
+        data = cell_data(run, cell, read_logs(run, cell), None)
+        series = series_by_cell(run.steps(SERIES, [cell.scene]))
+        for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
+            stated = [(event.kind, round(event.t_s * 1000)) for event in events_of(rollout, series) if event.t_s is not None]
+            assert [(one["kind"], one["t"]) for one in drive["moments"] if one["kind"] != "frame"] == stated
+            frames = [(one["text"], one["t"]) for one in drive["moments"] if one["kind"] == "frame"]
+            assert frames == [("frame: replaced", 100 * (WATCHED.steps // 3))]
+            seen += len(stated)
+    assert seen >= 3
+
+
+def test_what_is_not_valid_has_no_value_and_a_reason(small_run: Path) -> None:
+    curves = only_cell(small_run, None)["drives"][0]["curves"]
+    assert curves["min_distance_to_obstacle_m"]["v"] == [None]
+    assert curves["min_distance_to_obstacle_m"]["why"] == "no other road user within 50 m"
+    assert len(curves["lateral_offset_m"]["v"]) == SMALL.steps
+    assert "why" not in curves["lateral_offset_m"]
+    assert "ego_x_m" not in curves
+
+
+def test_without_frames_the_page_says_how_to_get_them_or_takes_the_video(tmp_path: Path) -> None:
+    root = make_watched(tmp_path, SMALL, cameras=())
+    for drive in only_cell(root)["drives"]:
+        assert drive["cameras"] == []
+        assert "--video all" in drive["no_frames"]
+    run = read_run(root)
+    for rollout in run.rollouts:
+        write_mp4(root / rollout.path / "front.mp4", [picture(k) for k in range(SMALL.steps)], 10, crf=12)
+    for drive in only_cell(root)["drives"]:
+        assert [number_of(jpeg) for jpeg in drive["cameras"][0]["jpeg"]] == list(range(SMALL.steps))
+        assert drive["cameras"][0]["t"] == [100 * k for k in range(SMALL.steps)]
+
+
+def test_without_a_log_the_table_of_steps_gives_the_way(small_run: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(small_run, tmp_path / "run"))
+    whole = only_cell(root, None)
+    for rollout in read_run(root).rollouts:
+        (root / rollout.path / "rollout.asl").unlink()
+    bare = only_cell(root, None)
+    for with_log, without in zip(whole["drives"], bare["drives"], strict=True):
+        assert (with_log["as_driven"], without["as_driven"]) == (True, False)
+        assert without["plans"] == []
+        assert np.abs(np.subtract(with_log["ego"]["x"], without["ego"]["x"])).max() <= 1
+        assert np.abs(np.subtract(with_log["ego"]["y"], without["ego"]["y"])).max() <= 1
+
+
+def test_a_damaged_log_is_told_in_its_place_and_the_others_are_shown(small_run: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(small_run, tmp_path / "run"))
+    (root / read_run(root).rollouts[0].path / "rollout.asl").write_bytes(b"no log")
+    damaged, whole = only_cell(root)["drives"]
+    assert damaged["failed"].startswith("its log cannot be read: ")
+    assert len(whole["cameras"][0]["t"]) == SMALL.steps
+
+
+def test_changed_outcomes_come_first_and_quiet_cells_are_few(watched_run: Path) -> None:
+    run = read_run(watched_run)
+    cells = cells_of(run)
+    assert [cell.interest for cell in cells] == ["flip", "flip", "flip", "quiet"]
+    many = [*cells, *(replace(cells[-1], seed=seed) for seed in range(10, 20))]
+    assert [cell.seed for cell in shown_by_default(many, Wanted(), None)] == [*(cell.seed for cell in cells), 10, 11]
+    assert len(shown_by_default(many, Wanted(scenes=("smoke-straight",)), None)) == 14
+    assert len(shown_by_default(many, Wanted(), 2)) == 2
+    (chosen,) = cells_of(run, Wanted(scenes=("smoke/straight",), seeds=(1,), renderers=("clean", "3dgs")))
+    assert [rollout.renderer for rollout in chosen.rollouts] == ["clean", "3dgs"]
+    far = replace(cells[-1].rollouts[0], metrics={"dist_traveled_m": 90.0})
+    near = replace(cells[-1].rollouts[1], metrics={"dist_traveled_m": 20.0, "lateral_distance_m": 3.0})
+    assert replace(cells[-1], rollouts=(far, near)).apart_m == 73.0
+    with pytest.raises(InputError, match=r"(?s)--renderer nobody.*clean, 3dgs, onefixer") as caught:
+        check_wanted(run, Wanted(renderers=("nobody",)))
+    assert caught.value.exit_code == 2
+
+
+def test_a_page_is_one_file_that_asks_for_nothing(watched_run: Path, tmp_path: Path) -> None:
+    made = write_page(read_run(watched_run), tmp_path / "view.html", Wanted(), Options(), None)
+    html = made.path.read_text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', html)
+    assert policy is not None
+    assert "default-src 'none'" in policy[1]
+    assert "unsafe" not in policy[1]
+    assert "connect-src" not in policy[1]
+    assert re.search(r"(src|href)=.(https?:|//)", html) is None
+    assert re.search(r' style="| on\w+="', html) is None
+    index = documents(html)["index"]
+    assert [cell["here"] for cell in index["cells"]] == [True] * 4
+    assert index["notes"] == []
+
+
+def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run: Path) -> None:
+    run = read_run(watched_run)
+    cells = cells_of(run)[2:]  # a changed outcome and a quiet one
+    size = len(make_page(run, cells, cells, Options()).html)
+    smaller = make_page(run, cells, cells, Options(max_bytes=size - 15_000))
+    assert size - 200_000 < len(smaller.html) <= size - 15_000
+    assert len(smaller.cells) == 2
+    assert any(re.match(r"Every \w+ camera frame is kept", note) for note in smaller.notes)
+    least = make_page(run, cells, cells, Options(max_bytes=size // 2 + 20_000))
+    assert len(least.html) <= size // 2 + 20_000
+    assert len(least.cells) == 1
+    assert least.notes[0].startswith("No room for 1\u00a0cell")
+    index = documents(least.html)["index"]
+    assert sum(cell["here"] for cell in index["cells"]) == len(least.cells)
+    assert {f"cell-{cell.id}" for cell in least.cells} == set(documents(least.html)) - {"index"}
+
+
+def test_names_cannot_leave_their_place(tmp_path: Path) -> None:
+    hostile = "</script><script>alert(1)</script><!--"
+    root = make_watched(tmp_path, Plan(renderers=("clean", hostile), scenes=(hostile,), seeds=(0,), steps=6))
+    made = write_page(read_run(root), tmp_path / "view.html", Wanted(), Options(), None)
+    html = made.path.read_text()
+    assert "alert(1)</script>" not in html
+    assert html.count("<script") == 3
+    assert documents(html)["index"]["cells"][0]["scene"] == hostile
+
+
+def test_a_run_links_its_changed_outcomes_to_a_small_page(watched_run: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(watched_run, tmp_path / "run"))
+    links = write_flips_page(root)
+    assert len(links) == 3
+    for (renderer, policy, scene, seed), link in links.items():
+        assert link == f"{FLIPS_PAGE}#scene={scene}&policy={policy}&seed={seed}&renderer={renderer}"
+    index = documents((root / FLIPS_PAGE).read_text())["index"]
+    assert [cell["interest"] for cell in index["cells"]] == ["flip"] * 3
+    table = pq.read_table(root / "rollouts.parquet")
+    rows = [row | {"offroad": 0.0, "collision_any": 0.0, "collision_at_fault": 0.0} for row in table.to_pylist()]
+    pq.write_table(pa.Table.from_pylist(rows, schema=table.schema), root / "rollouts.parquet")
+    assert write_flips_page(root) == {}
+    assert not (root / FLIPS_PAGE).exists()
+
+
+def test_the_whole_drive_of_the_fixture_is_watched(watched_run: Path) -> None:
+    assert {cell.scene for cell in cells_of(read_run(watched_run))} == set(WATCHED.scenes)
