@@ -53,6 +53,7 @@ def per_frame(
     perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")] = 0.1,
     temporal: Annotated[float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")] = 0.25,
     flow: Annotated[float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")] = 0.25,
+    grid: Annotated[float, typer.Option("--grid", min=0.0, help="Weight of the term against patterns of the network's grid.")] = 0.01,
     variant: Annotated[str, typer.Option("--variant", help=f"Row of the paper's ablation: {', '.join(PIXEL_VARIANTS)}.")] = DEPLOYED,
     init: Annotated[Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")] = None,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer",
@@ -92,7 +93,7 @@ def per_frame(
     schedule = Schedule(
         steps, peak_lr=lr, warmup=warmup, clip=0.5, ema=ema, save_every=save_every, decay_from=decay_from or max(4 * steps // 5, 1)
     )
-    chosen_variant = pixel_variant(variant).weighted(perceptual, temporal, flow, horizon=frames)
+    chosen_variant = pixel_variant(variant).weighted(perceptual, temporal, flow, grid, horizon=frames)
     needs_distance = any(stage.perceptual for stage in chosen_variant.stages)
     distance = progress.perceptual_term(metric_weights) if needs_distance else None
     dtype = torch.bfloat16 if chosen.name == "bf16" else None

@@ -4,6 +4,7 @@
     picture      | x^i - x^i_0 |                                  at every frame
     perceptual   d(x^w, x^w_0)                                    at sampled frames w
     temporal     | (x^i - x^i-1) - (x^i_0 - x^i-1_0) |            differences of neighbouring frames
+    grid         evenness of steps over the generator's cells     `training.grid_term`
     flow         | v(z^i_t, t | sg(state^<i)) - (z^i_1 - x^i_0) | at sampled frames and times, on the history of the rollout
 
 With x_0-prediction, v = (z_t - x_0) / t, so the flow term is the error of x_0 over t. Names as in the paper: ``z_1`` source, ``m`` mask,
@@ -23,6 +24,7 @@ from torch import Tensor
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
 from alpasim_plugin.nets.pixel_source import pixel_source
 from alpasim_plugin.nets.sampling import interpolant
+from alpasim_plugin.training.grid_term import grid_term
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
@@ -34,7 +36,7 @@ class PixelObjectives:
     """Weights of the terms, and the axes of the ablation.
 
     Args:
-        perceptual, temporal, flow, picture: Weights of the terms; 0 switches a term off.
+        perceptual, temporal, flow, picture, grid: Weights of the terms; 0 switches a term off.
         horizon: k, frames that gradients pass through; 1 cuts the history at every frame.
         history: What the state holds of the past: the generator's ``own`` outputs, the truth in their place (``clean``), or the truth that
             the generator noised and denoised again (``redenoised``; no gradient passes through it).
@@ -50,11 +52,12 @@ class PixelObjectives:
     use_map: bool = True
     mixed: bool = True
     picture: float = 1.0
+    grid: float = 0.01
 
     @property
     def in_pixels(self) -> bool:
         """Whether a term is computed on the deployed step, so that gradients pass through the rollout."""
-        return bool(self.picture or self.perceptual or self.temporal)
+        return bool(self.picture or self.perceptual or self.temporal or self.grid)
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,7 @@ class PixelLosses:
     perceptual: Tensor
     temporal: Tensor
     flow: Tensor
+    grid: Tensor
     predictions: Tensor
     state: PixelState  # after the last frame, detached
 
@@ -144,8 +148,10 @@ def pixel_losses(
         (top, left), chosen = sample.corner, list(sample.perceptual_frames)
         images = [x[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2) for x in (made, sample.truth)]
         perceptual = distance(images[0], images[1]).mean()
-    total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal + objectives.flow * flow
-    return PixelLosses(total, picture, perceptual, temporal, flow, made, state.detached())
+    grid = grid_term(made, sample.truth) if objectives.grid else zero
+    total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal
+    total = total + objectives.grid * grid + objectives.flow * flow
+    return PixelLosses(total, picture, perceptual, temporal, flow, grid, made, state.detached())
 
 
 def _source(render: Tensor, opacity: Tensor, eps: Tensor, objectives: PixelObjectives) -> Tensor:

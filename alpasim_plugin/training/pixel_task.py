@@ -139,6 +139,7 @@ class PixelTask:
         return found.total, {
             "picture": float(found.picture.detach()), "perceptual": float(found.perceptual.detach()),
             "temporal": float(found.temporal.detach()), "flow": float(found.flow.detach()),
+            "grid": float(found.grid.detach()),
             "psnr_db": float(made.mean()), "gain_db": gain,
         }  # fmt: skip
 

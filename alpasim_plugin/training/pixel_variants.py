@@ -1,6 +1,6 @@
 """The paper's ablation (OneFixer, Tab. 2a) for the per-frame generator: which terms, on which history, from which source.
 
-The terms in pixels (picture, perceptual, temporal) take the place of the paper's perceptual term.
+The terms in pixels (picture, perceptual, temporal, grid) take the place of the paper's perceptual term.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from alpasim_plugin.training.pixel_rollout import PixelObjectives
 from alpasim_plugin.training.variants import lookup
 
 FULL = PixelObjectives()
-FLOW_ALONE = PixelObjectives(picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0)
+FLOW_ALONE = PixelObjectives(picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0, grid=0.0)
 PIXELS_ALONE = replace(FULL, flow=0.0)
 DEPLOYED = "V9"
 
@@ -46,7 +46,7 @@ class PixelVariant:
         stages = [asdict(stage) for stage in self.stages]
         return {"name": self.name, "stages": stages} | ({"shares": self.shares, "steps": steps} if len(stages) > 1 else {})
 
-    def weighted(self, perceptual: float, temporal: float, flow: float, horizon: int) -> PixelVariant:
+    def weighted(self, perceptual: float, temporal: float, flow: float, grid: float, horizon: int) -> PixelVariant:
         """Return the variant with other weights of the terms that it has, and another k unless it is about k."""
 
         def stage_of(stage: PixelObjectives) -> PixelObjectives:
@@ -55,6 +55,7 @@ class PixelVariant:
                 perceptual=perceptual if stage.perceptual else 0.0,
                 temporal=temporal if stage.temporal else 0.0,
                 flow=flow if stage.flow and stage.in_pixels else stage.flow,
+                grid=grid if stage.grid else 0.0,
                 horizon=horizon if stage.horizon == FULL.horizon else stage.horizon,
             )
 

@@ -15,6 +15,7 @@ from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.training.grid_term import grid_term
 from alpasim_plugin.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from alpasim_plugin.training.pixel_run import PixelRun, train_per_frame
 from alpasim_plugin.training.pixel_variants import pixel_variant
@@ -93,7 +94,8 @@ def test_terms_are_what_they_are_called() -> None:
     torch.testing.assert_close(found.picture, error.abs().mean())
     torch.testing.assert_close(found.temporal, (error[:, 1:] - error[:, :-1]).abs().mean())
     torch.testing.assert_close(found.perceptual, error[:, [0, 2], 3:, 1:].abs().amax((2, 3, 4)).mean())
-    total = found.picture + 0.1 * found.perceptual + 0.25 * found.temporal + 0.25 * found.flow
+    torch.testing.assert_close(found.grid, grid_term(found.predictions, s.truth))
+    total = found.picture + 0.1 * found.perceptual + 0.25 * found.temporal + 0.25 * found.flow + 0.01 * found.grid
     torch.testing.assert_close(found.total, total)
     assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
 
@@ -147,7 +149,7 @@ def test_flow_matching_alone_sends_no_gradient_through_the_rollout() -> None:
 
 
 def test_stages_take_their_shares_of_the_updates() -> None:
-    two = pixel_variant("V7").weighted(perceptual=0.2, temporal=0.25, flow=0.25, horizon=4)
+    two = pixel_variant("V7").weighted(perceptual=0.2, temporal=0.25, flow=0.25, grid=0.01, horizon=4)
     assert [two.objectives(i, 8).in_pixels for i in range(8)] == [False] * 5 + [True] * 3
     assert two.objectives(7, 8).perceptual == 0.2
     assert two.objectives(0, 8).perceptual == 0
@@ -167,7 +169,7 @@ def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: 
     settings = fixer_settings("onefixer", SMALL)
     assert isinstance(settings, PixelFixerSettings)
     schedule = Schedule(steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from)
-    return PixelRun(settings, Streams(), pixel_variant(variant).weighted(0, 0.25, 0.25, horizon=4), schedule, **changes)
+    return PixelRun(settings, Streams(), pixel_variant(variant).weighted(0, 0.25, 0.25, 0.01, horizon=4), schedule, **changes)
 
 
 def weights(path: Path) -> dict[str, Tensor]:
