@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from alpasim_plugin.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from alpasim_plugin.alpasim.server.one_policy import serve_policy
     from alpasim_plugin.runtime.compose import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from policies import make_policy
@@ -22,7 +23,7 @@ __version__ = "0.1.0"
 
 OWN_PACKAGES = ("alpasim_plugin", "configs", "evaluators", "policies", "scenarios")
 
-__all__ = ["OWN_PACKAGES", "__version__", "load_scenario", "make_policy", "make_renderer", "run_rollout"]
+__all__ = ["OWN_PACKAGES", "__version__", "load_scenario", "make_policy", "make_renderer", "run_rollout", "serve_policy"]
 
 
 class _OwnPackages:
@@ -59,5 +60,6 @@ __getattr__ = lazy_names(
         "make_policy": "policies",
         "make_renderer": ".runtime.compose",
         "run_rollout": ".runtime.rollout",
+        "serve_policy": ".alpasim.server.one_policy",
     },
 )
