@@ -59,7 +59,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
 }
 # What stands outside the stages: it may import everything, and nothing imports it.
-OUTSIDE = ("alpasim_plugin.cli", "alpasim_plugin.bench", "alpasim_plugin.notebook")
+OUTSIDE = ("alpasim_plugin.cli", "alpasim_plugin.bench", "alpasim_plugin.gym", "alpasim_plugin.notebook")
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs")
 
 
