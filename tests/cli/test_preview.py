@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.runtime.preview import window
 
 SCENE = """
 version: 1
@@ -51,3 +52,12 @@ def test_a_page_holds_the_picture_and_asks_for_nothing(tmp_path: Path, capsys: p
     assert "default-src 'none'" in text
     assert "<script" not in text
     assert "http" not in text.replace("http-equiv", "")
+
+
+def test_the_map_has_the_shape_of_its_place_and_holds_the_drive() -> None:
+    for low, high in ((np.zeros(2), np.array([80.0, 3.0])), (np.array([-5.0, -40.0]), np.array([5.0, 40.0]))):
+        first, last = window(low, high, 0.5)
+        width, height = last - first
+        assert height == pytest.approx(0.5 * width)
+        assert (first <= low).all()
+        assert (last >= high).all()
