@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -56,11 +57,13 @@ class Completed:
 
 def completion(
     shell: Annotated[Shell, typer.Argument(help="Which shell.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
     """Print a script that completes verbs, options, and the names of renderers, policies and scenarios."""
     del debug
-    print(SCRIPTS[shell](commands(), known_names()), end="")
+    script = SCRIPTS[shell](commands(), known_names())
+    print(json.dumps({"shell": shell, "script": script}) if as_json else script, end="\n" if as_json else "")
 
 
 def known_names() -> dict[str, str]:

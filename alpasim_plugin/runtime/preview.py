@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from alpasim_plugin.atomic import write_bytes
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
+from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.types import F64, U8, Actor, RenderRequest, Scenario
@@ -102,7 +103,8 @@ def _facts(scenario: Scenario, there: Sequence[Actor]) -> tuple[str, ...]:
     ]
     changes = [f"{key} {_short(old)} -> {_short(new)}" for key, (old, new) in scenario.varied.items()]
     text += [f"scene seed {scenario.seed} varies {', '.join(changes[:6])}{' and more' if len(changes) > 6 else ''}"] if changes else []
-    return (*text, *scenario.notes[:4])
+    background = background_note(scenario)
+    return (*text, *([background] if background else []), *scenario.notes[:4])
 
 
 def _short(value: Any) -> str:
