@@ -114,6 +114,14 @@ def test_the_script_of_the_page_drives_as_in_the_process(folder: Path, capfd: py
     for outside, inside in zip(*logs, strict=True):
         assert np.abs(outside.ego.xyz - inside.ego.xyz).max() < 2e-5  # poses are float32 on the wire
     assert children._running == [], "the command outlives its run"
+    for words in (
+        ["check", "0", "--repair"],
+        ["fork", "0", "--cell", f"clean/{python('remote_policy.py')}/smoke-straight/5", "--at", "0.5"],
+    ):
+        if words[0] == "check":
+            min((folder / "0").rglob("rollout.asl")).unlink()
+        assert run_command([*words, "--json"]) == 2
+        assert "no command is run because a file names it" in json.loads(capfd.readouterr().out)["error"]["found"]
 
 
 def test_check_policy_takes_a_command(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
