@@ -56,7 +56,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         InputError: Anything wrong with the arguments or the scenario.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's own form
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's own form
 
     def __init__(
         self,
@@ -81,6 +81,10 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         if name and name not in known:
             raise InputError(DOING, f"camera {name!r}", f"the scenario has {known}", "name one of them, or camera='' for none")
         self._sensors = (SensorSpec(name),) if name else ()
+        if not name:
+            self.metadata = self.metadata | {"render_modes": []}
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise InputError(DOING, f"render_mode={render_mode!r}", f"it has {self.metadata['render_modes']}", "rgb_array needs a camera")
         self._camera = next((one for one in self._scenario.cameras if one.name == name), None)
         vehicle = self._scenario.vehicle
         self._actions: Actions = Controls(vehicle) if actions == "controls" else Trajectories(vehicle, horizon_us, step_us)
@@ -160,8 +164,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         """Return the newest frame ``(H, W, 3)``; None without render mode."""
         if self.render_mode is None:
             return None
-        if self._camera is None:
-            raise InputError("rendering", "an environment", "it has no camera", "make it with a camera")
+        assert self._camera is not None, "a render mode needs a camera"
         return np.array(self.observation.frames[self._camera.name].rgb)
 
     def close(self) -> None:

@@ -31,7 +31,7 @@ from policies.conformance import STRAIGHT, canned_scenario, observations
 REPO = Path(__file__).resolve().parents[2]
 HEAVY = "torch numba scipy shapely pydantic yaml pyarrow typer av matplotlib"
 PAGE = (REPO / "docs" / "policy-commands.md").read_text(encoding="utf-8")
-SHORT = ("--set", "timing.duration_us=800000", "--certify", "none", "--no-report", "--images", "none", "--workers", "1")
+SHORT = ("--set", "timing.duration_us=600000", "--certify", "none", "--no-report", "--images", "none", "--workers", "1")
 
 
 @pytest.fixture
@@ -124,6 +124,7 @@ def test_the_script_of_the_page_drives_as_in_the_process(folder: Path, capfd: py
         assert "no command is run because a file names it" in json.loads(capfd.readouterr().out)["error"]["found"]
 
 
+@pytest.mark.slow
 def test_check_policy_takes_a_command(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert run_command(["check-policy", python("remote_policy.py"), "--latency-limit-ms", "60000"]) == 0
     assert "FAIL" not in capfd.readouterr().out
@@ -171,6 +172,7 @@ def test_a_command_that_never_serves_is_told_apart(folder: Path, code: str, foun
     assert set(Path(tempfile.gettempdir()).glob("simrun-*")) <= before
 
 
+@pytest.mark.slow
 def test_a_port_is_asked_for_by_its_place_holder(folder: Path) -> None:
     serving = "import os, remote_policy as r; assert os.environ['SIMRUN_POLICY_ADDRESS'] == '127.0.0.1:{port}'; "
     plans = drive(made(python("-c", serving + "r.serve_policy(r.Cruise, '{address}')")))
