@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from alpasim_plugin.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from alpasim_plugin.alpasim.server.one_policy import serve_policy
+    from alpasim_plugin.notebook.opening import open_run
     from alpasim_plugin.runtime.compose import make_renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from policies import make_policy
@@ -22,7 +24,7 @@ __version__ = "0.1.0"
 
 OWN_PACKAGES = ("alpasim_plugin", "configs", "evaluators", "policies", "scenarios")
 
-__all__ = ["OWN_PACKAGES", "__version__", "load_scenario", "make_policy", "make_renderer", "run_rollout"]
+__all__ = ["OWN_PACKAGES", "__version__", "load_scenario", "make_policy", "make_renderer", "open_run", "run_rollout", "serve_policy"]
 
 
 class _OwnPackages:
@@ -58,6 +60,8 @@ __getattr__ = lazy_names(
         "load_scenario": "scenarios.load",
         "make_policy": "policies",
         "make_renderer": ".runtime.compose",
+        "open_run": ".notebook.opening",
         "run_rollout": ".runtime.rollout",
+        "serve_policy": ".alpasim.server.one_policy",
     },
 )

@@ -9,29 +9,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from alpasim_plugin.blank import blank_scenario
 from alpasim_plugin.errors import PolicyError, SimrunError
 from alpasim_plugin.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.types import (
     F64,
     CameraSpec,
-    Degradation,
     EgoState,
-    Environment,
     Frame,
-    HeightField,
-    LaneMap,
-    Latency,
     Observation,
     Plan,
     Policy,
-    Rates,
     Route,
     Scenario,
-    Vehicle,
 )
 from policies.base import make_policy
 from policies.conformance_faults import (
@@ -112,25 +107,7 @@ def canned_scenario(cameras: Sequence[CameraSpec] = (pinhole_camera(),)) -> Scen
     t_us = START_US - 1_000_000 + STEP_US * np.arange(80)
     poses = [T_WORLD_ROAD @ se2(10.0 * (int(t) - START_US) * 1e-6, 0.0, 0.0) for t in t_us]
     log = trajectory_from_poses(t_us, np.array(poses))
-    return Scenario(
-        scene_id="conformance",
-        source="yaml",
-        seed=0,
-        lane_map=LaneMap({}),
-        ground=HeightField(0.0, 0.0, 1.0, np.zeros((2, 2))),
-        ego_log=log,
-        vehicle=Vehicle(),
-        route=Route(log.xyz),
-        actors=(),
-        cameras=tuple(cameras),
-        rates=Rates(),
-        start_us=START_US,
-        end_us=int(t_us[-1]),
-        warmup_us=0,
-        latency=Latency(),
-        environment=Environment(),
-        degradation=Degradation(),
-    )
+    return replace(blank_scenario("conformance", log, cameras), start_us=START_US)
 
 
 def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency_limit_ms: float = 100.0) -> Report:
@@ -149,9 +126,17 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None, latency
     scenario = canned_scenario() if scenario is None else scenario
     if isinstance(policy, str):
         try:
-            policy = make_policy(policy, scenario)
+            made = make_policy(policy, scenario)
         except PolicyError as error:
             return Report((Check("made", False, f"{error.doing} failed: {error.found}"),), (), (0.0, 0.0))
+        report = _checked(made, scenario, latency_limit_ms)
+        with suppress(SimrunError):  # what it did before is the finding
+            made.close()
+        return report
+    return _checked(policy, scenario, latency_limit_ms)
+
+
+def _checked(policy: Policy, scenario: Scenario, latency_limit_ms: float) -> Report:
     cameras = {camera.name: camera for camera in scenario.cameras}
     sentence = sensors_fault(policy.sensors, cameras)
     if sentence:

@@ -58,6 +58,8 @@ MAY_IMPORT: dict[str, set[str]] = {
         "scenarios",
     },
 }
+# What stands outside the stages: it may import everything, and nothing imports it.
+OUTSIDE = ("alpasim_plugin.cli", "alpasim_plugin.bench", "alpasim_plugin.gym", "alpasim_plugin.notebook")
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs")
 
 
@@ -105,14 +107,14 @@ def imported(nodes: tuple[ast.AST, ...]) -> set[str]:
 
 def imports_against_the_stream(module: Module) -> list[str]:
     """Return a line for every import of this module that its stage may not make."""
-    if module.name.startswith(("alpasim_plugin.cli", "alpasim_plugin.bench")) or module.name == "alpasim_plugin":
-        return []  # the command line, the benches and the package's face may import everything
+    if module.name.startswith(OUTSIDE) or module.name == "alpasim_plugin":
+        return []
     stage = stage_of(module.name)
     wrong = []
     for name in sorted(n for n in imported(module.nodes) if n.split(".")[0] in PACKAGES):
         target = stage_of(name)
-        if name.startswith(("alpasim_plugin.cli", "alpasim_plugin.bench")):
-            wrong.append(f"{module.name} imports the command line or a bench: {name}")
+        if name.startswith(OUTSIDE):
+            wrong.append(f"{module.name} imports what stands outside the stages: {name}")
         elif target is None or target == stage:
             continue
         elif stage is None:

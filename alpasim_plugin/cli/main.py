@@ -72,10 +72,14 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "Query the policy at a logged rollout's poses behind several renderers and measure the distance between its plans.",
     ),
     "serve": ("serve", "serve", "EPILOG", "Serve AlpaSim's renderer service: our renderer, or OneFixer in front of any other renderer."),
+    "completion": (
+        "completion", "completion", "EPILOG",
+        "Print a script that completes verbs, options, and the names of renderers, policies and scenarios.",
+    ),
     "bench": ("bench", "app", "", "Measure speed and error of parts."),
     "train": ("train", "app", "", "Make training data and train networks."),
 }  # fmt: skip
-OWN_OPTIONS = ("--help", "--install-completion", "--show-completion")
+OWN_OPTIONS = ("--help",)
 
 
 def with_verb(args: list[str]) -> list[str]:
@@ -107,6 +111,7 @@ def make_app(verb: str | None) -> typer.Typer:
         no_args_is_help=True,
         rich_markup_mode="markdown",
         pretty_exceptions_enable=False,
+        add_completion=False,  # `simrun completion` needs no Python at a Tab
         help="Closed-loop evaluation of driving policies behind a renderer.\n\n"
         "The default verb is `run`: `simrun --renderer clean,3dgs smoke/straight`.\n\n"
         "Exit codes: 0 pass, 1 gate failed, 2 bad input or usage, 3 undecided, 4 rollouts could not be run, "
@@ -130,8 +135,7 @@ def run_command(args: list[str]) -> int:
     """Run one command line and return its exit code; errors are printed, as JSON on stdout with ``--json``."""
     try:
         args = with_verb(args)
-        completing = os.environ.get("COMP_WORDS", "").split()[1:2]  # set by the shell while it completes a word
-        app = make_app(next(iter([*args, *completing]), None))
+        app = make_app(next(iter(args), None))
         with stoppable():
             app(args=args, prog_name="simrun")
     except Stopped as stop:

@@ -6,6 +6,7 @@ import json
 import keyword
 import re
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 from typing import Annotated, Literal
@@ -66,4 +67,6 @@ def new(
         return
     for path in targets:
         print(f"wrote    {path}")
+    test = f"python -m pytest {folder / words['test']}"
+    print(f"test     {test}" if find_spec("pytest") else f"test     {test}   # after: pip install pytest")
     print(f"next     {command}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,7 +48,7 @@ def run(
         str, typer.Option("--renderer", help="Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.")
     ] = "3dgs",
     policy: Annotated[
-        str, typer.Option("--policy", help="Policies, comma-separated: a name, `package.module:Class` or `file.py:Class`.")
+        str, typer.Option("--policy", help="Policies, comma-separated: a name, `package.module:Class`, `file.py:Class` or `exec:COMMAND`.")
     ] = "lane-camera",
     seeds: Annotated[str, typer.Option("--seeds", help="How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
@@ -95,7 +96,7 @@ def run(
     if executor != "local":
         raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is implemented", "use --executor local")
     names = [name.strip() for name in renderer.split(",") if name.strip()]
-    drivers = [name.strip() for name in policy.split(",") if name.strip()]
+    drivers = split_policies(policy)
     _check_preset(preset)
     if baseline is not None and baseline not in names:
         raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")
@@ -119,6 +120,17 @@ def run(
     if plan.undigested and not as_json:
         print(f"not reused by the next command: {', '.join(plan.undigested)} has no digest (--resume reuses its rollouts)")
     raise typer.Exit(result.exit_code)
+
+
+def split_policies(text: str) -> list[str]:
+    """Split ``--policy`` at its commas, but not at those in the quotes of a command.
+
+    Example:
+        >>> split_policies("lane-camera, exec:python drive.py --size '576,320'")
+        ['lane-camera', "exec:python drive.py --size '576,320'"]
+    """
+    parts = re.findall(r"""(?:'[^']*'|"[^"]*"|[^,])+""", text)
+    return [part.strip() for part in parts if part.strip()]
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +12,11 @@ import typer
 
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, Security
-from alpasim_plugin.parts import resolve
+from alpasim_plugin.alpasim.server.one_policy import ADDRESS
+from alpasim_plugin.parts import PartSpec, build, resolve
 from alpasim_plugin.runtime.known_scenes import scenario_finder
 from alpasim_plugin.stopping import Stopped
+from alpasim_plugin.types import Policy, Scenario
 
 EPILOG = """
 Examples:
@@ -26,7 +29,9 @@ Examples:
 
 def serve_policy(
     policy: Annotated[str, typer.Argument(help="Policy as for `run --policy`.")],
-    listen: Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Address; port 0 takes a free one.")] = "127.0.0.1:50052",
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="HOST:PORT", envvar=ADDRESS, help="Address, or unix:PATH; port 0 takes a free one.")
+    ] = "127.0.0.1:50052",
     scenes: Annotated[
         list[str] | None, typer.Option("--scenes", help="Scenes by whose id a policy gets map and vehicle; without it, it gets neither.")
     ] = None,
@@ -42,7 +47,8 @@ def serve_policy(
     Each session gets a policy of its own, made for the session's cameras, which must be pinholes.
     """
     del debug  # read from the command line by cli.main, before any option is parsed
-    service = DriverService(resolve("policy", policy), scenario_finder(scenes or ()), sessions)
+    spec = resolve("policy", policy)
+    service = DriverService(spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes or ()), sessions)
     host = Host({"EgodriverService": service}, listen, Security(tls_cert, tls_key))
     what = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     print(json.dumps(what) if as_json else f"serving EgodriverService at {host.address}: {policy}", flush=True)
@@ -55,3 +61,8 @@ def serve_policy(
     quantiles = {f"drive_ms_p{q}": round(float(np.percentile(ms, q)), 2) for q in (50, 95, 99)} if len(ms) else {}
     counts = dict(service.counts) | quantiles
     print(json.dumps(counts) if as_json else ", ".join(f"{key} {value}" for key, value in counts.items()), flush=True)
+
+
+def _made(spec: PartSpec, scenario: Scenario) -> Policy:
+    policy: Policy = build(spec, scenario=scenario)
+    return policy

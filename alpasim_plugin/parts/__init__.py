@@ -4,7 +4,8 @@ A name is resolved once, into a `PartSpec` that carries the part's identity; a w
 (`alpasim_plugin.parts.builtin`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
 """
 
-from alpasim_plugin.parts.build import build, complete
+from alpasim_plugin.members import complete
+from alpasim_plugin.parts.build import build
 from alpasim_plugin.parts.registry import find, names
 from alpasim_plugin.parts.resolve import RendererSpec, resolve, resolve_renderer, unidentified
 from alpasim_plugin.parts.spec import PartSpec, digest

@@ -45,6 +45,10 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.alpasim.client.driver:AlpasimPolicy",
             "an AlpaSim driver: alpasim://HOST:PORT[?cameras=THEIRS:OURS,...]",
         ),
+        "exec:": (
+            "alpasim_plugin.alpasim.client.command:CommandPolicy",
+            "a command that serves a policy, in another environment or a container: 'exec:python my_policy.py'",
+        ),
         "can://": (
             "alpasim_plugin.control.can_policy:CanPolicy",
             "a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]",

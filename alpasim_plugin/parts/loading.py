@@ -14,12 +14,26 @@ from typing import Any
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.errors import InputError
 
+COMMAND = "exec:"  # what follows is a command line
 _imported_code: dict[Path, str] = {}  # file of a module -> its code digest when a part of it was first resolved
 
 
 def is_target(name: str) -> bool:
-    """Tell whether a name is a target and not a registered name or an address (``scheme://``)."""
-    return ":" in name and "://" not in name
+    """Tell whether a name is a target and not a registered name, an address (``scheme://``) or a command (``exec:``)."""
+    return ":" in name and not split_address(name)[0]
+
+
+def split_address(name: str) -> tuple[str, str]:
+    """Return the registered name and the address of a part that lies behind one; empty where the name has none.
+
+    Example:
+        >>> split_address("nre://host:50051"), split_address("exec:python drive.py http://a"), split_address("clean")
+        (('nre://', 'host:50051'), ('exec:', 'python drive.py http://a'), ('', ''))
+    """
+    if name.startswith(COMMAND):
+        return COMMAND, name.removeprefix(COMMAND)
+    scheme, slashes, rest = name.partition("://")
+    return (scheme + slashes, rest) if slashes else ("", "")
 
 
 def absolute_target(target: str) -> str:

@@ -18,7 +18,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.interfaces import Declaration
 from alpasim_plugin.parts.builtin import BUILTIN
 from alpasim_plugin.parts.kinds import KindName
-from alpasim_plugin.parts.loading import absolute_target, file_of, is_target, load, require_unedited
+from alpasim_plugin.parts.loading import absolute_target, file_of, is_target, load, require_unedited, split_address
 from alpasim_plugin.parts.registry import entries, find, names
 from alpasim_plugin.parts.source import code_digest
 from alpasim_plugin.parts.spec import PartSpec, digest, file_digest, part_digest
@@ -57,12 +57,12 @@ def resolve(kind: KindName, name: str, overrides: Sequence[str] = ()) -> PartSpe
 
     Args:
         kind: Its kind.
-        name: A registered name (a fixer also as ``NAME@STEPS``), ``package.module:Class``, ``path/file.py:Class``, or ``scheme://address``
-            where a part is registered as ``scheme://``.
+        name: A registered name (a fixer also as ``NAME@STEPS``), ``package.module:Class``, ``path/file.py:Class``, ``scheme://address``
+            where a part is registered as ``scheme://``, or ``exec:COMMAND``.
         overrides: ``KEY=VALUE`` of its settings.
 
     Raises:
-        InputError: Unknown name (with the nearest), a failing import, a bad setting, or a declared file that cannot be read.
+        InputError: Unknown name (with the nearest), a failing import, a bad setting or address, or a declared file that cannot be read.
     """
     spec = unidentified(kind, name, overrides)
     return _described(spec, None if _declares_nothing(kind, spec.target) else load(spec.target, kind))
@@ -74,14 +74,19 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
     if is_target(name):
         target = absolute_target(name)
     else:
-        scheme, slashes, rest = name.partition("://")
-        if slashes:
-            plain, address = scheme + slashes, rest
+        scheme, rest = split_address(name)
+        if scheme:
+            plain, address = scheme, rest
         elif kind == "fixer":
             plain, steps = split_steps(name)
         target = find(kind, plain).target
     at_steps = () if steps is None else (f"steps={steps}",)
-    settings = None if _declares_nothing(kind, target) else _settings(kind, plain, load(target, kind), (*at_steps, *overrides))
+    if _declares_nothing(kind, target):
+        return PartSpec(kind, name, target, None, address=address)
+    factory = load(target, kind)
+    if address is not None and hasattr(factory, "check_address"):
+        factory.check_address(address)
+    settings = _settings(kind, plain, factory, (*at_steps, *overrides))
     return PartSpec(kind, name, target, settings, address=address)
 
 

@@ -21,7 +21,7 @@ from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, STEPS_NAME, Remedy, RolloutState, inspect_rollout, write_manifest
 from alpasim_plugin.runtime.pictures import VIDEO_NAME
 from alpasim_plugin.runtime.plan import Cell, RunOptions
-from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
+from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, OUTPUT_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, write_table
@@ -85,7 +85,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         for name in (MANIFEST, *DRIVEN, *DERIVED):  # the manifest first: without it nothing is trusted
             (folder / name).unlink(missing_ok=True)
         scenario = replace(_scenario(cell.ref), stop_at_path_end=cell.stops_at_path_end)
-        with parts_print_to_stderr():
+        with parts_print_to_stderr(folder / OUTPUT_NAME):
             parts = builder(cell, options, scenario, threads)
             recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
             with recorder, _closing(complete(parts.policy, Policy)):

@@ -15,7 +15,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import resolve_renderer
 from alpasim_plugin.runtime.contents import read_run_json
 from alpasim_plugin.runtime.manifests import inspect_rollout
-from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan
+from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan, refuse_commands
 from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
 
@@ -87,6 +87,7 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
         raise InputError(DOING, f"{root / 'run.json'}", "it has no path of the scenario", "name it with --scenario PATH")
     ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())), stated.get("source"))
     options = _options(info)
+    refuse_commands([row["policy"]], DOING, str(root))
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a fixer.
     own = options if resolve_renderer(row["renderer"], options.fixer).fixer is not None else replace(options, fixer=())
     plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)

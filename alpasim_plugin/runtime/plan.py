@@ -10,6 +10,7 @@ from typing import Literal
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
+from alpasim_plugin.parts.loading import COMMAND
 from alpasim_plugin.parts.source import own_code_digest
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.types import Scenario
@@ -147,6 +148,23 @@ def make_plan(
         for seed in seeds
     ]
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
+    """Refuse policies that a file names as commands: only what a user types is run.
+
+    Args:
+        policies: Names that were read from a run folder.
+        doing: The attempted action, for the error.
+        where: The run folder, or its file.
+
+    Raises:
+        InputError: One begins with ``exec:``.
+    """
+    for name in policies:
+        if name.startswith(COMMAND):
+            do_this = "give simrun run the same command again: it drives what is missing or damaged"
+            raise InputError(doing, where, f"its policy is a command, {name}; no command is run because a file names it", do_this)
 
 
 def _cell(

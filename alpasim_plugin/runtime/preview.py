@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from alpasim_plugin.atomic import write_bytes
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
+from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.types import F64, U8, Actor, RenderRequest, Scenario
@@ -102,11 +103,25 @@ def _facts(scenario: Scenario, there: Sequence[Actor]) -> tuple[str, ...]:
     ]
     changes = [f"{key} {_short(old)} -> {_short(new)}" for key, (old, new) in scenario.varied.items()]
     text += [f"scene seed {scenario.seed} varies {', '.join(changes[:6])}{' and more' if len(changes) > 6 else ''}"] if changes else []
-    return (*text, *scenario.notes[:4])
+    background = background_note(scenario)
+    return (*text, *([background] if background else []), *scenario.notes[:4])
 
 
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def window(low: F64, high: F64, height_per_width: float) -> tuple[F64, F64]:
+    """Return the corners ``(2,)`` of the smallest window of a shape that holds a box, about the box's middle.
+
+    Example:
+        >>> [corner.tolist() for corner in window(np.array([0.0, 0.0]), np.array([10.0, 4.0]), 0.5)]
+        [[0.0, -0.5], [10.0, 4.5]]
+    """
+    shape = np.array([1.0, height_per_width])
+    half = 0.5 * float(((high - low) / shape).max()) * shape
+    middle = 0.5 * (low + high)
+    return middle - half, middle + half
 
 
 def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], images: Sequence[U8], facts: Sequence[str]) -> bytes:
@@ -134,9 +149,10 @@ def _figure(scenario: Scenario, there: Sequence[Actor], times: Sequence[int], im
         axes = figure.add_axes((0.0, strip_height / height, 1.0, map_height / height))
         _draw_road(axes, scenario, place)
         _draw_users(axes, scenario, there, times, place, turn)
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal", adjustable="datalim")
+        (x0, y0), (x1, y1) = window(low, high, map_height / WIDTH)
+        axes.set_xlim(x0, x1)
+        axes.set_ylim(y0, y1)
+        axes.set_aspect("equal")
         axes.set_axis_off()
         for k, (t_us, image) in enumerate(zip(times, images, strict=True)):
             cell = figure.add_axes((k / len(images) + 0.002, 0.0, 1 / len(images) - 0.004, (strip_height - 0.28) / height))

@@ -34,7 +34,7 @@ from alpasim_plugin.types import (
 )
 from alpasim_plugin.world.ego import ego_state_from_log
 
-LOG_NAME, FRAMES_NAME = "rollout.asl", "frames.jsonl"
+LOG_NAME, FRAMES_NAME, OUTPUT_NAME = "rollout.asl", "frames.jsonl", "output.log"
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 

@@ -16,7 +16,7 @@ from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.check import Inspection, inspect_run
 from alpasim_plugin.runtime.contents import CONTENTS, DOING, REPORTS, RUN_INFO, TABLES, write_run_json
 from alpasim_plugin.runtime.manifests import read_manifest
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, refuse_commands
 from alpasim_plugin.runtime.run import Progress, execute_run, finish_run
 from alpasim_plugin.runtime.writing import writing
 from scenarios.suite import ScenarioRef
@@ -140,6 +140,7 @@ def plan_of_run(info: Mapping[str, Any]) -> RunPlan:
         if not isinstance(ref, dict) or not isinstance(ref.get("path"), str):
             raise InputError("repairing a run", RUN_INFO, f"it has no path of the scenario {name}", "give the command of the run again")
         refs.append(ScenarioRef(ref["path"], ref.get("seed"), tuple(ref.get("overrides") or ()), ref.get("source")))
+    refuse_commands(info["policies"], "repairing a run", RUN_INFO)
     return make_plan(refs, info["renderers"], info["policies"], info["seeds"], options)
 
 

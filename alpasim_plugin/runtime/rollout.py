@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Generator, Mapping, Sequence
 
 from alpasim_plugin.clock import Clock
 from alpasim_plugin.control import make_controller
@@ -15,7 +16,7 @@ from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.types import Controller, Policy, Renderer, Scenario
+from alpasim_plugin.types import F64, Controller, Observation, Plan, Policy, Renderer, Scenario, SensorSpec
 from alpasim_plugin.world.actors import make_actors
 
 
@@ -44,52 +45,89 @@ def run_rollout(
         PolicyError: The policy raised or broke its contract.
         RendererError: The renderer raised, or a frame does not match its request.
     """
-    clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     recorder = recorder or Recorder(scenario, seed)
-    renderer, policy = complete(renderer, Renderer), complete(policy, Policy)
+    policy = complete(policy, Policy)
     controller = controller or make_controller(policy.controller, scenario.vehicle)
-    actors = make_actors(scenario)
-    plans = PlanQueue(scenario.latency)
-    state = LoopState.at_start(scenario, clock.n_steps)
-    sensors = checked_sensors(policy)
-    watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
-    cadence = make_cadence(clock, scenario, sensors, renderer.block)
-    path_end = PathEnd(scenario)
-    forecaster = Forecaster(scenario, controller, plans, actors, state)
-    rig = CameraRig(scenario, sensors or watched, clock, cadence, forecaster, renderer.lookahead)
+    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder)
     reset_policy(policy, seed, scenario.route)
-    recorder.start(clock, rig.specs)
-    seen = {} if watched else rig.specs
-
-    for tick in clock.ticks():
-        with recorder.stage("actors"):
-            others = actors.step(tick.t_us, state.ego)
-        recorder.poses(state.ego, others)
-        requests = rig.requests(tick, state.history, others)
-        with recorder.rendering(renderer, len(requests)):
-            frames = checked_frames(renderer, requests)
-        if frames and not watched:
-            plans.frames(tick.t_us, renderer.stage_ms)
-        for frame, request in zip(frames, requests, strict=True):
-            if frame.camera in seen:
-                state.frames[frame.camera] = frame
-            recorder.frame(frame, request)
-        if path_end.ends_rollout(state.ego) or tick.is_last:
-            policy.end(dict(state.frames))
-            break
-        if cadence.queries_at(tick.t_us):
-            observation = state.observe(seen)
-            recorder.policy_query(observation, clock)
-            began = time.perf_counter()
-            with recorder.stage("policy"):
-                plan = checked_plan(policy, observation)
-            recorder.plan_motion.add(plan, state.ego)
-            plan_world, *samples = state.to_world(plan)
-            plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
-            recorder.policy_plan(plan_world, samples)
-        before, active = state.ego, plans.active(tick.t_us)
-        with recorder.stage("control"):
-            forced = state.advance(controller, active, tick.t_us + clock.rates.control_us)
-        recorder.control_step(before, active, state.ego, forced)
-    recorder.finish(path_end)
+    driving = loop.drive()
+    try:
+        observation = next(driving)
+        while True:
+            observation = driving.send(checked_plan(policy, observation))
+    except StopIteration:  # the rollout has ended
+        pass
+    policy.end(dict(loop.state.frames))
+    recorder.finish(loop.path_end)
     return recorder
+
+
+class Loop:
+    """The closed loop of one rollout, which stops wherever a plan is needed: for a policy (`run_rollout`), or for whoever steps it.
+
+    Args:
+        scenario: The scenario.
+        renderer: A session for this rollout alone.
+        sensors: Cameras to render.
+        controller: Vehicle model.
+        recorder: Records the rollout. Whoever drives calls its ``finish``.
+
+    Attributes:
+        state: The ego and the newest frames.
+        actors: Poses of the other road users at the present instant, by id.
+        path_end: Whether the end of the recorded path was passed.
+    """
+
+    def __init__(
+        self, scenario: Scenario, renderer: Renderer, sensors: Sequence[SensorSpec], controller: Controller, recorder: Recorder
+    ) -> None:
+        self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+        self._renderer, self._controller, self._recorder = complete(renderer, Renderer), controller, recorder
+        self._world = make_actors(scenario)
+        self._plans = PlanQueue(scenario.latency)
+        self.state = LoopState.at_start(scenario, clock.n_steps)
+        self.actors: Mapping[str, F64] = {}
+        self._watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
+        self._cadence = make_cadence(clock, scenario, sensors, self._renderer.block)
+        self.path_end = PathEnd(scenario)
+        forecaster = Forecaster(scenario, controller, self._plans, self._world, self.state)
+        self._rig = CameraRig(scenario, sensors or self._watched, clock, self._cadence, forecaster, self._renderer.lookahead)
+
+    def drive(self) -> Generator[Observation, Plan, None]:
+        """Yield an observation at every policy query and take the plan for it; end with the rollout.
+
+        Raises:
+            RendererError: The renderer raised, or a frame does not match its request.
+        """
+        clock, renderer, recorder, plans, state = self._clock, self._renderer, self._recorder, self._plans, self.state
+        recorder.start(clock, self._rig.specs)
+        seen = {} if self._watched else self._rig.specs
+        for tick in clock.ticks():
+            with recorder.stage("actors"):
+                self.actors = self._world.step(tick.t_us, state.ego)
+            recorder.poses(state.ego, self.actors)
+            requests = self._rig.requests(tick, state.history, self.actors)
+            with recorder.rendering(renderer, len(requests)):
+                frames = checked_frames(renderer, requests)
+            if frames and not self._watched:
+                plans.frames(tick.t_us, renderer.stage_ms)
+            for frame, request in zip(frames, requests, strict=True):
+                if frame.camera in seen:
+                    state.frames[frame.camera] = frame
+                recorder.frame(frame, request)
+            if self.path_end.ends_rollout(state.ego) or tick.is_last:
+                return
+            if self._cadence.queries_at(tick.t_us):
+                observation = state.observe(seen)
+                recorder.policy_query(observation, clock)
+                began = time.perf_counter()
+                with recorder.stage("policy"):
+                    plan = yield observation
+                recorder.plan_motion.add(plan, state.ego)
+                plan_world, *samples = state.to_world(plan)
+                plans.submit(plan_world, tick.t_us, int((time.perf_counter() - began) * 1e6))
+                recorder.policy_plan(plan_world, samples)
+            before, active = state.ego, plans.active(tick.t_us)
+            with recorder.stage("control"):
+                forced = state.advance(self._controller, active, tick.t_us + clock.rates.control_us)
+            recorder.control_step(before, active, state.ego, forced)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.atomic import write_json
+from alpasim_plugin.child import end_children
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import find_rollout_state
@@ -135,9 +136,12 @@ def execute_run(
             progress.rollout_done(manifest, reused)
 
         how = HowToRun(threads, resume, full, limit_s, retry)
-        manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
-        pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
-        determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+        try:
+            manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
+            pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
+            determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+        finally:
+            end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 

@@ -13,6 +13,7 @@ from evaluators.report.run_folder import Rollout, Run
 
 LABEL = 9  # width of the labels
 MORE_SCENES = "suites/urban"
+SEEING = "lane-camera"  # a shipped policy with a camera
 
 
 def ending_lines(run: Run) -> list[str]:
@@ -53,8 +54,12 @@ def next_command(run: Run, finding: Finding) -> tuple[list[str], str]:
         return ["simrun", "check-policy", policy], "finds every fault of the policy in seconds"
     if failed:
         return ["simrun", "check", str(run.folder)], "says what is damaged or missing; the same command runs it again"
+    if all(r.frames == 0 for r in run.rollouts):
+        names = ",".join(run.renderers if len(run.renderers) > 1 else [*run.renderers, _other(run)])
+        why = "a policy that looks: without a camera it drives alike behind every renderer"
+        return _again(run, names, run.scenes_asked or [MORE_SCENES], SEEING), why
     if not finding.points:
-        more = "3dgs" if "3dgs" not in run.renderers else "onefixer"
+        more = _other(run)
         names = ",".join([*run.renderers, more])
         return _again(run, names, run.scenes_asked or [MORE_SCENES]), f"compares with {more}, pair by pair"
     flips, _ = find_flips(run)
@@ -75,9 +80,13 @@ def _probe(run: Run, rollout: Rollout, baseline: str) -> list[str]:
     return ["simrun", "probe", str(run.folder), "--cell", cell, "--renderers", ",".join(dict.fromkeys([baseline, rollout.renderer]))]
 
 
-def _again(run: Run, renderers: str, scenes: list[str]) -> list[str]:
+def _other(run: Run) -> str:
+    return "3dgs" if "3dgs" not in run.renderers else "onefixer"
+
+
+def _again(run: Run, renderers: str, scenes: list[str], policy: str = "") -> list[str]:
     seeds = max(1, len(run.info.get("seeds") or ()))
-    return ["simrun", "--renderer", renderers, "--policy", ",".join(run.policies), "--seeds", str(seeds), *scenes]
+    return ["simrun", "--renderer", renderers, "--policy", policy or ",".join(run.policies), "--seeds", str(seeds), *scenes]
 
 
 def _line(label: str, text: str) -> str:

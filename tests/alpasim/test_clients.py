@@ -71,7 +71,8 @@ def serve(name: str, implementation: object, interceptor: Calls | None = None) -
 def driver(scene: str) -> Iterator[tuple[DriverService, str, Calls]]:
     """Our own policy behind AlpaSim's driver service."""
     calls = Calls()
-    service = DriverService(resolve("policy", "lane-camera"), scenario_finder([scene]))
+    spec = resolve("policy", "lane-camera")
+    service = DriverService(spec.name, spec.digest, lambda scenario: build(spec, scenario=scenario), scenario_finder([scene]))
     server, address = serve("EgodriverService", service, calls)
     yield service, address, calls
     server.stop(0)

@@ -23,6 +23,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
     (r"view .*--serve", "goes on until it is stopped; tests/viewer/test_view_server.py asks it"),
+    (r"exec:docker|driver\.py", "needs a container or a driver of the reader's"),
     (r"--images folder/", "needs the reader's own pictures"),
     (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
 )

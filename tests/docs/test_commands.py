@@ -112,6 +112,8 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / "weights.npz").write_bytes(b"weights")
     policy = f"{own}\n\nMine = MyPolicy = Straight\n"
     (folder / "my_policy.py").write_text(policy)
+    commanded = (REPO / "docs" / "policy-commands.md").read_text(encoding="utf-8")
+    (folder / "remote_policy.py").write_text("\n".join(re.findall(r"^```python\n(.*?)^```", commanded, re.S | re.M)))
     (folder / "my_package").mkdir()
     (folder / "my_package" / "__init__.py").touch()
     (folder / "my_package" / "my_module.py").write_text(policy)
@@ -143,6 +145,7 @@ def shortened(words: tuple[str, ...]) -> list[str]:
 
 def call(simrun: Path, folder: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environment["PATH"] = f"{simrun.parent}{os.pathsep}{environment.get('PATH', '')}"
     return subprocess.run([simrun, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 

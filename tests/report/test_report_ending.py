@@ -63,3 +63,11 @@ def test_what_is_undecided_leads_to_more_scenes(tmp_path: Path, renderers: tuple
     run = read_run(make_run(tmp_path, Plan(renderers=renderers, scenes=("a",), seeds=(0,), steps=20, harm={"clean": 0.1, "3dgs": 0.1})))
     if find(run).tone == "unclear":
         assert words_of(run)[-1] == "suites/urban"
+
+
+def test_a_policy_without_a_camera_leads_to_one_that_looks(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Plan(renderers=("clean",), seeds=(0,), steps=20)))
+    blind = dataclasses.replace(run, rollouts=tuple(dataclasses.replace(r, frames=0) for r in run.rollouts if r.ok))
+    words = words_of(blind)
+    assert words[words.index("--policy") + 1] == "lane-camera"
+    assert words[words.index("--renderer") + 1] == "clean,3dgs"

@@ -31,23 +31,22 @@ _SESSIONS = itertools.count()  # sessions of several rollouts of one scene and s
 FRONT_WIDE = "camera_front_wide_120fov"  # what AlpaSim calls its main camera
 
 
-class AlpasimPolicy(Policy):
+class DriverPolicy(Policy):
     """A driver behind AlpaSim's EgodriverService.
 
     Args:
         scenario: Gives cameras, periods and the warm-up.
-        address: ``HOST:PORT[?cameras=THEIRS:OURS,...&encoding=jpeg|png&timeout_s=N]``. Without ``cameras`` the scenario's main camera is
-            sent under AlpaSim's name for it.
+        place: Where it listens, with the options `OPTIONS`.
+        main: Under which name the scenario's main camera is sent where no option ``cameras`` says it; None: its own.
     """
 
     is_remote = True
 
-    def __init__(self, scenario: Scenario, address: str) -> None:
-        place = Address.parse("alpasim", address, OPTIONS)
+    def __init__(self, scenario: Scenario, place: Address, main: str | None) -> None:
         self._scenario = scenario
-        self._cameras = cameras_of(scenario, place.options.get("cameras"))
+        self._cameras = cameras_of(scenario, place.options.get("cameras"), main)
         self.sensors: Sequence[SensorSpec] = tuple(SensorSpec(camera.name) for camera in self._cameras.values())
-        self._encoding = encoding_of(f"alpasim://{address}", place.options.get("encoding", "jpeg"))
+        self._encoding = encoding_of(place.target, place.options.get("encoding", "jpeg"))
         self._timeout_s = float(place.options.get("timeout_s", "300"))
         self.service = Service("EgodriverService", place.target, PolicyError, retries=False)
         version = self.service.version()
@@ -171,15 +170,35 @@ class AlpasimPolicy(Policy):
         return self.service.call(method, request, self._timeout_s)
 
 
-def cameras_of(scenario: Scenario, text: str | None) -> dict[str, CameraSpec]:
-    """Return the scenario's cameras to send, by the driver's names for them: ``THEIRS:OURS,...``.
+class AlpasimPolicy(DriverPolicy):
+    """``alpasim://HOST:PORT[?cameras=THEIRS:OURS,...&encoding=jpeg|png&timeout_s=N]``: a driver that runs already.
+
+    Without ``cameras`` the scenario's main camera is sent under AlpaSim's name for it.
+    """
+
+    def __init__(self, scenario: Scenario, address: str) -> None:
+        super().__init__(scenario, Address.parse("alpasim", address, OPTIONS), FRONT_WIDE)
+
+    @staticmethod
+    def check_address(address: str) -> None:
+        """Refuse what is no address, before a run begins."""
+        Address.parse("alpasim", address, OPTIONS)
+
+
+def cameras_of(scenario: Scenario, text: str | None, main_name: str | None = FRONT_WIDE) -> dict[str, CameraSpec]:
+    """Return the scenario's cameras to send, by the driver's names for them.
+
+    Args:
+        scenario: Has the cameras.
+        text: ``THEIRS:OURS,...``, or ``OURS,...`` where the names are the same; None: the main camera alone.
+        main_name: What that is called; None: by its own name.
 
     Raises:
         InputError: The scenario lacks a camera that is named, or has none.
     """
     own = {camera.name: camera for camera in scenario.cameras}
     main = next((name for name in (FRONT_WIDE, "front") if name in own), next(iter(own), ""))
-    pairs = [(FRONT_WIDE, main)] if text is None else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
+    pairs = [(main_name or main, main)] if text is None else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
     missing = [b for _, b in pairs if b not in own]
     if missing or not pairs:
         found = f"no camera {missing[0]!r} among {sorted(own)}" if missing else "no camera"

@@ -13,7 +13,6 @@ from alpasim_plugin.alpasim.server.driving import Driving
 from alpasim_plugin.alpasim.server.status import answering
 from alpasim_plugin.alpasim.wire import API_VERSION, common_pb2, egodriver_pb2
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import PartSpec, build
 from alpasim_plugin.types import Policy, Scenario
 
 DOING = "serving a policy"
@@ -23,7 +22,9 @@ class DriverService:
     """The service; sessions are independent, and a policy of its own drives each.
 
     Args:
-        policy: Which policy.
+        name: Of the policy, for `get_version`.
+        digest: Of its code and weights; None: it has none.
+        make: Makes a session's policy for a scenario.
         scenario_of: Returns what a policy is made for, by scene id.
         most_sessions: How many may be open at a time.
 
@@ -32,8 +33,16 @@ class DriverService:
         counts: Calls, and failed ones, by name.
     """
 
-    def __init__(self, policy: PartSpec, scenario_of: Callable[[str], Scenario], most_sessions: int = 64) -> None:
-        self._spec, self._scenario_of, self._most = policy, scenario_of, most_sessions
+    def __init__(
+        self,
+        name: str,
+        digest: str | None,
+        make: Callable[[Scenario], Policy],
+        scenario_of: Callable[[str], Scenario],
+        most_sessions: int = 64,
+    ) -> None:
+        self._name, self._digest = name, digest
+        self._make, self._scenario_of, self._most = make, scenario_of, most_sessions
         self._sessions: dict[str, Driving] = {}
         self._lock = threading.Lock()
         self.drives_s: list[float] = []
@@ -44,8 +53,8 @@ class DriverService:
         """Name the policy and the digest of its code and weights."""
         major, minor, patch = API_VERSION
         api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
-        digest = (self._spec.digest or "undigested")[:40]
-        return common_pb2.VersionId(version_id=f"simrun-{__version__}+{self._spec.name}", git_hash=digest, grpc_api_version=api)
+        digest = (self._digest or "undigested")[:40]
+        return common_pb2.VersionId(version_id=f"simrun-{__version__}+{self._name}", git_hash=digest, grpc_api_version=api)
 
     @answering
     def start_session(self, request: egodriver_pb2.DriveSessionRequest, context: Any) -> common_pb2.SessionRequestStatus:
@@ -114,7 +123,3 @@ class DriverService:
         if session is None:
             raise InputError(DOING, f"session {name!r}", "it is not open", "call start_session first")
         return session
-
-    def _make(self, scenario: Scenario) -> Policy:
-        policy: Policy = build(self._spec, scenario=scenario)
-        return policy

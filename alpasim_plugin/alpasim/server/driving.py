@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.alpasim.wire import egodriver_pb2
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import increasing_times, read_camera, read_poses, wire_trajectory
+from alpasim_plugin.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Policy, Route, Scenario, Trajectory
 
 DOING = "driving for AlpaSim"
@@ -82,7 +83,11 @@ class Driving:
             self._route_rig[: len(rows)] = rows
 
     def drive(self, now_us: int) -> egodriver_pb2.DriveResponse:
-        """Return the policy's plan as absolute poses; empty where it cannot be asked yet."""
+        """Return the policy's plan as absolute poses; empty where it cannot be asked yet.
+
+        Raises:
+            PolicyError: It returned no plan, or asks for cameras that the session does not have.
+        """
         with self._lock:
             if not self._t_us or len(self._frames) < len(self._native):
                 return egodriver_pb2.DriveResponse()
@@ -91,6 +96,9 @@ class Driving:
             shown = {name: frame for name, frame in self._frames.items() if name in self._cameras}
             observation = Observation(now_us, shown, self._cameras, replace(ego, t_us=now_us), history, self._route_rig.copy())
             plan = policy.act(observation)
+            problem = plan_problem(plan, now_us)
+            if problem:
+                raise PolicyError(DOING, type(policy).__name__, problem, "simrun check-policy finds all faults of a policy")
             return self._answer(plan, ego.T_world_rig)
 
     def close(self) -> None:
@@ -105,7 +113,13 @@ class Driving:
         known = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
         route = Route(transform_points(ego.T_world_rig, known) if len(known) else ego.T_world_rig[None, :3, 3])
         policy = self._make(replace(self._scenario, cameras=tuple(cameras), route=route))
-        self._cameras = {camera.name: camera for camera in cameras if camera.name in {sensor.camera for sensor in policy.sensors}}
+        found = sensors_problem(policy.sensors)
+        wanted = [] if found else [sensor.camera for sensor in policy.sensors]
+        missing = sorted(set(wanted) - set(self._native))
+        if found or missing:
+            found = found or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
+            raise PolicyError(DOING, type(policy).__name__, found, "name the session's cameras as the policy does: ?cameras=NAME,...")
+        self._cameras = {camera.name: camera for camera in cameras if camera.name in wanted}
         policy.reset(self._seed, route)
         return policy
 

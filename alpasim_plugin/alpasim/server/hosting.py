@@ -115,7 +115,7 @@ class Host:
 
     Args:
         services: Implementations by the name of the service (`SERVICE_PATHS`).
-        listen: ``HOST:PORT``; port 0 takes a free one.
+        listen: ``HOST:PORT``; port 0 takes a free one. Or ``unix:PATH``.
         security: TLS and token.
         workers: Calls that run at the same time; further ones wait.
         every: Called every `every_s` seconds, such as to forget what is old.
@@ -141,14 +141,15 @@ class Host:
         made = [handlers(name, service) for name, service in services.items()]
         self._server.add_generic_rpc_handlers((*made, handlers("Health", self.health), *Reflection([*services, "Health"]).handlers()))
         host, _, port = listen.rpartition(":")
+        is_socket = listen.startswith("unix:")
         credentials = security.credentials()
         try:
-            if not host or not port.isdigit():
-                raise InputError(DOING, f"--listen {listen}", "no HOST:PORT", "write for example 127.0.0.1:50051")
+            if not is_socket and (not host or not port.isdigit()):
+                raise InputError(DOING, f"--listen {listen}", "no HOST:PORT", "write for example 127.0.0.1:50051, or unix:PATH")
             add = self._server.add_insecure_port(listen) if credentials is None else self._server.add_secure_port(listen, credentials)
         except RuntimeError as error:
             raise InfrastructureError(DOING, listen, str(error), "choose a free port and an address of this machine") from error
-        self.address = f"{host}:{add}"
+        self.address = listen if is_socket else f"{host}:{add}"
         self._ended = threading.Event()
         self._every, self._every_s = every, every_s
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from alpasim_plugin.alpasim.server.status import UnknownScene
 from alpasim_plugin.alpasim.wire import sensorsim_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.log.schema import wire_camera
@@ -105,10 +106,6 @@ class SceneShelf:
         if scene_id in self._sources:
             raise InputError(DOING, f"scene {scene_id!r}", f"both {self._sources[scene_id]} and {source} have this id", "remove one")
         self._sources[scene_id] = source
-
-
-class UnknownScene(InputError):
-    """A scene id that the server does not know."""
 
 
 def sources_in(place: str | Path) -> list[str | Path]:

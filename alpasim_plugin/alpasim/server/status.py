@@ -15,7 +15,6 @@ from typing import Any
 
 import grpc
 
-from alpasim_plugin.alpasim.server.scenes import UnknownScene
 from alpasim_plugin.errors import InfrastructureError, InputError, SimrunError
 
 Code = grpc.StatusCode
@@ -24,6 +23,10 @@ BACKEND = "Stopped waiting for backend"
 PASSING = (Code.UNAVAILABLE, Code.RESOURCE_EXHAUSTED, Code.ABORTED, Code.CANCELLED, Code.DEADLINE_EXCEEDED)
 BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
 POLL_S = 0.1
+
+
+class UnknownScene(InputError):
+    """A scene id that the server does not know."""
 
 
 class UpstreamFault(InfrastructureError):

@@ -24,8 +24,8 @@ import numpy as np
 from alpasim_plugin.alpasim.server.failures import Failures
 from alpasim_plugin.alpasim.server.fixing import FixerShelf
 from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
-from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf, UnknownScene
-from alpasim_plugin.alpasim.server.status import CallTime, answering
+from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf
+from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene, answering
 from alpasim_plugin.alpasim.server.views import read_pose
 from alpasim_plugin.alpasim.wire import common_pb2, video_model_pb2
 from alpasim_plugin.errors import InputError

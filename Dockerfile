@@ -1,0 +1,44 @@
+# simrun in a container. On a CPU:        docker build -t simrun .
+# With CUDA (an Ubuntu 24.04 base):       docker build -t simrun-cuda --build-arg TORCH_INDEX=https://pypi.org/simple \
+#                                             --build-arg BASE=nvidia/cuda:12.8.1-runtime-ubuntu24.04 .
+# Then:                                   docker run --rm -v "$PWD:/work" simrun --renderer clean,3dgs smoke/curve
+ARG BASE=python:3.11-slim-bookworm
+
+FROM ${BASE} AS build
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+SHELL ["/bin/sh", "-euc"]
+RUN if ! command -v python3 >/dev/null || ! python3 -c "import ensurepip"; then \
+        apt-get update; \
+        apt-get install -y --no-install-recommends python3 python3-venv; \
+        rm -rf /var/lib/apt/lists/*; \
+    fi
+RUN python3 -m venv /opt/simrun
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+# torch first, in a layer of its own: it is large, and changes seldom
+RUN /opt/simrun/bin/pip install --index-url "${TORCH_INDEX}" "torch>=2.8,<2.14"
+WORKDIR /source
+COPY pyproject.toml README.md LICENSE ./
+COPY alpasim_plugin alpasim_plugin
+COPY configs configs
+COPY evaluators evaluators
+COPY policies policies
+COPY scenarios scenarios
+RUN /opt/simrun/bin/pip install .
+
+FROM ${BASE}
+SHELL ["/bin/sh", "-euc"]
+RUN if ! command -v python3 >/dev/null; then \
+        apt-get update; \
+        apt-get install -y --no-install-recommends python3; \
+        rm -rf /var/lib/apt/lists/*; \
+    fi
+RUN useradd --create-home --uid 10001 simrun && mkdir /work && chown simrun /work
+COPY --from=build /opt/simrun /opt/simrun
+# Compiled kernels and fitted scenes go to the user's home: what is installed is read-only. Mount it to keep them.
+ENV PATH=/opt/simrun/bin:$PATH \
+    NUMBA_CACHE_DIR=/home/simrun/.cache/numba \
+    PYTHONUNBUFFERED=1
+USER 10001
+WORKDIR /work
+ENTRYPOINT ["simrun"]
+CMD ["--help"]

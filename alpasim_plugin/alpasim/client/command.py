@@ -1,0 +1,189 @@
+"""``--policy "exec:COMMAND"``: a policy in another Python environment or a container, started here and driven over a local socket.
+
+The command serves AlpaSim's EgodriverService (`alpasim_plugin.serve_policy` does, so does AlpaSim's own driver) at the address in the
+environment variable ``SIMRUN_POLICY_ADDRESS``. It is started once in each process that drives, for all of its rollouts, and ended with the
+run.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+from alpasim_plugin.alpasim.client.channel import Address
+from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
+from alpasim_plugin.alpasim.client.listening import LoopbackPort, SocketFile
+from alpasim_plugin.child import Child, fate
+from alpasim_plugin.errors import InputError, PolicyError, SimrunError
+from alpasim_plugin.stdout import say
+from alpasim_plugin.types import Scenario
+
+DOING = "starting a policy's command"
+DRIVING = "driving by a policy's command"
+VARIABLE = "SIMRUN_POLICY_ADDRESS"
+READY_S = 120.0  # a container starts, a network is loaded
+POLL_S = 0.02
+REAP_S = 1.0  # between the end of a connection and that of the process behind it
+SHOWN_LINES = 3
+
+
+@dataclass(frozen=True)
+class Command:
+    """What stands after ``exec:``: ``[?OPTION=VALUE[&...] ]PROGRAM ARGUMENT...``.
+
+    Attributes:
+        text: As it was given.
+        words: Program and arguments; ``{address}``, ``{port}`` and ``{folder}`` stand for where the policy shall listen.
+        options: Those of `alpasim_plugin.alpasim.client.driver`, and ``ready_s``.
+    """
+
+    text: str
+    words: tuple[str, ...]
+    options: Mapping[str, str]
+
+    @classmethod
+    def parse(cls, text: str) -> Command:
+        """Read a command; no shell is asked, quotes are read as a shell reads them.
+
+        Example:
+            >>> Command.parse("?timeout_s=5 python drive.py --net 'a b.pt'").words
+            ('python', 'drive.py', '--net', 'a b.pt')
+
+        Raises:
+            InputError: No program, one that is not found, an open quote, or an unknown option.
+        """
+        doing, whole = "reading a policy's command", f"exec:{text}"
+        head, _, rest = text.partition(" ") if text.startswith("?") else ("", "", text)
+        options = {key: values[-1] for key, values in parse_qs(head[1:], keep_blank_values=True).items()}
+        known = (*OPTIONS, "ready_s")
+        unknown = sorted(set(options) - set(known))
+        if unknown:
+            raise InputError(doing, whole, f"no option {unknown[0]!r}", f"the options are {', '.join(known)}")
+        for key in ("ready_s", "timeout_s"):
+            if not re.fullmatch(r"\d+(\.\d+)?", options.get(key, "1")):
+                raise InputError(doing, whole, f"{key}={options[key]!r}", "write seconds as a number")
+        try:
+            words = tuple(shlex.split(rest))
+        except ValueError as error:
+            raise InputError(doing, whole, str(error), "close the quotes") from error
+        if not words:
+            raise InputError(doing, whole, "no program", "write exec:PROGRAM ARGUMENT..., such as 'exec:python my_policy.py'")
+        if shutil.which(words[0]) is None:
+            raise InputError(doing, whole, f"no program {words[0]!r}", "install it, or write its path; a shell is not asked")
+        return cls(text, words, options)
+
+
+class Served:
+    """A command that runs and has opened its address.
+
+    Raises:
+        PolicyError: It ended before, or did not open it in time.
+    """
+
+    def __init__(self, command: Command) -> None:
+        self.command = command
+        in_text = " ".join(command.words)
+        self._place = LoopbackPort() if "{port}" in in_text else SocketFile(Path(tempfile.mkdtemp(prefix="simrun-")))
+        words = [self._place.filled_in(word) for word in command.words]
+        self._child = Child(words, {VARIABLE: self._place.address}, say, self._place.close)
+        self.address = self._place.address
+        limit_s = float(command.options.get("ready_s", READY_S))
+        end_s = time.monotonic() + limit_s
+        while not self._place.is_open():
+            self.require_running()
+            if time.monotonic() > end_s:
+                self.stop()
+                found = f"nothing listens at {self.address} after {limit_s:g} s{self._said()}"
+                raise PolicyError(DOING, self._name, found, f"let it serve at the address in {VARIABLE}, or give it longer: ?ready_s=N")
+            time.sleep(POLL_S)
+        self.require_running()
+
+    def require_running(self, wait_s: float = 0.0) -> None:
+        """Raise if the command has ended, or does so within a time.
+
+        Raises:
+            PolicyError: It has.
+        """
+        code = self._child.end_within(wait_s)
+        if code is not None:
+            self.stop()
+            raise PolicyError(DRIVING, self._name, f"it ended with {fate(code)}{self._said()}", "see output.log of the rollout")
+
+    def is_running(self) -> bool:
+        """Tell whether the command still runs."""
+        return self._child.end_within(0.0) is None
+
+    def stop(self) -> None:
+        """End the command; harmless if it has ended."""
+        self._child.stop()
+
+    @property
+    def _name(self) -> str:
+        return f"exec:{self.command.text}"
+
+    def _said(self) -> str:
+        lines = [line.strip() for line in self._child.last if line.strip()][-SHOWN_LINES:]
+        return f"; its last lines: {' | '.join(lines)}" if lines else "; it printed nothing"
+
+
+_served: dict[str, Served] = {}
+
+
+def served_by(command: Command) -> Served:
+    """Return the running command; it is started if it does not run.
+
+    Raises:
+        PolicyError: As `Served`.
+    """
+    held = _served.get(command.text)
+    if held is None or not held.is_running():
+        if held is not None:
+            held.stop()  # gives back its place
+        held = _served[command.text] = Served(command)
+    return held
+
+
+class CommandPolicy(DriverPolicy):
+    """A policy that a command serves.
+
+    Args:
+        scenario: Gives cameras, periods and the warm-up.
+        address: The command, as `Command.parse` reads it. Frames are sent as PNG unless it says otherwise, and the main camera under its
+            own name: the policy sees what it would see in this process.
+
+    Raises:
+        InputError: As `Command.parse`.
+        PolicyError: The command ends, or does not serve in time.
+    """
+
+    def __init__(self, scenario: Scenario, address: str) -> None:
+        command = Command.parse(address)
+        self._served = served_by(command)
+        try:
+            super().__init__(scenario, Address(self._served.address, {"encoding": "png", **command.options}), None)
+        except SimrunError:
+            self._served.require_running(REAP_S)
+            raise
+        self._facts |= {"command": address}
+
+    @staticmethod
+    def check_address(address: str) -> None:
+        """Refuse what is no command, before a run begins."""
+        Command.parse(address)
+
+    def _call(self, method: str, request: Any) -> Any:
+        try:
+            return super()._call(method, request)
+        except PolicyError as error:
+            self._served.require_running(REAP_S if "UNAVAILABLE" in error.found else 0.0)
+            if "DEADLINE_EXCEEDED" in error.found:  # it hangs: the next rollout gets a new one
+                self._served.stop()
+            raise

@@ -1,0 +1,253 @@
+"""The environment: the closed loop of a rollout, paused at every policy query."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box, Dict
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.gym.actions import Actions, Controls, Trajectories
+from alpasim_plugin.gym.reward import Instant, Judge, Reward
+from alpasim_plugin.plan_check import plan_problem
+from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
+from alpasim_plugin.runtime.rollout import Loop
+from alpasim_plugin.runtime.scoring import score_log
+from alpasim_plugin.seeding import derive_seed
+from alpasim_plugin.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec
+from scenarios.load import load_scenario
+
+DOING = "making an environment"
+ROUTE_POINTS, ROUTE_M = 20, 200.0  # rows of the route, and the bound of its coordinates
+SPEED_MPS = 100.0
+ROLLOUT_SEEDS = 2**31
+
+Actions_ = Literal["controls", "trajectory"]
+
+
+class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gymnasium is an extra
+    """Drive a scenario; an episode is a rollout, with the loop, the renderer and the evaluators of a run.
+
+    Observation, a dictionary: ``camera`` ``(H, W, 3)`` uint8 sRGB; ``speed`` ``(1,)`` float32 m/s; ``route`` ``(20, 3)`` float32, x and y
+    in the rig frame (metres) and 1, or zeros after the route's end. Actions: `alpasim_plugin.gym.actions`. Reward: `Reward`. An episode
+    terminates with a collision or off the road, or where the recorded path ends, and is truncated when its time is up. ``info`` then holds
+    ``ended`` and ``metrics``, the scores of the whole rollout as ``simrun score`` would give them.
+
+    Args:
+        scenario: File, recorded log, or shipped name.
+        actions: ``controls`` or ``trajectory``.
+        renderer: As `make_renderer` takes it.
+        camera: Which camera; None: the scenario's first. An empty name: none, and nothing is rendered.
+        scene_seeds: Each episode drives the scene of one of these seeds.
+        overrides: ``key=value`` for the scenario, such as ``cameras=[{width: 64, height: 36}]``.
+        preset: Evaluator preset: ``paper`` or ``strict``.
+        reward: Weights.
+        horizon_us: Of a trajectory.
+        step_us: Between its poses.
+        render_mode: ``rgb_array``: `render` returns the newest frame.
+
+    Raises:
+        InputError: Anything wrong with the arguments or the scenario.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's own form
+
+    def __init__(
+        self,
+        scenario: str | Path = "smoke/curve",
+        actions: Actions_ = "controls",
+        renderer: str = "clean",
+        camera: str | None = None,
+        scene_seeds: Sequence[int] = (0,),
+        overrides: Sequence[str] = (),
+        preset: Literal["paper", "strict"] = "paper",
+        reward: Reward = Reward(),
+        horizon_us: int = 2_000_000,
+        step_us: int = 200_000,
+        render_mode: str | None = None,
+    ) -> None:
+        self._scenarios = [load_scenario(scenario, seed, tuple(overrides)) for seed in scene_seeds]
+        _check(self._scenarios, actions, preset, horizon_us, step_us)
+        self._preset, self._reward, self._renderer, self.render_mode = preset, reward, renderer, render_mode
+        self._scenario = self._scenarios[0]
+        known = [one.name for one in self._scenario.cameras]
+        name = camera if camera is not None else known[0] if known else ""
+        if name and name not in known:
+            raise InputError(DOING, f"camera {name!r}", f"the scenario has {known}", "name one of them, or camera='' for none")
+        self._sensors = (SensorSpec(name),) if name else ()
+        if not name:
+            self.metadata = self.metadata | {"render_modes": []}
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise InputError(DOING, f"render_mode={render_mode!r}", f"it has {self.metadata['render_modes']}", "rgb_array needs a camera")
+        self._camera = next((one for one in self._scenario.cameras if one.name == name), None)
+        vehicle = self._scenario.vehicle
+        self._actions: Actions = Controls(vehicle) if actions == "controls" else Trajectories(vehicle, horizon_us, step_us)
+        self.action_space = self._actions.space
+        self.observation_space = self._space()
+        self._driving: Generator[Observation, Plan, None] | None = None
+        self._folder: TemporaryDirectory[str] | None = None
+        self._recorder: _Watching | None = None
+        self._loop: Loop | None = None
+        self._judge: Judge | None = None
+        self._observation: Observation | None = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """Give what the present episode drives."""
+        return self._scenario
+
+    @property
+    def observation(self) -> Observation:
+        """Give the observation as policies get it: with times, poses and camera models."""
+        if self._observation is None:
+            raise InputError("observing", "an environment", "no episode has begun", "call reset() first")
+        return self._observation
+
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; its scene and its rollout seed follow from the seed of the last `reset` that had one.
+
+        Args:
+            seed: Of the episodes from here on.
+            options: ``scene_seed``: index into ``scene_seeds``; ``seed``: the rollout seed of this episode.
+        """
+        super().reset(seed=seed)
+        self.close()
+        wanted = dict(options or {})
+        drawn_scene = int(self.np_random.integers(len(self._scenarios)))  # drawn in any case, so that options change one episode only
+        drawn_seed = int(self.np_random.integers(ROLLOUT_SEEDS))
+        self._scenario = self._scenarios[int(wanted.get("scene_seed", drawn_scene))]
+        rollout_seed = int(wanted.get("seed", derive_seed(self._scenario.scene_id, drawn_seed, "gym") % ROLLOUT_SEEDS))
+        self._folder = TemporaryDirectory(prefix="simrun-gym-")
+        self._recorder = _Watching(self._scenario, rollout_seed, Path(self._folder.name))
+        session = make_renderer(self._renderer, self._scenario, rollout_seed, threads=1)
+        self._loop = Loop(self._scenario, session, self._sensors, self._actions.controller, self._recorder)
+        self._judge = Judge(self._scenario, self._preset, self._reward)
+        self._driving = self._loop.drive()
+        self._observation = next(self._driving)
+        while self._observation.t_us < self._scenario.start_us + self._scenario.warmup_us:  # the recording is forced: nothing to decide
+            self._observation = self._driving.send(self._recorded())
+        *_, facts = self._judge.judge(self._recorder.taken())
+        return self._seen(), {"seed": rollout_seed, "scene": self._scenario.scene_id, "t_us": self._observation.t_us, **facts}
+
+    def step(self, action: Any) -> tuple[dict[str, Any], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Act for one policy period.
+
+        Raises:
+            InputError: No episode runs, or the action is none.
+        """
+        if self._driving is None or self._judge is None or self._recorder is None or self._loop is None:
+            raise InputError("stepping", "an environment", "no episode runs", "call reset() first")
+        plan = self._actions.plan(np.asarray(action), self.observation)
+        problem = plan_problem(plan, self.observation.t_us)
+        if problem:
+            raise InputError("stepping", "an action", problem, "give finite numbers within the action space")
+        over = False
+        try:
+            self._observation = self._driving.send(plan)
+        except StopIteration:
+            over = True
+        worth, ended, facts = self._judge.judge(self._recorder.taken())
+        terminated = bool(ended) or (over and self._loop.path_end.passed)
+        info: dict[str, Any] = {"t_us": self._loop.state.ego.t_us, **facts}
+        if over or terminated:
+            info |= {"ended": ended or ("path_end" if terminated else "time"), "metrics": self._finish()}
+            self._observation = self._loop.state.observe({} if self._camera is None else {self._camera.name: self._camera})
+        return self._seen(), worth, terminated, over and not terminated, info
+
+    def render(self) -> U8 | None:
+        """Return the newest frame ``(H, W, 3)``; None without render mode."""
+        if self.render_mode is None:
+            return None
+        assert self._camera is not None, "a render mode needs a camera"
+        return np.array(self.observation.frames[self._camera.name].rgb)
+
+    def close(self) -> None:
+        """End the episode, if one runs."""
+        if self._recorder is not None and self._driving is not None:
+            self._driving.close()
+            self._recorder.__exit__(GeneratorExit, GeneratorExit(), None)  # the log of an episode that was left is not kept
+        self._driving = self._recorder = None
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+    def _finish(self) -> dict[str, float | None]:
+        """Close the log and return the scores of the whole rollout; None where a metric is not valid."""
+        assert self._recorder is not None
+        assert self._driving is not None
+        assert self._loop is not None
+        self._driving.close()
+        self._recorder.finish(self._loop.path_end)
+        folder = self._recorder.folder
+        scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, self._scenario, self._preset)
+        self._driving = None
+        return {name: entry["value"] if entry["valid"] else None for name, entry in scored.metrics.items()}
+
+    def _recorded(self) -> Plan:
+        """Return a plan for the warm-up, in which none is driven: straight on."""
+        observation = self.observation
+        times = observation.t_us + np.arange(0, 2_000_001, 100_000, dtype=np.int64)
+        xy = np.column_stack([observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))])
+        return Plan(observation.t_us, times, xy, np.zeros(len(times)))
+
+    def _space(self) -> Dict:
+        spaces: dict[str, Any] = {
+            "speed": Box(-SPEED_MPS, SPEED_MPS, (1,), np.float32),
+            "route": Box(-ROUTE_M, ROUTE_M, (ROUTE_POINTS, 3), np.float32),
+        }
+        if self._camera is not None:
+            spaces["camera"] = Box(0, 255, (self._camera.height, self._camera.width, 3), np.uint8)
+        return Dict(spaces)
+
+    def _seen(self) -> dict[str, Any]:
+        observation = self.observation
+        seen = {"speed": np.array([np.clip(observation.ego.speed_mps, -SPEED_MPS, SPEED_MPS)], np.float32)}
+        seen["route"] = _route(observation.route_rig)
+        if self._camera is not None:
+            seen["camera"] = np.array(observation.frames[self._camera.name].rgb)
+        return seen
+
+
+class _Watching(Recorder):
+    """Records a rollout without images, and keeps the instants that nobody has judged yet."""
+
+    def __init__(self, scenario: Scenario, seed: int, folder: Path) -> None:
+        super().__init__(scenario, seed, folder, images="none")
+        self._new: list[Instant] = []
+
+    def poses(self, ego: EgoState, actors: Mapping[str, F64]) -> None:
+        super().poses(ego, actors)
+        self._new.append((ego, dict(actors)))
+
+    def taken(self) -> list[Instant]:
+        """Return the instants since the last call."""
+        new, self._new = self._new, []
+        return new
+
+
+def _route(route_rig: F64) -> np.ndarray[Any, np.dtype[np.float32]]:
+    known = np.isfinite(route_rig).all(axis=1)
+    out = np.zeros((ROUTE_POINTS, 3), np.float32)
+    out[known, :2] = np.clip(route_rig[known, :2], -ROUTE_M, ROUTE_M)
+    out[known, 2] = 1.0
+    return out
+
+
+def _check(scenarios: Sequence[Scenario], actions: str, preset: str, horizon_us: int, step_us: int) -> None:
+    latencies = {one.latency.kind for one in scenarios}
+    problems = {
+        "scene_seeds": "" if scenarios else "none",
+        "latency": "measured, so that a step depends on how long the learner thinks" if "measured" in latencies else "",
+        "actions": "" if actions in ("controls", "trajectory") else f"{actions!r}",
+        "preset": "" if preset in ("paper", "strict") else f"{preset!r}, which scores whole rollouts only",
+        "horizon_us and step_us": "" if 0 < step_us <= horizon_us and horizon_us % step_us == 0 else f"{horizon_us} and {step_us}",
+    }
+    for name, found in problems.items():
+        if found:
+            raise InputError(DOING, name, found, "see docs/gym.md")

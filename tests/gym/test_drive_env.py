@@ -1,0 +1,226 @@
+"""The Gymnasium environments: the API's own check, the same rollout as a run, the same scores, and how episodes end."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.log import read_asl
+from alpasim_plugin.runtime.compose import make_renderer
+from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
+from alpasim_plugin.runtime.rollout import run_rollout
+from alpasim_plugin.types import Observation, Plan, Policy
+from evaluators import score
+from policies import make_policy
+
+gymnasium = pytest.importorskip("gymnasium")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+import alpasim_plugin.gym as doors  # noqa: E402
+from alpasim_plugin.gym.actions import HeldCommand  # noqa: E402
+from alpasim_plugin.gym.env import DriveEnv  # noqa: E402
+
+SMALL = "cameras=[{width: 64, height: 36}]"
+SHORT = ("timing.duration_us=1500000", "timing.warmup_us=300000")
+STRAIGHT = "road.segments=[{kind: straight, length_m: 220}]"
+STRAIGHT_ON = np.zeros(2, np.float32)
+
+
+def finish(env: DriveEnv, action: Any = STRAIGHT_ON) -> tuple[float, bool, bool, dict[str, Any], int]:
+    """Repeat an action to the end of the episode; return the last reward, flags and info, and the number of steps."""
+    for n in range(1, 200):
+        _, worth, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            return float(worth), terminated, truncated, info, n
+    raise AssertionError("the episode does not end")
+
+
+@pytest.mark.parametrize(("name", "camera"), [(doors.DRIVE, "front"), (doors.PLAN, "")])
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_gymnasiums_own_check_finds_nothing(name: str, camera: str) -> None:
+    env = gymnasium.make(name, overrides=(SMALL, *SHORT), camera=camera, render_mode="rgb_array" if camera else None)
+    check_env(env.unwrapped, skip_close_check=True)
+    if camera:
+        assert env.unwrapped.render().shape == (36, 64, 3)
+    env.close()
+
+
+def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run() -> None:
+    env = DriveEnv(
+        "smoke/lead_car", "trajectory", camera="", horizon_us=5_000_000, step_us=100_000, overrides=("timing.duration_us=2500000",)
+    )
+    _, info = env.reset(seed=3)
+    policy = make_policy("pure-pursuit", env.scenario)
+    policy.reset(info["seed"], env.scenario.route)
+    policy.act(env.observation)  # of the first query in charge
+    over = False
+    while not over:
+        plan = policy.act(env.observation)
+        _, _, terminated, truncated, info = env.step(np.column_stack([plan.xy, plan.yaw])[1:])
+        over = terminated or truncated
+    stepped = read_asl(Path(env._folder.name) / LOG_NAME)  # type: ignore[union-attr]
+
+    class Recorded(Policy):
+        """The same policy as the environment lets it drive: with a straight plan while the recording is forced."""
+
+        sensors = env._sensors
+
+        def reset(self, seed: int, route: Any) -> None:
+            self.own = make_policy("pure-pursuit", env.scenario)
+            self.own.reset(seed, route)
+
+        def act(self, observation: Observation) -> Plan:
+            if observation.t_us < env.scenario.start_us + env.scenario.warmup_us:
+                return forced(observation)
+            plan = self.own.act(observation)
+            return Plan(plan.t_us, plan.times_us, np.vstack([np.zeros(2), plan.xy[1:]]), np.r_[0.0, plan.yaw[1:]])
+
+    def forced(observation: Observation) -> Plan:
+        times = observation.t_us + np.arange(0, 2_000_001, 100_000)
+        xy = np.column_stack([observation.ego.speed_mps * (times - times[0]) * 1e-6, np.zeros(len(times))])
+        return Plan(observation.t_us, times, xy, np.zeros(len(times)))
+
+    with Recorder(env.scenario, stepped.seed, images="none") as recorder:
+        run_rollout(env.scenario, make_renderer("clean", env.scenario, stepped.seed, threads=1), Recorded(), stepped.seed, recorder)
+    assert (Path(env._folder.name) / LOG_NAME).read_bytes() == (recorder.folder / LOG_NAME).read_bytes()  # type: ignore[union-attr]
+    assert info["ended"] == "path_end"
+    env.close()
+
+
+def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_episode() -> None:
+    env = DriveEnv("smoke/curve", camera="")
+    _, first = env.reset(seed=0)
+    facts, total = [first], 0.0
+    while True:
+        _, worth, terminated, truncated, info = env.step(STRAIGHT_ON)
+        facts.append(info)
+        total += float(worth)
+        if terminated or truncated:
+            break
+    assert (terminated, info["ended"]) == (True, "offroad")
+    assert info["metrics"]["offroad"] == 1.0
+    log = read_asl(Path(env._folder.name) / LOG_NAME)  # type: ignore[union-attr]
+    found = {one.name: one for one in score(log, env.scenario.scene, "paper")}
+    at = np.searchsorted(log.ego.t_us, [one["t_us"] for one in facts])
+    for name in ("lateral_distance_m", "progress"):
+        np.testing.assert_allclose([one[name] for one in facts], found[name].value[at], atol=1e-5)  # poses in the log are float32
+    assert np.flatnonzero(found["offroad"].value).tolist() == [len(log.ego.t_us) - 1]
+    lateral, share = found["lateral_distance_m"].value[at], found["progress"].value[at]
+    wanted = 0.1 * (share[-1] - share[0]) * found["gt_dist_traveled_m"].value[0] - 0.5 * 0.1 * lateral[1:].sum() - 5.0
+    assert total == pytest.approx(wanted, abs=1e-4)
+    with pytest.raises(InputError, match=r"call reset\(\) first"):
+        env.step(STRAIGHT_ON)
+    env.close()
+
+
+def test_a_contact_ends_the_episode() -> None:
+    env = DriveEnv("smoke/lead_car", camera="", overrides=(STRAIGHT,), reward=doors.Reward(collision=7.0))
+    env.reset(seed=0)
+    worth, terminated, _, info, _ = finish(env, np.array([0.0, 1.0], np.float32))
+    assert (terminated, info["ended"], info["metrics"]["collision_any"]) == (True, "collision", 1.0)
+    assert worth < -5.0
+    env.close()
+
+
+def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind() -> None:
+    env = DriveEnv("smoke/curve", camera="", scene_seeds=(0, 1), overrides=SHORT)
+    env.reset(seed=12)
+    folder = Path(env._folder.name)  # type: ignore[union-attr]
+    first = [env.reset()[1] for _ in range(3)]
+    assert not folder.exists()
+    env.reset(seed=12)
+    assert [env.reset()[1] for _ in range(3)] == first
+    assert len({one["scene"] for one in first}) > 1
+    assert len({one["seed"] for one in first}) == 3
+    assert env.reset(options={"scene_seed": 1, "seed": 5})[1]["scene"] == "smoke-curve-seed1"
+    env.close()
+
+
+def test_wheel_and_pedals_do_what_they_say() -> None:
+    env = DriveEnv("smoke/straight", camera="")
+    env.reset(seed=0)
+    assert isinstance(env._actions.controller, HeldCommand)
+    before = env.observation.ego
+    env.step(np.array([0.5, 0.0], np.float32))
+    assert env.observation.ego.yaw_rate_radps > 0.0, "left is positive"
+    assert env.observation.ego.speed_mps == pytest.approx(before.speed_mps)
+    speeds = [float(env.step(np.array([0.0, -1.0], np.float32))[0]["speed"][0]) for _ in range(3)]
+    assert speeds[0] > speeds[1] > speeds[2]
+    plan = env._actions.plan(np.array([0.0, 1.0]), env.observation)
+    assert plan.xy[-1, 0] > 2.0 * env.observation.ego.speed_mps, "the plan in the log is where the command leads"
+    env.close()
+
+
+def test_what_makes_no_environment_is_refused() -> None:
+    for settings, found in (
+        ({"camera": "left"}, "camera 'left'"),
+        ({"actions": "words"}, "'words'"),
+        ({"camera": "", "render_mode": "rgb_array"}, "rgb_array"),
+        ({"preset": "alpasim"}, "whole rollouts"),
+        ({"step_us": 300_000}, "300000"),
+        ({"overrides": ("latency.kind=measured",)}, "measured"),
+    ):
+        with pytest.raises(InputError, match=found):
+            DriveEnv(**settings)  # type: ignore[arg-type]
+    env = DriveEnv(camera="", overrides=SHORT)
+    env.reset()
+    with pytest.raises(InputError, match="not finite"):
+        env.step(np.array([np.nan, 0.0]))
+    env.close()
+
+
+def test_without_gymnasium_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(InputError, match=r"extra \[gym\]"):
+        importlib.reload(doors)
+    monkeypatch.undo()
+    importlib.reload(doors)
+
+
+def blocks() -> list[str]:
+    page = Path(__file__).resolve().parents[2] / "docs" / "gym.md"
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+
+
+def test_the_example_of_the_page_runs() -> None:
+    space: dict[str, Any] = {}
+    exec(compile(blocks()[0], "docs/gym.md", "exec"), space)
+    assert space["seen"]["camera"].shape == (54, 96, 3)
+
+
+@pytest.mark.slow
+def test_the_training_script_of_the_page_runs(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    (tmp_path / "train_ppo.py").write_text(blocks()[1])
+    repo = Path(__file__).resolve().parents[2]
+    environment = os.environ | {"PYTHONPATH": str(repo)}
+    words = [sys.executable, "train_ppo.py", "0.05"]
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert re.search(r"^\d+ steps in 0\.\d minutes$", done.stdout, re.M)
+    assert (tmp_path / "ppo_curve.zip").exists()
+
+
+@pytest.mark.slow
+def test_environments_run_in_processes_and_agree_with_one_in_this_process() -> None:
+    settings = {"camera": "", "overrides": SHORT}
+    several = gymnasium.make_vec(doors.DRIVE, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **settings)
+    seen, _ = several.reset(seed=[4, 5])
+    one = DriveEnv(**settings)  # type: ignore[arg-type]
+    own, _ = one.reset(seed=5)
+    np.testing.assert_array_equal(seen["route"][1], own["route"])
+    for _ in range(3):
+        seen, worth, *_ = several.step(np.array([[0.0, 0.2], [0.1, 0.0]], np.float32))
+        own, alone, *_ = one.step(np.array([0.1, 0.0], np.float32))
+    np.testing.assert_array_equal(seen["route"][1], own["route"])
+    assert worth[1] == pytest.approx(float(alone))
+    several.close()
+    one.close()
