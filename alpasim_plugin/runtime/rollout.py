@@ -54,7 +54,7 @@ def run_rollout(
     sensors = checked_sensors(policy)
     watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
     cadence = make_cadence(clock, scenario, sensors, renderer.block)
-    path_end = PathEnd(scenario)
+    path_end = PathEnd(scenario.ego_log, scenario.stop_at_path_end)
     forecaster = Forecaster(scenario, controller, plans, actors, state)
     rig = CameraRig(scenario, sensors or watched, clock, cadence, forecaster, renderer.lookahead)
     reset_policy(policy, seed, scenario.route)
@@ -74,7 +74,7 @@ def run_rollout(
             if frame.camera in seen:
                 state.frames[frame.camera] = frame
             recorder.frame(frame, request)
-        if path_end.ends_rollout(state.ego) or tick.is_last:
+        if path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
             policy.end(dict(state.frames))
             break
         if cadence.queries_at(tick.t_us):

@@ -14,7 +14,7 @@ from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.types import EgoState, Observation, Plan, Route, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 from tests.runtime.grey_renderer import GREY, Grey
@@ -69,12 +69,9 @@ def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(straight_
     angle = np.linspace(0.0, 2 * np.pi - 0.3, 301)
     xyz = np.stack([30 * np.sin(angle), 30 - 30 * np.cos(angle), 0 * angle], axis=1)
     log = Trajectory(np.linspace(0, 3_000_000, 301).astype(np.int64), xyz, quat_from_yaw(angle))
-    end = PathEnd(replace(straight_road, ego_log=log))
-    pose = np.eye(4)
-    pose[:3, 3] = [2.0, 0.1, 0.0]  # on the first metres, ahead of the last ones
-    assert not end.ends_rollout(EgoState(0, pose, 5.0))
-    pose[:3, 3] = xyz[-1] + 3.0 * (xyz[-1] - xyz[-2])
-    assert end.ends_rollout(EgoState(0, pose, 5.0))
+    end = PathEnd(log)
+    assert not end.ends_rollout(np.array([2.0, 0.1]))  # on the first metres, ahead of the last ones
+    assert end.ends_rollout((xyz[-1] + 3.0 * (xyz[-1] - xyz[-2]))[:2])
 
 
 def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(tmp_path: Path) -> None:
