@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.run import execute_run
+from alpasim_plugin.runtime.score_logs import check_complete
 from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from scenarios.load import load_scenario
 from scenarios.suite import expand
@@ -58,6 +60,19 @@ def test_a_rollout_ends_where_a_moving_recording_ends(straight_road: Scenario) -
     assert ego.t_us[-1] < scenario.end_us
     assert rig_x[-1] > 25.0 >= rig_x[-2] - 1e-6  # the first pose beyond the end is the last one
     assert rollout.facts()["passed_path_end"]
+
+
+def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later(straight_road: Scenario) -> None:
+    log = run_rollout(shortened(straight_road, 25.0, stands=False), Grey(), Fast(), 0).log()
+    check_complete(Path("rollout.asl"), log)
+    ego = log.ego
+    shorter = Trajectory(ego.t_us[:-1], ego.xyz[:-1], ego.quat[:-1])
+    later = Trajectory(
+        np.append(ego.t_us, ego.t_us[-1] + 100_000), np.vstack([ego.xyz, ego.xyz[-1] + [1, 0, 0]]), ego.quat[[*range(len(ego)), -1]]
+    )
+    for other in (shorter, later):
+        with pytest.raises(InfrastructureError, match="control steps"):
+            check_complete(Path("rollout.asl"), replace(log, ego=other))
 
 
 def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(straight_road: Scenario) -> None:
