@@ -180,3 +180,17 @@ def test_vertices_are_put_in_and_rounded_as_alpasims_loader_does():
         inner = int(np.linalg.norm(b - a) // 2.0)
         want += [a + (b - a) / (inner + 1) * k for k in range(1, inner + 1)] + [b]
     np.testing.assert_array_equal(with_vertices(line), want)  # to the bit: it decides whether a union of lanes has cracks
+
+
+def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(straight: Scenario, tmp_path: Path):
+    path = tmp_path / "scene.usdz"
+    write_usdz(path, straight)
+    alpasim = ["timing.timeline=alpasim"]
+    plain = load_scenario(path, overrides=alpasim)
+    assert (plain.start_us, plain.warmup_us) == (straight.start_us, 1_700_000)
+    later = load_scenario(path, overrides=[*alpasim, "timing.start_time_offset_us=1500000"])
+    assert (later.start_us - plain.start_us, later.end_us) == (1_500_000, plain.end_us)
+    built = [load_scenario("smoke/straight", overrides=[*alpasim, f"timing.start_time_offset_us={us}"]) for us in (0, 700_000)]
+    assert built[1].start_us - built[0].start_us == 700_000
+    with pytest.raises(InputError, match="timeline: alpasim"):
+        load_scenario("smoke/straight", overrides=["timing.start_time_offset_us=700000"])
