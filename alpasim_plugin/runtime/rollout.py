@@ -16,7 +16,7 @@ from alpasim_plugin.runtime.loop_state import LoopState
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.types import Controller, Policy, Renderer, Scenario
-from alpasim_plugin.world.actors import make_actors
+from alpasim_plugin.world.actors import Actors, make_actors
 
 
 def run_rollout(
@@ -26,6 +26,7 @@ def run_rollout(
     seed: int = 0,
     recorder: Recorder | None = None,
     controller: Controller | None = None,
+    actors: Actors | None = None,
 ) -> Recorder:
     """Drive one scenario once and return its recorder.
 
@@ -39,6 +40,7 @@ def run_rollout(
         seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.seeding`.
         recorder: Records the rollout; by default into a temporary folder.
         controller: Vehicle model; by default the policy's, else the bicycle with a tracker.
+        actors: Road users at their beginning; by default those of the scenario.
 
     Raises:
         PolicyError: The policy raised or broke its contract.
@@ -47,8 +49,8 @@ def run_rollout(
     clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
     recorder = recorder or Recorder(scenario, seed)
     renderer, policy = complete(renderer, Renderer), complete(policy, Policy)
-    controller = controller or make_controller(policy.controller, scenario.vehicle)
-    actors = make_actors(scenario)
+    controller = complete(controller or make_controller(policy.controller, scenario.vehicle), Controller)
+    actors = actors or make_actors(scenario)
     plans = PlanQueue(scenario.latency)
     state = LoopState.at_start(scenario, clock.n_steps)
     sensors = checked_sensors(policy)
