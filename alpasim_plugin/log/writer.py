@@ -11,7 +11,7 @@ import numpy as np
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.asl import AslFile
-from alpasim_plugin.alpasim.wire import common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, inverse, quat_from_matrix, se3, trajectory_from_poses
 from alpasim_plugin.log.images import ImageEncoding, encode_image
@@ -30,7 +30,6 @@ from alpasim_plugin.log.schema import (
 )
 from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
 
-WIRE_API = (0, 54, 0)  # AlpaSim's API version whose messages these are
 _SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "controller", "video_model")
 
 
@@ -259,9 +258,8 @@ class AslWriter:
 
     def _version(self, service: str) -> common_pb2.VersionId:
         given = self.header.versions.get(service, __version__ if service == "runtime" else "<skip>")
-        major, minor, patch = WIRE_API
-        api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
-        return common_pb2.VersionId(version_id=given, git_hash="<skip>" if given == "<skip>" else "", grpc_api_version=api)
+        git_hash = "<skip>" if given == "<skip>" else ""
+        return common_pb2.VersionId(version_id=given, git_hash=git_hash, grpc_api_version=api_version())
 
     def _recorded(self, t_us: int) -> dict[str, F64]:
         """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or around it."""

@@ -106,7 +106,9 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
                 for part in held:
                     stack.enter_context(_closing(part))
                 run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller, parts.actors)
-        manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
+        rendered = dict(complete(parts.renderer, Renderer).facts())
+        manifest |= recorder.facts() | {"fixer": rendered if cell.renderer.fixer is not None else {}}
+        manifest |= {"renderer_facts": rendered} if rendered and cell.renderer.fixer is None else {}
         own = dict(complete(parts.policy, Policy).facts())
         manifest |= {"policy_facts": own} if own else {}
         manifest |= _score(folder, cell, options, scenario)
