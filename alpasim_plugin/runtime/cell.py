@@ -101,7 +101,11 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         with parts_print_to_stderr():
             parts = builder(cell, options, scenario, threads)
             recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
-            held = [complete(parts.policy, Policy), complete(parts.controller, Controller), *([parts.actors] if parts.actors else [])]
+            held: list[Policy | Controller | RemoteActors] = [
+                complete(parts.policy, Policy),
+                complete(parts.controller, Controller),
+                *([parts.actors] if parts.actors else []),
+            ]
             with recorder, ExitStack() as stack:
                 for part in held:
                     stack.enter_context(_closing(part))

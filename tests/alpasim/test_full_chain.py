@@ -116,7 +116,7 @@ def chain(network: Network, scene: str, renderer: dict[str, object], overrides: 
     front = assemble(Settings(overrides=overrides, scenes=(scene,), upstream=Upstream(base), threads=1, reliability=1.0))
     driver = DriverService(resolve("policy", "lane-camera"), scenario_finder([scene]))
     yield network.add({"SensorsimService": front.service}), base, network.add({"EgodriverService": driver})
-    front.channel.close()
+    front.close()
 
 
 @cache

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.types import LaneMap, RolloutLog, Trajectory
-from evaluators import PRESETS, preset, rollout_values, score
-from evaluators.alpasim import EvalSettings, ScoredRollout, over_sweeps, reduce_run, results_summary, scene_score
+from evaluators import PRESETS, preset, reduce_rollout, rollout_values, score
+from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, results_summary, scene_score
 from evaluators.alpasim.settings import Modifiers, SceneScoreSettings
 from evaluators.route import from_corridor, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
+from tests.evaluators.golden import scored
 
 NOW, LATER = PRESETS["alpasim"], PRESETS["alpasim@6f1029c"]
 RECORDED = track(np.linspace(0.0, 50.0, 51), 0.0)
@@ -95,3 +96,27 @@ def test_settings_and_result_files_name_the_version():
         summary = results_summary(reduced, {}, [{"rollout_id": "b"}], over_sweeps(reduced), SceneScoreSettings())
         assert ("left_corridor_laterally" in summary["score_criteria"]) == shown
         assert ("left_corridor_laterally" in summary["rollouts"][1]["score_metrics"]) == shown
+
+
+@pytest.mark.parametrize(
+    ("name", "rollout_id", "score_there", "reason", "lateral_m", "progress", "clipped"),
+    [  # AlpaSim's evaluation with the files of 6f1029c, on logs that its runtime wrote
+        ("drift-a", "d796f5c0-e557-11f1-bfca-02fc00000001", 0.0, "left_corridor_laterally", 4.259358, 0.426836, 0.579653),
+        ("standstill-c", "c15fd60a-e557-11f1-ade6-02fc00000001", 0.0, "left_corridor_laterally", 4.14875, 1.0, 1.0),
+        ("seam-c", "b5500b0a-e557-11f1-8adf-02fc00000001", 0.0, "offroad", 2.187058, 0.335811, 0.397196),
+        ("lane-change-a", "b9155f60-e557-11f1-b1de-02fc00000001", 1.0, None, 3.61542, 0.787192, 1.069075),
+        ("standstill-a", "d6261e14-e557-11f1-88ac-02fc00000001", 1.0, None, 1e-06, 0.603732, 0.964489),
+    ],
+)
+def test_golden_logs_have_the_values_of_the_later_code(shared_data, name, rollout_id, score_there, reason, lateral_m, progress, clipped):
+    folder, scene_id = shared_data / "alpasim-golden", f"synthetic-{name}"
+    log = folder / "rollouts" / scene_id / rollout_id / "rollout.asl"
+    settings = load_settings(folder / "eval-config.yaml")
+    chosen = settings.preset(LATER)
+    found = {
+        key: one.value for key, one in reduce_rollout(scored(log, folder / "scenes" / f"{scene_id}.usdz", chosen), chosen).values.items()
+    }
+    got = [found[key] for key in ("lateral_dist_to_gt_trajectory", "progress", "progress_clipped_rel")]
+    assert got == pytest.approx([lateral_m, progress, clipped], abs=1e-5)
+    result = scene_score(found, settings.scene_score)
+    assert (result.score, result.failure_reason) == (score_there, reason)
