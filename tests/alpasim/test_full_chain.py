@@ -36,7 +36,7 @@ from scenarios.load import load_scenario
 def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
     written = yaml.safe_load(shipped_names()["smoke/curve"].read_text())
     path = tmp_path_factory.mktemp("scenes") / "curve.yaml"
-    timing = {"duration_us": 600_000, "warmup_us": 200_000}
+    timing = {"duration_us": 400_000, "warmup_us": 200_000}
     camera = {"width": 96, "height": 64, "name": "front"}
     path.write_text(yaml.safe_dump(written | {"scene_id": "chain-curve", "timing": timing, "cameras": [camera]}))
     return str(path)
