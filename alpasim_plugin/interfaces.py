@@ -173,7 +173,9 @@ class Policy(Protocol):
 
 @runtime_checkable
 class Controller(Protocol):
-    """Moves the ego along a plan. Pure: the result depends on the arguments only."""
+    """Moves the ego along a plan. Pure, unless it is a remote one: the result depends on the arguments only."""
+
+    grounds: bool = False  # whether the poses that it returns stand on the ground; others are put on the scenario's
 
     @abstractmethod
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
@@ -188,6 +190,10 @@ class Controller(Protocol):
             PolicyError: The plan is empty, not finite, or its times do not increase.
             InputError: ``to_us`` is not later than ``state.t_us``.
         """
+
+    def close(self) -> None:
+        """Give back what the controller holds, such as a session; called after a rollout, also after one that failed."""
+        return
 
 
 @runtime_checkable

@@ -48,10 +48,14 @@ METRICS: dict[str, MetricInfo] = {  # in the order in which reports show them, a
         "m", "lower", "mean", "the paper's: mean distance from the recorded path; driving past its end counts as distance"
     ),
     "lateral_bias_m": MetricInfo("m", "none", "mean", "mean signed distance to the side of the recorded path, left of it positive"),
+    "lateral_dist_to_gt_trajectory": MetricInfo(
+        "m", "lower", "max", "distance of the ego centre from the recorded path, which goes straight on at its far end"
+    ),
+    "left_corridor_laterally": _flag("the ego left the recorded path to the side, by 4 m unless AlpaSim's settings say else"),
     "dist_to_gt_location": MetricInfo("m", "lower", "max", "distance of the ego centre from where the recording is at that time"),
     "progress": MetricInfo("", "higher", "last", "share of the recorded path's length that was reached", is_headline=True, is_share=True),
     "progress_rel": MetricInfo("", "higher", "min", "share reached of the path that the recording has driven by then", is_share=True),
-    "progress_rel_to_total": MetricInfo("", "higher", "last", "same as progress, under AlpaSim's other name", is_share=True),
+    "progress_rel_to_total": MetricInfo("", "higher", "last", "progress; in later AlpaSim of what the recording reaches by then"),
     "dist_traveled_m": MetricInfo("m", "none", "last", "metres driven"),
     "gt_dist_traveled_m": MetricInfo("m", "none", "last", "length of the recorded path"),
     "plan_deviation": MetricInfo("m", "lower", "mean", "how far consecutive plans differ at common times, near ones weigh more"),

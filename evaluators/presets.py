@@ -7,7 +7,7 @@ right. A preset only selects; the evaluators hold the code of each choice.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from alpasim_plugin.errors import InputError
@@ -36,7 +36,9 @@ class Preset:
     # surface, all lanes and drivable areas of the ego's level.
     offroad_rule: Literal["edge_touch", "margin"] = "edge_touch"
     edge_touch_m: float = 0.001  # off-road below this distance from a road edge, if no lane contains the footprint
-    edge_query: Literal["any", "nearest_vertex"] = "any"
+    # "any": every edge at the ego's height. "nearest_vertex": the edge that owns the vertex nearest in 3-D. "nearest_of_level": the same of
+    # the edges whose vertex beside the ego is at its height.
+    edge_query: Literal["any", "nearest_vertex", "nearest_of_level"] = "any"
     edge_height_m: float = 3.0  # edges and surfaces farther above or below the box centre belong to another road
     alpasim_map: bool = False  # read the road as AlpaSim's own loader does, where the scene says that this differs
     # Wrong lane. "none_agrees": no lane under the ego runs its way. "any_opposes": at least one runs against it.
@@ -48,6 +50,9 @@ class Preset:
     # Recorded path.
     invented_starts: bool = False  # the first two rows of the recording-based metrics are constants
     distance_from: Literal["handover", "log_start"] = "handover"  # where dist_traveled_m starts
+    # What progress_rel_to_total is a share of: the recorded path, or its part up to where the recording is when the rollout ends.
+    progress_of: Literal["path", "reachable"] = "path"
+    corridor: bool = False  # whether leaving the recorded path to the side by stop_beyond_gt_m is a fault of its own
     # Plans.
     open_loop_horizon_us: int = 3_000_000
     min_ade_horizons_s: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0)
@@ -83,34 +88,46 @@ class Preset:
         return dataclasses.asdict(self)
 
 
+ALPASIM = Preset(
+    name="alpasim",
+    reproduces="AlpaSim, alpasim_eval 1.36.0 (main, commit 3032e0c, July 2026, wire API 0.54.0)",
+    shrink=0.02,
+    roundness=0.5,
+    hits="last",
+    lane_query="vertices",
+    seam_m=0.0,
+    edge_query="nearest_vertex",
+    alpasim_map=True,
+    missing_road="absent",
+    wrong_lane_rule="any_opposes",
+    wrap_heading=False,
+    float32=True,
+    invented_starts=True,
+    distance_from="log_start",
+    min_ade_rule="by_index",
+    image_camera="camera_front_wide_120fov",
+    image_rule="at_or_after_step",
+    aliases=True,
+    replay_is_scored=True,
+    honour_valid=False,
+    stop_beyond_gt_m=4.0,
+    drop_black=True,
+    stop_at_path_end=False,
+)
+ALPASIM_LATER = replace(
+    ALPASIM,
+    name="alpasim@6f1029c",
+    reproduces="AlpaSim, rules of commit 6f1029c (public challenge, later than July 2026) over alpasim_eval 1.36.0",
+    edge_query="nearest_of_level",
+    progress_of="reachable",
+    corridor=True,
+    drop_black=False,
+)
+
 PRESETS: dict[str, Preset] = {
     "paper": Preset(name="paper", ego_size_m=(4.855, 1.88)),
-    "alpasim": Preset(
-        name="alpasim",
-        reproduces="AlpaSim, alpasim_eval 1.36.0 (commit 3032e0c, wire API 0.54.0)",
-        shrink=0.02,
-        roundness=0.5,
-        hits="last",
-        lane_query="vertices",
-        seam_m=0.0,
-        edge_query="nearest_vertex",
-        alpasim_map=True,
-        missing_road="absent",
-        wrong_lane_rule="any_opposes",
-        wrap_heading=False,
-        float32=True,
-        invented_starts=True,
-        distance_from="log_start",
-        min_ade_rule="by_index",
-        image_camera="camera_front_wide_120fov",
-        image_rule="at_or_after_step",
-        aliases=True,
-        replay_is_scored=True,
-        honour_valid=False,
-        stop_beyond_gt_m=4.0,
-        drop_black=True,
-        stop_at_path_end=False,
-    ),
+    ALPASIM.name: ALPASIM,
+    ALPASIM_LATER.name: ALPASIM_LATER,
     "strict": Preset(name="strict", contact="between_steps", seam_m=0.1, offroad_rule="margin", missing_road="error"),
 }
 

@@ -20,6 +20,8 @@ from evaluators.footprint import Geometries
 from evaluators.presets import Preset
 from evaluators.surface import Surface, segment_distance
 
+LEVEL_RADIUS_M = 30.0  # AlpaSim's later rule looks no further for road edges
+
 
 class Road:
     """Lanes and edges of one map, metres relative to ``origin``."""
@@ -66,8 +68,12 @@ class Road:
         """Return whether footprints ``(T,)`` with box centres ``(T, 3)`` lie nearer than the preset's threshold to the road edge.
 
         ``edge_query`` "any": to any edge at the ego's height. "nearest_vertex": to the edge that owns the vertex nearest to the centre.
+        "nearest_of_level": to the one of `_Polylines.nearest_of_level`.
         """
         limit_m = self._preset.edge_touch_m
+        if self._preset.edge_query == "nearest_of_level":
+            owner = self._edge.nearest_of_level(xyz, self._preset.edge_height_m)
+            return np.asarray((owner >= 0) & (shapely.distance(self.edges[owner], footprints) < limit_m))
         if self._preset.edge_query == "nearest_vertex":
             return np.asarray(shapely.distance(self.edges[self._edge.nearest_vertex_owner(xyz)], footprints) < limit_m)
         return self._edge.touched(footprints, xyz[:, 2], limit_m, self._preset.edge_height_m)
@@ -118,6 +124,24 @@ class _Polylines:
     def nearest_vertex_owner(self, xyz: F64) -> I64:
         """Return the line ``(T,)`` that owns the vertex nearest to each point ``(T, 3)``, in 3-D."""
         return np.asarray(self.vertex_owner[scipy.spatial.cKDTree(self.vertices).query(xyz)[1]])
+
+    def nearest_of_level(self, xyz: F64, height_m: float) -> I64:
+        """Return the nearest line ``(T,)`` at the height of each point ``(T, 3)``, -1 where there is none.
+
+        Each line with a vertex within `LEVEL_RADIUS_M` in 3-D is judged by its vertex nearest in plan view: that one must lie within
+        ``height_m`` of the point's height, and the line whose such vertex is nearest in 3-D is taken.
+        """
+        out = np.full(len(xyz), -1, dtype=np.int64)
+        start = np.concatenate([[0], np.flatnonzero(np.diff(self.vertex_owner)) + 1, [len(self.vertices)]])
+        for i, near in enumerate(self.vertex_within(xyz, LEVEL_RADIUS_M)):
+            best_m = np.inf
+            for line in np.flatnonzero(near):
+                own = self.vertices[start[line] : start[line + 1]]
+                beside = own[np.argmin(np.hypot(*(own[:, :2] - xyz[i, :2]).T))]
+                away_m = float(np.linalg.norm(beside - xyz[i]))
+                if abs(beside[2] - xyz[i, 2]) <= height_m and away_m < best_m:
+                    out[i], best_m = line, away_m
+        return out
 
     def touched(self, footprints: Geometries, z: F64, limit_m: float, height_m: float) -> Bool:
         """Return whether each footprint is nearer than a limit to a segment whose middle is at most ``height_m`` above or below it."""

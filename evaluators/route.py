@@ -92,6 +92,21 @@ def beside(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
     return out
 
 
+def from_corridor(path: F64, s: F64, points: F64, distance_m: F64) -> F64:
+    """Return ``(T,)`` the distance of points from a path that goes straight on at its far end only, along its last segment.
+
+    AlpaSim's later rule; `beside` is ours. Arguments as there.
+    """
+    out = np.array(distance_m)
+    length_m = float(arc_lengths(path)[-1])
+    along = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
+    if length_m > 0 and np.hypot(*along) > 0:
+        beyond = s >= length_m - 1e-9
+        offset = points[beyond] - path[-1]
+        out[beyond] = np.abs(offset[:, 0] * along[1] - offset[:, 1] * along[0]) / np.hypot(*along)
+    return out
+
+
 def progress_so_far(path: F64, points: F64) -> F64:
     """Return ``(T,)`` how far point k has come along the first k + 1 vertices of a path, as a share of their length.
 
@@ -140,6 +155,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
     no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     no_length = "the recorded path has no length"
     outside = "the recording does not cover this time"
+    aside_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
     so_far = progress_so_far(there, ego)
     traveled_m = driven(ego, int(np.argmax(engaged)) if preset.distance_from == "handover" else 0)
@@ -148,7 +164,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
         traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
         share[:2] = [0.0, share[2] / 2] if len(share) > 2 else 0.0
         so_far[:2] = 1.0
-        for column in (distance_m, away_m, traveled_m):
+        for column in (distance_m, away_m, traveled_m, *(() if aside_m is None else (aside_m,))):
             column[:2] = 0.0
     out = [
         series("dist_to_gt_trajectory", t_us, distance_m),
@@ -160,6 +176,12 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
         series("eval_relevant", t_us, engaged),
     ]
     if preset.aliases:
+        if aside_m is not None and preset.stop_beyond_gt_m is not None:
+            out.append(series("lateral_dist_to_gt_trajectory", t_us, aside_m))
+            out.append(series("left_corridor_laterally", t_us, aside_m >= preset.stop_beyond_gt_m))
+        if preset.progress_of == "reachable" and length_m > 0:
+            reached_m = float(to_path(path, there[-1:])[1][0])
+            share = share * (length_m / reached_m if reached_m > 0 else 1.0)
         return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
     aside_m = beside(path, s, ego, distance_m)
     has_side = np.isfinite(aside_m)

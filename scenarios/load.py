@@ -149,7 +149,7 @@ def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenari
 
     check_specification(spec, lambda loc, found, do_this: document.error(DOING, loc, found, do_this))
     built = build(spec, vehicle, fail)
-    start, warmup = spec.timing.start_us, _warmup_us(spec)
+    start, warmup = spec.timing.start_us + spec.timing.start_time_offset_us, _warmup_us(spec)
     cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else (camera_spec(),)
     return Scenario(
         scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
@@ -180,6 +180,7 @@ def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario
     start = first + spec.timing.start_us
     if spec.timing.timeline == "alpasim" and record.first_frame_us is not None:
         start = record.first_frame_us
+    start += spec.timing.start_time_offset_us
     end = last if spec.timing.duration_us is None else start + spec.timing.duration_us
     if end > last:
         raise document.error(
@@ -217,6 +218,9 @@ def _timed(document: Document, spec: ScenarioSpec, scenario: Scenario) -> Scenar
     if spec.timing.timeline == "alpasim" and scenario.warmup_us % scenario.rates.control_us:
         found = f"a control period of {scenario.rates.control_us} us, of which {scenario.warmup_us} us is no multiple"
         raise document.error(DOING, ("timing", "timeline"), found, "choose a rates.control_us that divides AlpaSim's 1.7 s")
+    if spec.timing.start_time_offset_us and spec.timing.timeline != "alpasim":
+        found = f"an offset of {spec.timing.start_time_offset_us} us in the scenario's own time line"
+        raise document.error(DOING, ("timing", "start_time_offset_us"), found, "set timing.start_us, or timing.timeline: alpasim")
     length = clock.n_steps * scenario.rates.control_us
     if scenario.warmup_us >= length:
         raise document.error(

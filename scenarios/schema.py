@@ -109,6 +109,9 @@ class TimingSpec(Part):
         default="scenario",
         description="alpasim: start at the recording's first camera frame, where it has any, and force 1.7 s, whatever the keys above say.",
     )
+    start_time_offset_us: Annotated[int, within(b.TIME_US)] = Field(
+        default=0, description="With timeline alpasim: skipped at the start, as by AlpaSim's field of that name (since wire 0.55)."
+    )
 
 
 class LatencySpec(Part):

@@ -33,7 +33,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.control": set(),
     "policies": set(),
     "alpasim_plugin.alpasim": set(),
-    "alpasim_plugin.alpasim.client": {"alpasim_plugin.alpasim", "alpasim_plugin.log"},
+    "alpasim_plugin.alpasim.client": {
+        "alpasim_plugin.alpasim",
+        "alpasim_plugin.control",  # a remote vehicle checks plans as every controller does
+        "alpasim_plugin.log",
+        "alpasim_plugin.world",  # road users behind a service stand in for the scenario's
+    },
     "alpasim_plugin.alpasim.server": {
         "alpasim_plugin.alpasim",
         "alpasim_plugin.fixers",
@@ -47,6 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.viewer": {"alpasim_plugin.log", "evaluators"},
     "alpasim_plugin.runtime": {
         "alpasim_plugin.alpasim",  # the messages of logs that it exports
+        "alpasim_plugin.alpasim.client",  # road users behind a service
         "alpasim_plugin.fixers",
         "alpasim_plugin.world",
         "alpasim_plugin.renderers",

@@ -91,8 +91,7 @@ def in_front(upstream: Host, settings: Settings) -> Iterator[tuple[Host, Assembl
         yield host, made
     finally:
         host.stop(0.0)
-        if made.channel is not None:
-            made.channel.close()
+        made.close()
 
 
 def ask_all(address: str, wanted: Sequence[Sequence[Request]]) -> tuple[list[list[bytes]], list[float], float]:

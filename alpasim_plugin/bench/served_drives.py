@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import api_version, common_pb2, sensorsim_pb2
 from alpasim_plugin.geometry import quat_from_matrix, se2
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.types import F64, U8
@@ -83,8 +83,7 @@ class PaintedRenderer:
 
     def get_version(self, asked: Any, context: Any) -> common_pb2.VersionId:
         """Return a triple."""
-        api = common_pb2.VersionId.APIVersion(major=0, minor=54, patch=0)
-        return common_pb2.VersionId(version_id="stand-in", git_hash="abc", grpc_api_version=api)
+        return common_pb2.VersionId(version_id="stand-in", git_hash="abc", grpc_api_version=api_version())
 
     def get_available_scenes(self, asked: Any, context: Any) -> common_pb2.AvailableScenesReturn:
         """Know every scene."""

@@ -67,6 +67,9 @@ def run(
     controller: Annotated[
         str | None, typer.Option("--controller", help="Controller that tracks the plans; by default the policy's.")
     ] = None,
+    traffic: Annotated[
+        str | None, typer.Option("--traffic", metavar="HOST:PORT", help="AlpaSim's traffic service moves the other road users.")
+    ] = None,
     evaluators: Annotated[
         list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
     ] = None,
@@ -104,7 +107,7 @@ def run(
     if timeline != "scenario":
         of_scene = (*of_scene, f"timing.timeline={timeline}")
     refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
-    options = RunOptions(preset, images, video, device, baseline, of_fixer, controller, tuple(evaluators or ()))
+    options = RunOptions(preset, images, video, device, baseline, of_fixer, controller, tuple(evaluators or ()), traffic)
     plan = make_plan(refs, names, drivers, parse_seeds(seeds), options)
     root = out or default_folder(plan)
     if dry_run:

@@ -19,6 +19,7 @@ from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
 from evaluators import preset as find_preset
 from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
+from evaluators.presets import Preset
 from evaluators.report import render_table
 
 EPILOG = """
@@ -59,9 +60,9 @@ def score(
     """
     del debug  # read from the command line by cli.main, before any option is parsed
     chosen = find_preset(preset)
-    own = _settings(preset, settings)
+    own = _settings(chosen, settings)
     if own is not None:
-        chosen = own.preset()
+        chosen = own.preset(chosen)
     found = find_logs(logs)
     done = 0
 
@@ -87,13 +88,13 @@ def score(
     raise typer.Exit(result.exit_code)
 
 
-def _settings(preset: str, path: Path | None) -> EvalSettings | None:
+def _settings(preset: Preset, path: Path | None) -> EvalSettings | None:
     """Return AlpaSim's settings where its preset is meant; its defaults where no file is given."""
-    if preset == "alpasim":
+    if preset.reproduces is not None:
         return EvalSettings() if path is None else load_settings(path)
     if path is not None:
         raise InputError(
-            "reading evaluation settings", f"--settings {path}", f"--preset {preset}", "add --preset alpasim: the file is AlpaSim's"
+            "reading evaluation settings", f"--settings {path}", f"--preset {preset.name}", "add --preset alpasim: the file is AlpaSim's"
         )
     return None
 

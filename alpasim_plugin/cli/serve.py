@@ -95,6 +95,8 @@ def serve(
         host.wait()
     except Stopped:
         host.stop(drain_s)
+    finally:
+        made.close()
     counts = vars(made.tree.counts) | {"events": dict(made.service.frames.events), "failed": dict(made.service.statuses)}
     print(json.dumps(counts) if as_json else ", ".join(f"{key} {value}" for key, value in counts.items()), flush=True)
 

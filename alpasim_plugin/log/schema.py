@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
 from alpasim_plugin.log.images import ImageEncoding
@@ -237,6 +237,30 @@ def wire_image(session_uuid: str, camera: str, start_us: int, end_us: int, data:
     """Return the message of one encoded frame; ``end_us`` is its time stamp."""
     image = egodriver_pb2.RolloutCameraImage.CameraImage(frame_start_us=start_us, frame_end_us=end_us, image_bytes=data, logical_id=camera)
     return egodriver_pb2.RolloutCameraImage(session_uuid=session_uuid, camera_image=image)
+
+
+def wire_traffic_session(header: RolloutHeader) -> traffic_pb2.TrafficSessionRequest:
+    """Return the message that opens a session of road users: the ego first, then every track, and when the service takes over."""
+    xyz, quat = rigid_product(header.ego_log.xyz, header.ego_log.quat, header.T_rig_box)
+    ego = wire_trajectory(Trajectory(header.ego_log.t_us, xyz, quat), "the recorded ego")
+    objects = [traffic_pb2.ObjectTrajectory(aabb=wire_box(header.vehicle.box), trajectory=ego, object_id=EGO, is_static=False)]
+    objects += [
+        traffic_pb2.ObjectTrajectory(
+            aabb=wire_box(a.box),
+            trajectory=wire_trajectory(a.track, f"track of actor {a.actor_id!r}"),
+            object_id=a.actor_id,
+            is_static=a.is_static,
+            label_class=a.label,
+        )
+        for a in header.actors
+    ]
+    return traffic_pb2.TrafficSessionRequest(
+        session_uuid=header.session_uuid,
+        scene_id=header.scene_id,
+        random_seed=header.seed,
+        logged_object_trajectories=objects,
+        handover_time_us=header.render_start_us + header.force_gt_us,
+    )
 
 
 # --- from the wire --------------------------------------------------------------------------------------------------

@@ -11,14 +11,13 @@ import numpy as np
 
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.asl import AslFile
-from alpasim_plugin.alpasim.wire import common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2, traffic_pb2
+from alpasim_plugin.alpasim.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import interpolate, inverse, quat_from_matrix, se3, trajectory_from_poses
 from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.schema import (
     EGO,
     RolloutHeader,
-    rigid_product,
     wire_box,
     wire_camera,
     wire_dynamics,
@@ -26,11 +25,11 @@ from alpasim_plugin.log.schema import (
     wire_pose,
     wire_poses,
     wire_render_request,
+    wire_traffic_session,
     wire_trajectory,
 )
 from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
 
-WIRE_API = (0, 54, 0)  # AlpaSim's API version whose messages these are
 _SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "controller", "video_model")
 
 
@@ -93,7 +92,7 @@ class AslWriter:
                 rollout_spec=request.RolloutSpec(vehicle=vehicle),
             )
         )
-        self._write(traffic_session_request=self._traffic_session())
+        self._write(traffic_session_request=wire_traffic_session(header))
         first_us = int(header.ego_log.t_us[0])
         if first_us < header.render_start_us:
             present = self._recorded(first_us) if context is None else context
@@ -259,36 +258,8 @@ class AslWriter:
 
     def _version(self, service: str) -> common_pb2.VersionId:
         given = self.header.versions.get(service, __version__ if service == "runtime" else "<skip>")
-        major, minor, patch = WIRE_API
-        api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
-        return common_pb2.VersionId(version_id=given, git_hash="<skip>" if given == "<skip>" else "", grpc_api_version=api)
-
-    def _traffic_session(self) -> traffic_pb2.TrafficSessionRequest:
-        header = self.header
-        xyz, quat = rigid_product(header.ego_log.xyz, header.ego_log.quat, self._T_rig_box)
-        ego = Trajectory(header.ego_log.t_us, xyz, quat)
-        objects = [
-            traffic_pb2.ObjectTrajectory(
-                aabb=wire_box(header.vehicle.box), trajectory=wire_trajectory(ego, "the recorded ego"), object_id=EGO, is_static=False
-            )
-        ]
-        objects += [
-            traffic_pb2.ObjectTrajectory(
-                aabb=wire_box(a.box),
-                trajectory=wire_trajectory(a.track, f"track of actor {a.actor_id!r}"),
-                object_id=a.actor_id,
-                is_static=a.is_static,
-                label_class=a.label,
-            )
-            for a in header.actors
-        ]
-        return traffic_pb2.TrafficSessionRequest(
-            session_uuid=self._uuid,
-            scene_id=header.scene_id,
-            random_seed=header.seed,
-            logged_object_trajectories=objects,
-            handover_time_us=header.render_start_us + header.force_gt_us,
-        )
+        git_hash = "<skip>" if given == "<skip>" else ""
+        return common_pb2.VersionId(version_id=given, git_hash=git_hash, grpc_api_version=api_version())
 
     def _recorded(self, t_us: int) -> dict[str, F64]:
         """Return ``T_world_box`` of the actors whose tracks have a pose exactly at an instant or around it."""

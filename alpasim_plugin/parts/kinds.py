@@ -34,7 +34,7 @@ KINDS: dict[str, Kind] = {
         Kind("renderer", "simrun.renderers", interfaces.Renderer, ("scenario", *SESSION, "address")),
         Kind("fixer", "simrun.fixers", interfaces.Fixer, ("settings", "scene_id", *SESSION)),
         Kind("policy", "simrun.policies", interfaces.Policy, ("scenario", "address")),
-        Kind("controller", "simrun.controllers", interfaces.Controller, ("vehicle",)),
+        Kind("controller", "simrun.controllers", interfaces.Controller, ("vehicle", "address", "scene_id")),
         Kind("evaluator", "simrun.evaluators", interfaces.Evaluator, ("preset",)),
         Kind("source", "simrun.sources", interfaces.Source, ()),
     )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 
@@ -30,6 +30,9 @@ from alpasim_plugin.types import Policy, Renderer, Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
+if TYPE_CHECKING:
+    from alpasim_plugin.alpasim.client.traffic import RemoteActors
+
 
 @dataclass(frozen=True)
 class RolloutParts:
@@ -39,6 +42,7 @@ class RolloutParts:
         session: Identifies the rollout in its log; equal rollouts have equal ids.
         names: Name of each service, for the log's header.
         controller: Moves the ego.
+        actors: Road users behind a service; None: the scenario's own.
     """
 
     renderer: Renderer
@@ -46,6 +50,14 @@ class RolloutParts:
     session: str
     names: Mapping[str, str]
     controller: Controller
+    actors: RemoteActors | None = None
+
+
+def remote_actors(scenario: Scenario, address: str, seed: int) -> RemoteActors:
+    """Connect a rollout's road users to a traffic service."""
+    from alpasim_plugin.alpasim.client.traffic import RemoteActors  # gRPC is loaded where a service is called
+
+    return RemoteActors(scenario, address, seed)
 
 
 PartsBuilder = Callable[[Cell, RunOptions, Scenario, int], RolloutParts]
@@ -59,7 +71,8 @@ def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: in
         build(cell.policy, scenario=scenario),
         cell.rollout_key,
         {"sensorsim": name if fixer is None else f"{name} ({fixer.label})", "egodriver": cell.policy.name},
-        build(cell.controller, vehicle=scenario.vehicle),
+        build(cell.controller, vehicle=scenario.vehicle, scene_id=scenario.scene_id),
+        remote_actors(scenario, options.traffic, cell.seed) if options.traffic else None,
     )
 
 
@@ -88,9 +101,18 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         with parts_print_to_stderr(folder / OUTPUT_NAME):
             parts = builder(cell, options, scenario, threads)
             recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
-            with recorder, _closing(complete(parts.policy, Policy)):
-                run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller)
-        manifest |= recorder.facts() | {"fixer": dict(complete(parts.renderer, Renderer).facts())}
+            held: list[Policy | Controller | RemoteActors] = [
+                complete(parts.policy, Policy),
+                complete(parts.controller, Controller),
+                *([parts.actors] if parts.actors else []),
+            ]
+            with recorder, ExitStack() as stack:
+                for part in held:
+                    stack.enter_context(_closing(part))
+                run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller, parts.actors)
+        rendered = dict(complete(parts.renderer, Renderer).facts())
+        manifest |= recorder.facts() | {"fixer": rendered if cell.renderer.fixer is not None else {}}
+        manifest |= {"renderer_facts": rendered} if rendered and cell.renderer.fixer is None else {}
         own = dict(complete(parts.policy, Policy).facts())
         manifest |= {"policy_facts": own} if own else {}
         manifest |= _score(folder, cell, options, scenario)
@@ -166,15 +188,15 @@ def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) ->
 
 
 @contextmanager
-def _closing(policy: Policy) -> Iterator[None]:
-    """Close a policy after its rollout."""
+def _closing(part: Policy | Controller | RemoteActors) -> Iterator[None]:
+    """Close a part after its rollout."""
     try:
         yield
     except BaseException:
         with suppress(SimrunError):  # what failed first is the rollout's failure; a service that is gone cannot be closed either
-            policy.close()
+            part.close()
         raise
-    policy.close()
+    part.close()
 
 
 @lru_cache(maxsize=4)

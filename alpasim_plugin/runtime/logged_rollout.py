@@ -49,8 +49,11 @@ class LoggedRollout:
             doing: The attempted action, for the error.
 
         Raises:
-            InputError: Its latency is measured.
+            InputError: Its latency is measured, or a service moved its road users.
         """
+        if self.options.traffic is not None:
+            found = f"the traffic service {self.options.traffic} moved its road users: nothing here can move them so again"
+            raise InputError(doing, self.name, found, "run it without --traffic")
         if self.scenario.latency.kind == "measured":
             found = "its latency is measured: the delay of its plans depended on the machine"
             raise InputError(doing, self.name, found, "run it with --set latency.kind=fixed")

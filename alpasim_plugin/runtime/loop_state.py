@@ -96,5 +96,7 @@ def advance_ego(scenario: Scenario, controller: Controller, ego: EgoState, plan:
     if to_us <= scenario.start_us + scenario.warmup_us:
         return ego_state_from_log(scenario.ego_log, to_us, scenario.vehicle), True
     moved = controller.advance(ego, plan, to_us)
+    if controller.grounds:
+        return moved, False
     x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
     return replace(moved, T_world_rig=ground_pose(scenario.ground, x, y, yaw_of(moved.T_world_rig))), False

@@ -34,6 +34,7 @@ class RunOptions:
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
     controller: str | None = None  # None: each policy's own
     evaluators: tuple[str, ...] = ()  # package.module:Class of evaluators in addition to the registered ones
+    traffic: str | None = None  # HOST:PORT of a traffic service; None: the scenario's own road users
 
 
 @dataclass(frozen=True)
@@ -177,12 +178,14 @@ def _cell(
     evaluators: tuple[PartSpec, ...],
     options: RunOptions,
 ) -> Cell:
-    content = {
+    content: dict[str, str | None] = {
         f"renderer {renderer.name}": renderer.digest,
         f"policy {policy.name}": policy.digest,
         f"controller {controller.name}": controller.digest,
         f"source of {scenario.scene_id}": code_digest_of(scenario),
     }
+    if options.traffic is not None:
+        content[f"traffic service {options.traffic}"] = None
     loop = own_code_digest("alpasim_plugin.runtime.rollout")
     rollout_key = digest([loop, scenario.content_hash, content, seed, options.images, options.device])
     undigested = tuple(what for what, known in content.items() if known is None)

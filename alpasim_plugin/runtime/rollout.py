@@ -17,7 +17,7 @@ from alpasim_plugin.runtime.loop_state import LoopState
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.types import F64, Controller, Observation, Plan, Policy, Renderer, Scenario, SensorSpec
-from alpasim_plugin.world.actors import make_actors
+from alpasim_plugin.world.actors import Actors, make_actors
 
 
 def run_rollout(
@@ -27,6 +27,7 @@ def run_rollout(
     seed: int = 0,
     recorder: Recorder | None = None,
     controller: Controller | None = None,
+    actors: Actors | None = None,
 ) -> Recorder:
     """Drive one scenario once and return its recorder.
 
@@ -40,6 +41,7 @@ def run_rollout(
         seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.seeding`.
         recorder: Records the rollout; by default into a temporary folder.
         controller: Vehicle model; by default the policy's, else the bicycle with a tracker.
+        actors: Road users at their beginning; by default those of the scenario.
 
     Raises:
         PolicyError: The policy raised or broke its contract.
@@ -47,8 +49,8 @@ def run_rollout(
     """
     recorder = recorder or Recorder(scenario, seed)
     policy = complete(policy, Policy)
-    controller = controller or make_controller(policy.controller, scenario.vehicle)
-    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder)
+    controller = complete(controller or make_controller(policy.controller, scenario.vehicle), Controller)
+    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder, actors)
     reset_policy(policy, seed, scenario.route)
     driving = loop.drive()
     try:
@@ -71,6 +73,7 @@ class Loop:
         sensors: Cameras to render.
         controller: Vehicle model.
         recorder: Records the rollout. Whoever drives calls its ``finish``.
+        actors: Road users at their beginning; by default those of the scenario.
 
     Attributes:
         state: The ego and the newest frames.
@@ -79,17 +82,23 @@ class Loop:
     """
 
     def __init__(
-        self, scenario: Scenario, renderer: Renderer, sensors: Sequence[SensorSpec], controller: Controller, recorder: Recorder
+        self,
+        scenario: Scenario,
+        renderer: Renderer,
+        sensors: Sequence[SensorSpec],
+        controller: Controller,
+        recorder: Recorder,
+        actors: Actors | None = None,
     ) -> None:
         self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
         self._renderer, self._controller, self._recorder = complete(renderer, Renderer), controller, recorder
-        self._world = make_actors(scenario)
+        self._world = actors or make_actors(scenario)
         self._plans = PlanQueue(scenario.latency)
         self.state = LoopState.at_start(scenario, clock.n_steps)
         self.actors: Mapping[str, F64] = {}
         self._watched = () if sensors else recorder.watch(scenario)  # what a policy without cameras does can be seen all the same
         self._cadence = make_cadence(clock, scenario, sensors, self._renderer.block)
-        self.path_end = PathEnd(scenario)
+        self.path_end = PathEnd(scenario.ego_log, scenario.stop_at_path_end)
         forecaster = Forecaster(scenario, controller, self._plans, self._world, self.state)
         self._rig = CameraRig(scenario, sensors or self._watched, clock, self._cadence, forecaster, self._renderer.lookahead)
 
@@ -115,7 +124,7 @@ class Loop:
                 if frame.camera in seen:
                     state.frames[frame.camera] = frame
                 recorder.frame(frame, request)
-            if self.path_end.ends_rollout(state.ego) or tick.is_last:
+            if self.path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
                 return
             if self._cadence.queries_at(tick.t_us):
                 observation = state.observe(seen)

@@ -11,11 +11,13 @@ from typing import Any
 
 from alpasim_plugin.config import load_yaml
 from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
+from alpasim_plugin.geometry import inverse, offset_trajectory
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.runtime.contents import RUN_INFO
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.manifests import MANIFEST, STEPS_NAME, read_manifest
+from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.scoring import contacts_of, tabulate
@@ -164,7 +166,7 @@ def check_complete(log: Path, rollout: RolloutLog) -> None:
     """Refuse the log of a rollout that did not finish.
 
     A finished rollout has the number of control steps in its header after the first policy time, or covers the recording. A rollout that
-    the driver terminated is finished.
+    the driver terminated is finished, and one whose last pose is the first beyond the end of the recorded path: ours end there.
 
     Raises:
         InfrastructureError: The log ends earlier.
@@ -174,12 +176,19 @@ def check_complete(log: Path, rollout: RolloutLog) -> None:
     recorded = (int(rollout.ego_log.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
     steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
     done = _steps(rollout)
-    if done < steps:
+    if done < steps and not _ends_with_the_path(rollout):
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
         raise InfrastructureError(
             "scoring a log", str(log), f"the rollout ended after {done} of {steps} control steps{cut}",
             "run this rollout again",
         )  # fmt: skip
+
+
+def _ends_with_the_path(rollout: RolloutLog) -> bool:
+    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    end = PathEnd(rollout.ego_log)
+    passed = [end.ends_rollout(at) for at in rig.xyz[1:, :2]]
+    return passed[-1] and not any(passed[:-1])
 
 
 def _steps(rollout: RolloutLog) -> int:

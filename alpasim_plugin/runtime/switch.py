@@ -94,10 +94,17 @@ class SwitchedPolicy(Policy):
 
 
 class SwitchedController(Controller):
-    """Drive with ``first`` before ``at_us`` and with ``then`` from it on. Controllers have no state."""
+    """Drive with ``first`` before ``at_us`` and with ``then`` from it on; the first call of ``then`` gives it the state to begin with."""
 
     def __init__(self, first: Controller, then: Controller, at_us: int) -> None:
         self.first, self.then, self.at_us = first, then, at_us
+        self.grounds = first.grounds and then.grounds
+
+    def close(self) -> None:
+        """Close both."""
+        self.first.close()
+        if self.then is not self.first:
+            self.then.close()
 
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
         """Return the state at ``to_us``."""

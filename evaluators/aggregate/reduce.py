@@ -114,8 +114,8 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = "paper
         line = table["eval_relevant"].t_us
         scored = line[(line >= first_us) & (line <= last_us)]
         values["duration_frac_20s"] = _value("duration_frac_20s", float(scored[-1] - scored[0]) / 20e6)
-    if chosen.aliases and "progress" in values:
-        values["progress_clipped_rel"] = values["progress"]
+    if "progress_rel_to_total" in values:
+        values["progress_clipped_rel"] = values["progress_rel_to_total"]
     return Reduction(values, ledger, () if ledger.dropped else _events(table, first_us, last_us))
 
 

@@ -18,6 +18,7 @@ SCORE_METRICS = (
     "progress_clipped_rel", "progress_rel", "progress_score", "collision_at_fault", "offroad", "dist_to_gt_trajectory",
     "gt_dist_traveled_m",
 )  # fmt: skip
+LATER_SCORE_METRICS = (*SCORE_METRICS, "lateral_dist_to_gt_trajectory", "left_corridor_laterally")
 
 
 def combined_run_uuid(rollouts: Sequence[ScoredRollout]) -> str:
@@ -70,9 +71,13 @@ def results_summary(
         settings: Of the scene score.
     """
     run_uuid = combined_run_uuid([one.of for one in rollouts])
+    later = any("left_corridor_laterally" in one.values for one in rollouts)
+    shown = LATER_SCORE_METRICS if later else SCORE_METRICS
     counted = [(i, one) for i, one in enumerate(rollouts) if not one.dropped]
-    entries = [_entry(one, scores.get(i), run_uuid) for i, one in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))]
-    entries += [_failed_entry(one, settings.enabled) for one in failed]
+    entries = [
+        _entry(one, scores.get(i), run_uuid, shown) for i, one in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
+    ]
+    entries += [_failed_entry(one, settings.enabled, shown) for one in failed]
     name = rollouts[0].of.run_name if rollouts else None
     saturation, least = settings.progress_saturation_threshold, settings.min_gt_distance_for_full_score_m
     overall: dict[str, Any] = {key: _number(value) for key, value in sweeps.items()}
@@ -89,10 +94,12 @@ def results_summary(
             "progress_score": f"min(clamp(progress_clipped_rel, 0, 1) / {saturation}, 1.0)",
             "short_gt_distance_override": f"progress_score = 1.0 when gt_dist_traveled_m < {least}",
         }
+        if later:
+            out["score_criteria"]["left_corridor_laterally"] = "== 0"
     return out
 
 
-def _entry(one: ReducedRollout, score: SceneScore | None, run_uuid: str) -> dict[str, Any]:
+def _entry(one: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]) -> dict[str, Any]:
     ids = {"run_uuid": run_uuid, "run_name": one.of.run_name, "clipgt_id": one.of.scene, "rollout_id": one.of.rollout}
     values = {name: _number(value) for name, value in one.values.items()}
     status = "unscored" if score is None else "pass" if score.passed else "fail"
@@ -102,17 +109,17 @@ def _entry(one: ReducedRollout, score: SceneScore | None, run_uuid: str) -> dict
         "passed": None if score is None else score.passed,
         "score": None if score is None else score.score,
         "failure_reason": None if score is None else score.failure_reason,
-        "score_metrics": None if score is None else {name: (values | own).get(name) for name in SCORE_METRICS},
+        "score_metrics": None if score is None else {name: (values | own).get(name) for name in shown},
         "metrics": values | ids,
     }
 
 
-def _failed_entry(failure: Mapping[str, Any], scored: bool) -> dict[str, Any]:
+def _failed_entry(failure: Mapping[str, Any], scored: bool, shown: Sequence[str]) -> dict[str, Any]:
     ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
     entry = ids | {"status": "fail", "passed": False, "failure_reason": failure.get("error")}
     entry["metrics"] = ids | {"error": failure.get("error")}
     if scored:
-        entry |= {"score": 0.0, "score_metrics": {name: 0.0 if name == "progress_score" else None for name in SCORE_METRICS}}
+        entry |= {"score": 0.0, "score_metrics": {name: 0.0 if name == "progress_score" else None for name in shown}}
     return entry
 
 

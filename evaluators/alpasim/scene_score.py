@@ -10,7 +10,8 @@ import numpy as np
 from alpasim_plugin.errors import EvaluatorError
 from evaluators.alpasim.settings import SceneScoreSettings
 
-NEEDED = ("progress_clipped_rel", "gt_dist_traveled_m", "collision_at_fault", "offroad")
+FAULTS = ("collision_at_fault", "offroad")
+LATER_FAULTS = (*FAULTS, "left_corridor_laterally")  # from commit 6f1029c on
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class SceneScore:
 
     score: float  # 0..1
     progress_score: float  # 0..1, what the score would be without a fault
-    failure_reason: str | None  # collision_at_fault | offroad
+    failure_reason: str | None  # the first of the faults
 
     @property
     def passed(self) -> bool:
@@ -38,17 +39,19 @@ def scene_score(values: Mapping[str, float | None], settings: SceneScoreSettings
         EvaluatorError: A metric that is needed is missing or not finite; AlpaSim stops there too.
     """
     found: dict[str, float] = {}
-    for name in NEEDED:
+    faults = LATER_FAULTS if LATER_FAULTS[-1] in values else FAULTS  # only a preset that has the rule has the metric
+    needed = ("progress_clipped_rel", "gt_dist_traveled_m", *faults)
+    for name in needed:
         value = values.get(name)
         if name not in values or value is None or not np.isfinite(value):
             what = f"missing metric {name!r}" if name not in values else f"metric {name!r} is {value}"
             raise EvaluatorError(
-                "computing the scene score", f"metrics {', '.join(NEEDED)}", what,
+                "computing the scene score", f"metrics {', '.join(needed)}", what,
                 "give the scene a map with road edges, or set scene_score.enabled: false in --settings",
             )  # fmt: skip
         found[name] = float(value)
     progress = min(min(max(found["progress_clipped_rel"], 0.0), 1.0) / settings.progress_saturation_threshold, 1.0)
     if found["gt_dist_traveled_m"] < settings.min_gt_distance_for_full_score_m:
         progress = 1.0
-    reason = next((name for name in ("collision_at_fault", "offroad") if found[name] != 0.0), None)
+    reason = next((name for name in faults if found[name] != 0.0), None)
     return SceneScore(0.0 if reason else progress, progress, reason)

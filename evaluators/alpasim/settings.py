@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.config import load_yaml, validate
-from evaluators.presets import PRESETS, Preset
+from evaluators.presets import ALPASIM, Preset
 
 DOING = "reading evaluation settings"
 
@@ -93,11 +93,11 @@ class EvalSettings(_Part):
     vec_map: dict[str, Any] = {}
     video: dict[str, Any] = {}
 
-    def preset(self) -> Preset:
-        """Return preset ``alpasim`` with these settings."""
+    def preset(self, version: Preset = ALPASIM) -> Preset:
+        """Return the preset of a version of AlpaSim with these settings."""
         one = self.scorers
         return replace(
-            PRESETS["alpasim"],
+            version,
             shrink=self.vehicle.vehicle_shrink_factor,
             roundness=self.vehicle.vehicle_corner_roundness,
             stop_beyond_gt_m=self.aggregation_modifiers.max_dist_to_gt_trajectory,

@@ -50,7 +50,7 @@ def in_front_of(upstream: Host, security: Security = Security(), **settings: Any
     made = assemble(Settings(upstream=Upstream(upstream.address), threads=1, **settings))
     with hosted({"SensorsimService": made.service}, security=security) as host, channel_to(host) as channel:
         yield Stub(channel, "SensorsimService"), made
-    made.channel.close()
+    made.close()
 
 
 def holes(folder: Path) -> Path:

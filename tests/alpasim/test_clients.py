@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Iterator
 from concurrent import futures
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -14,11 +15,10 @@ import pytest
 import yaml
 
 from alpasim_plugin.alpasim.client.channel import Address
-from alpasim_plugin.alpasim.client.driver import FRONT_WIDE
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.alpasim.wire import SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
 from alpasim_plugin.alpasim.wire.services import Stub, handlers
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.errors import InfrastructureError, InputError, PolicyError, RendererError
@@ -117,6 +117,18 @@ def test_renderer_and_driver_over_sockets_at_once(
         difference = np.abs(decode_image(one.data).astype(int) - decode_image(other.data).astype(int))
         assert difference.mean() < 0.05
         assert np.percentile(difference, 99.9) <= 2
+
+
+def test_a_run_behind_a_renderer_service_says_which_one(scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = assemble(Settings(renderer="clean", scenes=(scene,)))
+    with Host({"SensorsimService": made.service}, "127.0.0.1:0") as host:
+        given = ["--renderer", f"nre://{host.address}", "--policy", "lane-camera", "--out", str(tmp_path / "a"), "--workers", "1"]
+        assert run_command([*given, "--no-report", "--certify", "none", "--set", "timing.duration_us=700000", scene]) == 0
+    (path,) = (tmp_path / "a").rglob("manifest.json")
+    manifest = json.loads(path.read_text())
+    assert manifest["renderer_facts"]["service"].startswith("simrun-")
+    assert not manifest["fixer"]
+    assert "no digest" in capsys.readouterr().out
 
 
 class Scripted:

@@ -165,11 +165,11 @@ def test_a_command_that_hangs_is_ended_and_said_so(folder: Path) -> None:
     ],
 )
 def test_a_command_that_never_serves_is_told_apart(folder: Path, code: str, found: str) -> None:
-    before = set(Path(tempfile.gettempdir()).glob("simrun-*"))
+    before = set(Path(tempfile.gettempdir()).glob("simrun-policy-*"))
     with pytest.raises(PolicyError, match=found):
         made(python("-S", "-c", code).replace("exec:", "exec:?ready_s=1 "))
     assert children._running == []
-    assert set(Path(tempfile.gettempdir()).glob("simrun-*")) <= before
+    assert set(Path(tempfile.gettempdir()).glob("simrun-policy-*")) <= before
 
 
 @pytest.mark.slow

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, assemble
-from alpasim_plugin.alpasim.server.scenes import FRONT_WIDE
 from alpasim_plugin.alpasim.server.views import read_view
-from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
+from alpasim_plugin.alpasim.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
 from alpasim_plugin.alpasim.wire.services import Stub
 from alpasim_plugin.geometry import interpolate
 from alpasim_plugin.log.images import decode_image

@@ -193,7 +193,7 @@ def test_running_calls_finish_while_the_server_stops(upstream: Host, renderer: S
         assert running.result(timeout=30).image_bytes
         ending.join(30)
         assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
-    made.channel.close()
+    made.close()
 
 
 def test_only_callers_with_the_token_are_served_but_health_is_open(upstream: Host) -> None:
@@ -219,7 +219,7 @@ def test_tls_with_an_upstream_behind_tls_and_a_token(renderer: StandInRenderer, 
                 assert len(answers(Stub(channel, "SensorsimService"), drive(1))) == 1
             with grpc.secure_channel(host.address, grpc.ssl_channel_credentials(trusted)) as channel:  # shows no certificate
                 assert failure(lambda: Stub(channel, "SensorsimService").get_version(EMPTY, timeout=5))[0] == Code.UNAVAILABLE
-        service.channel.close()
+        service.close()
     with pytest.raises(InputError, match="one of certificate and key"):
         Security(cert).credentials()
     with pytest.raises(InputError, match="a token over plain text"):

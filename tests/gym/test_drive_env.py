@@ -44,7 +44,7 @@ def finish(env: DriveEnv, action: Any = STRAIGHT_ON) -> tuple[float, bool, bool,
     raise AssertionError("the episode does not end")
 
 
-@pytest.mark.parametrize(("name", "camera"), [(doors.DRIVE, "front"), (doors.PLAN, "")])
+@pytest.mark.parametrize(("name", "camera"), [pytest.param(doors.DRIVE, "front", marks=pytest.mark.slow), (doors.PLAN, "")])
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_gymnasiums_own_check_finds_nothing(name: str, camera: str) -> None:
     env = gymnasium.make(name, overrides=(SMALL, *SHORT), camera=camera, render_mode="rgb_array" if camera else None)
@@ -122,6 +122,7 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
     env.close()
 
 
+@pytest.mark.slow
 def test_a_contact_ends_the_episode() -> None:
     env = DriveEnv("smoke/lead_car", camera="", overrides=(STRAIGHT,), reward=doors.Reward(collision=7.0))
     env.reset(seed=0)

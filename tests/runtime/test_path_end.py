@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.geometry import quat_from_yaw
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.types import EgoState, Observation, Plan, Route, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.runtime.score_logs import check_complete
+from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 from tests.runtime.grey_renderer import GREY, Grey
@@ -60,6 +62,19 @@ def test_a_rollout_ends_where_a_moving_recording_ends(straight_road: Scenario) -
     assert rollout.facts()["passed_path_end"]
 
 
+def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later(straight_road: Scenario) -> None:
+    log = run_rollout(shortened(straight_road, 25.0, stands=False), Grey(), Fast(), 0).log()
+    check_complete(Path("rollout.asl"), log)
+    ego = log.ego
+    shorter = Trajectory(ego.t_us[:-1], ego.xyz[:-1], ego.quat[:-1])
+    later = Trajectory(
+        np.append(ego.t_us, ego.t_us[-1] + 100_000), np.vstack([ego.xyz, ego.xyz[-1] + [1, 0, 0]]), ego.quat[[*range(len(ego)), -1]]
+    )
+    for other in (shorter, later):
+        with pytest.raises(InfrastructureError, match="control steps"):
+            check_complete(Path("rollout.asl"), replace(log, ego=other))
+
+
 def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(straight_road: Scenario) -> None:
     assert last_us(shortened(straight_road, 20.0, stands=True)) == straight_road.end_us
     assert last_us(replace(shortened(straight_road, 25.0, stands=False), stop_at_path_end=False)) == straight_road.end_us
@@ -69,12 +84,9 @@ def test_a_path_that_comes_back_beside_its_own_end_has_not_been_passed(straight_
     angle = np.linspace(0.0, 2 * np.pi - 0.3, 301)
     xyz = np.stack([30 * np.sin(angle), 30 - 30 * np.cos(angle), 0 * angle], axis=1)
     log = Trajectory(np.linspace(0, 3_000_000, 301).astype(np.int64), xyz, quat_from_yaw(angle))
-    end = PathEnd(replace(straight_road, ego_log=log))
-    pose = np.eye(4)
-    pose[:3, 3] = [2.0, 0.1, 0.0]  # on the first metres, ahead of the last ones
-    assert not end.ends_rollout(EgoState(0, pose, 5.0))
-    pose[:3, 3] = xyz[-1] + 3.0 * (xyz[-1] - xyz[-2])
-    assert end.ends_rollout(EgoState(0, pose, 5.0))
+    end = PathEnd(log)
+    assert not end.ends_rollout(np.array([2.0, 0.1]))  # on the first metres, ahead of the last ones
+    assert end.ends_rollout((xyz[-1] + 3.0 * (xyz[-1] - xyz[-2]))[:2])
 
 
 def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import zipfile
 from dataclasses import replace
@@ -22,6 +23,7 @@ from scenarios.usdz import read_usdz
 from scenarios.usdz_calibration import pixel_to_angle
 from scenarios.usdz_tables import table_ids
 from scenarios.usdz_write import alpasim_cameras, write_usdz
+from scenarios.vertices import with_vertices
 
 TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
 
@@ -167,3 +169,28 @@ def test_a_scene_that_alpasim_cannot_drive_is_refused(straight: Scenario, tmp_pa
 
 def test_names_with_hyphens_stay_apart() -> None:
     assert table_ids(["a-1", "a~1"]) == {"a-1": "lane0", "a~1": "lane1"}
+
+
+def test_vertices_are_put_in_and_rounded_as_alpasims_loader_does():
+    line = np.random.default_rng(3).uniform(-40, 40, (60, 3))
+    line[6], line[7] = [1.0, 2.0, 3.0], [1.0, 4.0, 3.0]  # exactly 2 m: split as well
+    line[9] = line[8] + [1e-3, 0.0, 0.0]  # shorter: left alone
+    want = [line[0]]
+    for a, b in itertools.pairwise(line):
+        inner = int(np.linalg.norm(b - a) // 2.0)
+        want += [a + (b - a) / (inner + 1) * k for k in range(1, inner + 1)] + [b]
+    np.testing.assert_array_equal(with_vertices(line), want)  # to the bit: it decides whether a union of lanes has cracks
+
+
+def test_the_time_line_of_alpasim_starts_at_the_first_frame_and_an_offset_later(straight: Scenario, tmp_path: Path):
+    path = tmp_path / "scene.usdz"
+    write_usdz(path, straight)
+    alpasim = ["timing.timeline=alpasim"]
+    plain = load_scenario(path, overrides=alpasim)
+    assert (plain.start_us, plain.warmup_us) == (straight.start_us, 1_700_000)
+    later = load_scenario(path, overrides=[*alpasim, "timing.start_time_offset_us=1500000"])
+    assert (later.start_us - plain.start_us, later.end_us) == (1_500_000, plain.end_us)
+    built = [load_scenario("smoke/straight", overrides=[*alpasim, f"timing.start_time_offset_us={us}"]) for us in (0, 700_000)]
+    assert built[1].start_us - built[0].start_us == 700_000
+    with pytest.raises(InputError, match="timeline: alpasim"):
+        load_scenario("smoke/straight", overrides=["timing.start_time_offset_us=700000"])

@@ -45,8 +45,8 @@ class Address:
         unknown = sorted(set(options) - set(known))
         if not host or not port.isdigit() or unknown:
             found = f"no option {unknown[0]!r}" if unknown else "no HOST:PORT"
-            shown = "&".join(f"{name}=..." for name in known)
-            raise InputError("reading a service's address", f"{scheme}://{text}", found, f"write {scheme}://HOST:PORT[?{shown}]")
+            shown = f"[?{'&'.join(f'{name}=...' for name in known)}]" if known else ""
+            raise InputError("reading a service's address", f"{scheme}://{text}", found, f"write {scheme}://HOST:PORT{shown}")
         return cls(target, options)
 
 

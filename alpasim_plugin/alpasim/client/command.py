@@ -91,7 +91,7 @@ class Served:
     def __init__(self, command: Command) -> None:
         self.command = command
         in_text = " ".join(command.words)
-        self._place = LoopbackPort() if "{port}" in in_text else SocketFile(Path(tempfile.mkdtemp(prefix="simrun-")))
+        self._place = LoopbackPort() if "{port}" in in_text else SocketFile(Path(tempfile.mkdtemp(prefix="simrun-policy-")))
         words = [self._place.filled_in(word) for word in command.words]
         self._child = Child(words, {VARIABLE: self._place.address}, say, self._place.close)
         self.address = self._place.address

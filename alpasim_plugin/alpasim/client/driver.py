@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.alpasim.client.channel import Address, Service, encoding_of
-from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2
+from alpasim_plugin.alpasim.wire import FRONT_WIDE, common_pb2, egodriver_pb2
 from alpasim_plugin.errors import InputError, PolicyError
 from alpasim_plugin.geometry import interpolate, inverse, se3, wrap_angle, yaw_of
 from alpasim_plugin.log.images import encode_image
@@ -28,7 +28,6 @@ from alpasim_plugin.types import F64, I64, CameraSpec, EgoState, Frame, Observat
 OPTIONS = ("cameras", "encoding", "timeout_s")
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
 _SESSIONS = itertools.count()  # sessions of several rollouts of one scene and seed may be open at one driver
-FRONT_WIDE = "camera_front_wide_120fov"  # what AlpaSim calls its main camera
 
 
 class DriverPolicy(Policy):

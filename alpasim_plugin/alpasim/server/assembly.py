@@ -107,6 +107,11 @@ class Assembled:
         both = {"SensorsimService": self.service, "WorldModelService": self.world_model}
         return {name: service for name, service in both.items() if service is not None}
 
+    def close(self) -> None:
+        """Close the channel to the upstream: its threads must be gone before the interpreter ends, which otherwise may abort."""
+        if self.channel is not None:
+            self.channel.close()
+
     def expire(self) -> None:
         """Forget what nobody used for long."""
         self.tree.expire()

@@ -11,7 +11,7 @@ from typing import Any
 from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.driving import Driving
 from alpasim_plugin.alpasim.server.status import answering
-from alpasim_plugin.alpasim.wire import API_VERSION, common_pb2, egodriver_pb2
+from alpasim_plugin.alpasim.wire import api_version, common_pb2, egodriver_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import Policy, Scenario
 
@@ -51,10 +51,8 @@ class DriverService:
     @answering
     def get_version(self, request: common_pb2.Empty, context: Any) -> common_pb2.VersionId:
         """Name the policy and the digest of its code and weights."""
-        major, minor, patch = API_VERSION
-        api = common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
         digest = (self._digest or "undigested")[:40]
-        return common_pb2.VersionId(version_id=f"simrun-{__version__}+{self._name}", git_hash=digest, grpc_api_version=api)
+        return common_pb2.VersionId(version_id=f"simrun-{__version__}+{self._name}", git_hash=digest, grpc_api_version=api_version())
 
     @answering
     def start_session(self, request: egodriver_pb2.DriveSessionRequest, context: Any) -> common_pb2.SessionRequestStatus:

@@ -152,12 +152,14 @@ class Host:
         self.address = listen if is_socket else f"{host}:{add}"
         self._ended = threading.Event()
         self._every, self._every_s = every, every_s
+        self._upkeep: threading.Thread | None = None
 
     def start(self) -> Host:
         """Accept calls."""
         self._server.start()
         if self._every is not None:
-            threading.Thread(target=self._repeat, daemon=True, name="serve-upkeep").start()
+            self._upkeep = threading.Thread(target=self._repeat, daemon=True, name="serve-upkeep")
+            self._upkeep.start()
         return self
 
     def wait(self) -> None:
@@ -170,6 +172,8 @@ class Host:
         self.health.stop()
         self._server.stop(drain_s).wait()
         self._ended.set()
+        if self._upkeep is not None:
+            self._upkeep.join()
 
     def __enter__(self) -> Host:
         return self.start()

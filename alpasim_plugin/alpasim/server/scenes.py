@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from alpasim_plugin.alpasim.server.status import UnknownScene
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
+from alpasim_plugin.alpasim.wire import FRONT_WIDE, sensorsim_pb2
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.log.schema import wire_camera
 from alpasim_plugin.parts import RendererSpec, build, complete
@@ -20,7 +20,6 @@ from scenarios.usdz import usdz_scene_id
 
 DOING = "looking for a scene"
 FILES = (".usdz", ".yaml", ".yml", ".xml")
-FRONT_WIDE = "camera_front_wide_120fov"  # AlpaSim's evaluation and its drivers know the front camera by this name
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def one_line(error: SimrunError) -> str:
 
 
 def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
-    """Make a service's method answer errors as statuses; unexpected ones are handed to the service's ``unexpected``."""
+    """Make a service's method answer errors as statuses; every one is handed to the service's ``failed``."""
 
     @wraps(call)
     def answer(self: Any, request: Any, context: Any) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from alpasim_plugin import __version__
-from alpasim_plugin.alpasim.wire import API_VERSION, common_pb2
+from alpasim_plugin.alpasim.wire import api_version, common_pb2
 from alpasim_plugin.parts import RendererSpec
 from alpasim_plugin.parts.spec import digest
 
@@ -35,8 +35,7 @@ def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb
     text = f"simrun-{__version__}+{name} {short} settings={digest([given, settings])[:12]} code={(part.digest or 'remote')[:12]}"
     version = common_pb2.VersionId(version_id=text, git_hash=everything[:40])
     if upstream is None:
-        major, minor, patch = API_VERSION
-        version.grpc_api_version.CopyFrom(common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch))
+        version.grpc_api_version.CopyFrom(api_version())
         return version
     version.version_id = f"{text} over {upstream.version_id}"
     version.git_hash = f"{everything[:40]}+{upstream.git_hash}"

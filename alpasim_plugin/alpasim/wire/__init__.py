@@ -52,10 +52,22 @@ SERVICE_PATHS = {
 #: Version of AlpaSim's wire interface that these messages speak: what `common.VersionId` reports.
 API_VERSION = (0, 54, 0)
 
+#: What AlpaSim's drivers, evaluation and presets call the main camera.
+FRONT_WIDE = "camera_front_wide_120fov"
+
+
+def api_version() -> common_pb2.VersionId.APIVersion:
+    """Return `API_VERSION` as a message."""
+    major, minor, patch = API_VERSION
+    return common_pb2.VersionId.APIVersion(major=major, minor=minor, patch=patch)
+
+
 __all__ = [
     "API_VERSION",
+    "FRONT_WIDE",
     "MODULES",
     "SERVICE_PATHS",
+    "api_version",
     "common_pb2",
     "controller_pb2",
     "egodriver_pb2",
