@@ -21,9 +21,10 @@ EPILOG = "Example: `simrun report runs/us101`"
 
 
 def report_line(root: Path) -> str:
-    """Return the line that says where a run's report is, or how to get it."""
-    page = root / "report.html"
-    return f"report   {shlex.quote(str(page))}" if page.exists() else f"report   not written; simrun report {shlex.quote(str(root))}"
+    """Return the lines that say where a run's report is, or how to get it, and how to watch its drives."""
+    page, run = root / "report.html", shlex.quote(str(root))
+    report = f"report   {shlex.quote(str(page))}" if page.exists() else f"report   not written; simrun report {run}"
+    return f"{report}\nwatch    simrun view {run}"
 
 
 def report(

@@ -133,7 +133,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
     try:
         import cantools
     except ImportError as error:
-        raise InputError(DOING, str(database), "cantools is not installed", "pip install 'alpasim-onefixer[can]'") from error
+        raise InputError(DOING, str(database), "cantools is not installed", "install the extra [can], or pip install cantools") from error
     try:
         # Real databases have overlapping signals in messages that nobody uses here; the map's own messages are checked below.
         loaded = cantools.database.load_file(database, strict=False)

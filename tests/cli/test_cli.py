@@ -121,8 +121,9 @@ def test_a_run_prints_its_table_and_writes_the_contracted_files(tmp_path: Path, 
     assert run_command(command) == 0
     captured = capsys.readouterr()
     assert "lateral_distance_m" in captured.out
-    assert captured.out.splitlines()[-1].startswith("next     simrun --renderer clean,3dgs --policy log-replay --seeds 1 smoke/straight ")
+    assert captured.out.splitlines()[-1].startswith("next     simrun --renderer clean,3dgs --policy lane-camera --seeds 1 smoke/straight ")
     assert "report.html" in captured.out
+    assert f"simrun view {tmp_path}" in captured.out
     names = {"run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", "junit.xml", "report.html"}
     assert names <= {p.name for p in tmp_path.iterdir()}
     summary = json.loads((tmp_path / "summary.json").read_text())

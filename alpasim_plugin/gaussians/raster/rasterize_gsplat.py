@@ -90,7 +90,7 @@ def require_gsplat(device: str = "cuda") -> Any:
             _DOING,
             "the package gsplat",
             f"it does not import ({error})",
-            "pip install 'alpasim-onefixer[gpu]', or choose --device cpu (backend='cpu' in code)",
+            "install the extra [gpu], or choose --device cpu (backend='cpu' in code)",
         ) from error
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise RendererError(
