@@ -272,6 +272,7 @@ def test_our_driver_service_is_tolerant_where_alpasim_needs_it(driver: tuple[Dri
     assert SERVICE_PATHS["EgodriverService"] == "/egodriver.EgodriverService/"
 
 
+@pytest.mark.slow
 def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(
     scene: str, driver: tuple[DriverService, str, Calls], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -95,6 +95,7 @@ def is_gone(pid: int) -> bool:
         return True
 
 
+@pytest.mark.slow
 def test_the_script_of_the_page_drives_as_in_the_process(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     logs: list[list[RolloutLog]] = []
     for name in (python("remote_policy.py"), "remote_policy.py:Cruise"):

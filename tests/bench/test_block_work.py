@@ -25,6 +25,7 @@ from tests.fixers.fixer_cases import SMALL_DIT, small_settings
 LAPTOP = "1:0.1:20:8"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
     first_of([("history=finalise", "window=4", "holes=noise"), ("precision=bf16", "codec_precision=bf16", "steps=[1000,500]"),

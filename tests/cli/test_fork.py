@@ -15,6 +15,7 @@ from tests.runtime.test_fork import CELL, SHORT
 from tests.runtime.test_runs import Heard
 
 
+@pytest.mark.slow
 def test_the_verbs_report_what_they_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "run"
     plan = make_plan(expand("smoke/lead_car", SHORT), ("clean",), ("lane-camera",), (0,), RunOptions())

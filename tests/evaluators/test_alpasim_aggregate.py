@@ -41,7 +41,9 @@ def same(got: Any, want: Any, path: str = "") -> list[str]:
     return [] if got == want and type(got) is type(want) else [f"{path}: {got!r} for {want!r}"]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] if name == "rollouts" else []) for name in SETS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in ("rollouts", "other-settings") else []) for name in SETS]
+)
 def test_golden_runs_give_alpasims_tables(shared_data, name):
     one = golden_set(shared_data / "alpasim-golden", name)
     run = one.run()

@@ -73,6 +73,7 @@ def test_every_step_and_every_rollout_value_is_alpasims(shared_data, name):
             assert_reduced(log, archive, ALPASIM, row["metrics"])
 
 
+@pytest.mark.slow
 def test_other_settings_of_the_scorers_are_followed(shared_data):
     golden = shared_data / "alpasim-golden"
     folder = golden / "other-settings"

@@ -127,6 +127,7 @@ def test_everything_follows_a_sloping_ground() -> None:
             assert above.max() < 0.14
 
 
+@pytest.mark.slow
 def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
     shift = np.array([4.0e5, -3.0e5, 0.0])
     near, graph = empty_street(straight)

@@ -149,6 +149,7 @@ def test_seeds_drive_differently_and_a_seed_alike() -> None:
     assert lateral < 2.5
 
 
+@pytest.mark.slow
 def test_temperature_zero_is_the_mean_for_every_seed() -> None:
     policy = make_policy("learned-mean", scenario_with())
     assert isinstance(policy, Learned)

@@ -118,6 +118,7 @@ def test_frame_does_not_depend_on_the_thread_count(scenario: Scenario) -> None:
         np.testing.assert_array_equal(one.rgb, two.rgb)
 
 
+@pytest.mark.slow
 def test_frame_does_not_depend_on_whether_the_scene_was_cached(scenario: Scenario) -> None:
     before = make_renderer("3dgs", scenario).render(request(scenario, left_m=1.0))
     clear_cache()

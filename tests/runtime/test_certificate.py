@@ -83,6 +83,7 @@ def test_a_policy_that_remembers_is_named_before_the_motion_that_follows_from_it
     assert {"plans", "ego", "scores"} <= differing
 
 
+@pytest.mark.slow
 def test_the_same_command_again_keeps_the_certificate_until_the_log_is_another(tmp_path: Path) -> None:
     first = certificate(plan_of(images="jpeg"), tmp_path)
     assert certificate(plan_of(images="jpeg"), tmp_path, first) == first  # wall_s included: nothing was repeated

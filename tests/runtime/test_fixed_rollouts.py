@@ -104,6 +104,7 @@ def assert_same_pictures(one: Sequence[Frame], other: Sequence[Frame]) -> None:
 # --- speculative ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straight_road: Scenario) -> None:
     run = drive(straight_road)
     facts = run.session.facts()

@@ -159,6 +159,7 @@ def test_a_scenario_that_has_changed_is_refused(root: Path, past: LoggedRollout,
         find_rollout(tmp_path, CELL)
 
 
+@pytest.mark.slow
 def test_a_probe_of_one_renderer_against_itself_finds_nothing_and_against_another_something(past: LoggedRollout, root: Path) -> None:
     probe = probe_rollout(past, ["clean", "broken-frozen", "3dgs"])
     frozen, surrogate = probe.pairs

@@ -107,6 +107,7 @@ def test_real_least_gap_in_the_plane_of_the_ego(real):
     assert (times[gaps.argmin()] - times[0]) * 1e-6 == pytest.approx(facts["gap_s"], abs=0.05)
 
 
+@pytest.mark.slow
 def test_real_least_gap_in_the_world_plane(real):
     """In the world's xy plane the tilt of the road moves the box centre, half a height above it, by millimetres."""
     facts, _, _, log = real

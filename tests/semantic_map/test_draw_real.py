@@ -68,6 +68,7 @@ def test_projection_equals_the_reader_s(clip, shared_data):
         np.testing.assert_allclose(table * camera.A[0][0], exact, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["front_wide_120fov", *(pytest.param(name, marks=pytest.mark.slow) for name in ("cross_right_120fov", "rear_left_70fov"))]
 )

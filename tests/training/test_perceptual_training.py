@@ -98,6 +98,7 @@ def test_every_loss_term_reaches_the_trunk(task: PerceptualTask) -> None:
         assert torch.isfinite(p.grad).all(), name
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_and_the_result_loads(task: PerceptualTask, tmp_path: Path) -> None:
     schedule = Schedule(6, peak_lr=6e-3, warmup=1)
     trainer = Trainer(task.module, tmp_path / "run", schedule, lambda i: task.batch(0), task.loss, task.facts)
