@@ -27,7 +27,8 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"--images folder/", "needs the reader's own pictures"),
     (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
 )
-SHORT = ("--set", "timing.duration_us=1200000", "--set", "degradation.kind=surrogate", "--certify", "none", "--workers", "2")
+SHORT = ("--set", "timing.duration_us=1200000", "--certify", "none", "--workers", "2")
+NOTHING_FITTED = ("--set", "degradation.kind=surrogate")  # for scenes that say nothing about their reconstruction
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import typer
 
 from alpasim_plugin.cli.main import VERBS, make_app, with_verb
 from alpasim_plugin.log import write_mp4
-from tests.docs.commands import NO_COMMAND, OTHER, SHORT, SIMRUN, Command, commands, lines_of, pages
+from tests.docs.commands import NO_COMMAND, NOTHING_FITTED, OTHER, SHORT, SIMRUN, Command, commands, lines_of, pages
 
 REPO = Path(__file__).resolve().parents[2]
 COMMANDS = commands(REPO)
@@ -138,8 +138,9 @@ def shortened(words: tuple[str, ...]) -> list[str]:
         return ["new", "policy", "my_first_policy"]  # the folder has a policy of the page's name already
     args = ["scenario.yaml" if word == "SCENARIO" else word.replace("suites/urban", "suites/smoke") for word in words]
     if args[0] not in VERBS or args[0] == "run":
-        fitting = [] if any("drive.csv" in word for word in args) else list(SHORT)
-        return [*args, *fitting, "--seeds", "1"]
+        fitting = [] if "suites/first" in args else NOTHING_FITTED
+        more = () if any("drive.csv" in word for word in args) else (*SHORT, *fitting)
+        return [*args, *more, "--seeds", "1"]
     return args
 
 
@@ -165,8 +166,8 @@ def prepare(simrun: Path, folder: Path, words: list[str]) -> None:
     """Make the run that a command reads, once."""
     runs = {
         "runs/us101": ["--renderer", "3dgs", "real/us101", "--set", "timing.duration_us=5000000", "--set", "degradation.kind=surrogate"],
-        "runs/lead_car": ["--renderer", "clean", "smoke/lead_car", *SHORT],
-        "runs/smoke": ["--renderer", "clean", "suites/smoke", *SHORT],
+        "runs/lead_car": ["--renderer", "clean", "smoke/lead_car", *SHORT, *NOTHING_FITTED],
+        "runs/smoke": ["--renderer", "clean", "suites/smoke", *SHORT, *NOTHING_FITTED],
     }
     for name in [word for word in words if word in runs and not (folder / word).exists()]:
         made = call(simrun, folder, [*runs[name], "--out", name])
