@@ -29,6 +29,8 @@ from alpasim_plugin.nets.perceptual import NAME, shipped_weights
 from alpasim_plugin.parts import build, resolve
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
 from alpasim_plugin.types import U8
 from evaluators.video.charts import plot_by_frame, plot_speed
@@ -37,7 +39,7 @@ from evaluators.video.summary import TRUTH, summarise
 from evaluators.video.table import markdown
 
 DOING = "measuring quality"
-Given = Literal["render", "truth"]  # what the fixers get
+Given = Literal["render", "truth", "lost-resolution"]  # what the fixers get
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames that are shown, as shares of a clip
 EPILOG = """
 Examples:
@@ -83,7 +85,11 @@ def quality(
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     given: Annotated[
         Given,
-        typer.Option("--input", help="What fixers get: the degraded render, or the ground truth, opaque, which they should leave alone."),
+        typer.Option(
+            "--input",
+            help="What fixers get: the degraded render; the ground truth, opaque, which they should leave alone; or the truth "
+            "that has lost resolution (blur, cells of 2 to 4 pixels, up to 3 holes that stay in place).",
+        ),
     ] = "render",
     baseline: Annotated[str, typer.Option("--baseline", help="Variant that the others are compared with.")] = RAW,
     frames: Annotated[int, typer.Option("--frames", min=2, help="First frames of every clip; shorter clips are taken whole.")] = 198,
@@ -204,13 +210,23 @@ def finish(work: Work) -> dict[str, Any]:
 
 
 def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip:
-    """Return a sequence of pairs as a clip to measure on; given the truth, its render is the ground truth and opaque."""
+    """Return a sequence of pairs as a clip to measure on, its render replaced as ``--input`` says."""
     clip = sequence.clip
     facts = {**sequence.info, CONTENT: sequence.content}  # a sequence written again has another digest
-    if given == "truth":
-        opaque = np.full_like(clip.opacity, 255)
-        return QualityClip(sequence.name, {**facts, "input": given}, clip.rgb_gt, clip.rgb_gt, opaque, clip.sdmap, clip.t_us)
-    return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
+    if given == "render":
+        return QualityClip(sequence.name, facts, clip.rgb_input, clip.rgb_gt, clip.opacity, clip.sdmap, clip.t_us)
+    render, opacity = clip.rgb_gt, np.full_like(clip.opacity, 255)
+    if given == "lost-resolution":
+        render, opacity = lose_resolution(clip.rgb_gt, sequence.name)
+    return QualityClip(sequence.name, {**facts, "input": given}, render, clip.rgb_gt, opacity, clip.sdmap, clip.t_us)
+
+
+def lose_resolution(video: U8, name: str) -> tuple[U8, U8]:
+    """Return a video ``(T, H, W, 3)`` that has lost resolution, and its opacity ``(T, H, W)``; the damage is keyed by the clip's name."""
+    lost = draw_lost_resolution(stream(name, 0, "lost-resolution"), *video.shape[1:3])
+    frames = lost.apply(np.moveaxis(video, -1, 1).astype(np.float32) / np.float32(127.5) - 1)
+    damaged = np.clip(np.rint((frames + 1) * np.float32(127.5)), 0, 255).astype(np.uint8)
+    return np.moveaxis(damaged, 1, -1), np.broadcast_to(np.rint(lost.opacity * 255).astype(np.uint8), video.shape[:3])
 
 
 def shown_frames(frames: int) -> tuple[int, ...]:

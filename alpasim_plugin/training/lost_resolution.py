@@ -38,7 +38,7 @@ class LostResolution:
         """Return frames ``(T, 3, h, w)`` in [-1, 1], damaged; black shows through the holes."""
         height, width = self.opacity.shape
         coarse = (max(width // self.cell_px, 1), max(height // self.cell_px, 1))
-        out = np.empty_like(frames)
+        out = np.empty(frames.shape, frames.dtype)  # in C order, whatever the frames' own is: the loop writes into a view of it
         for image, made in zip(frames.reshape(-1, height, width), out.reshape(-1, height, width), strict=True):
             soft = cv2.GaussianBlur(image, (0, 0), self.blur_px)
             cells = cv2.resize(cv2.resize(image, coarse, interpolation=cv2.INTER_AREA), (width, height))

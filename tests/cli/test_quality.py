@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.cli.quality import Work, finish, identity, parse_variants, shown_frames
+from alpasim_plugin.cli.quality import Work, finish, identity, lose_resolution, parse_variants, shown_frames
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -100,6 +100,18 @@ def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(data: Path, bun
     assert rows["identity"]["identical"] == FRAMES
     assert rows["small"]["values"]["psnr_db"] < rows["identity"]["values"]["psnr_db"]
     assert json.loads((tmp_path / "quality.json").read_text())["run"]["input"] == "truth"
+
+
+def test_lost_resolution_is_the_same_damage_at_every_frame_and_of_the_clip_alone() -> None:
+    video = np.random.default_rng(0).integers(0, 256, (1, 48, 64, 3), np.uint8).repeat(2, axis=0)
+    damaged, opacity = lose_resolution(video, "a")
+    assert damaged.shape == video.shape
+    assert np.array_equal(damaged[0], damaged[1])
+    assert np.array_equal(opacity[0], opacity[1])
+    steps = [np.abs(np.diff(one.astype(int), axis=2)).mean() for one in (damaged, video)]
+    assert steps[0] < 0.6 * steps[1]
+    assert np.array_equal(lose_resolution(video, "a")[0], damaged)
+    assert not np.array_equal(lose_resolution(video, "b")[0], damaged)
 
 
 def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
