@@ -39,6 +39,10 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "view", "view", "EPILOG",
         "Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run.",
     ),
+    "runs": (
+        "runs", "runs", "EPILOG",
+        "List run folders: what was driven, with what, when, and how far it came; filtered, and with metrics side by side.",
+    ),
     "export": (
         "export", "export", "EPILOG",
         "Write a run as AlpaSim run folders, one for each renderer and policy, and its scenes as .usdz; or scenes alone.",
