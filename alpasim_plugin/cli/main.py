@@ -45,7 +45,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     ),
     "export": (
         "export", "export", "EPILOG",
-        "Write a run as AlpaSim run folders, one for each renderer and policy, and its scenes as .usdz; or scenes alone.",
+        "Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove or Rerun.",
     ),
     "serve-policy": (
         "serve_policy", "serve_policy", "EPILOG",
