@@ -62,7 +62,9 @@ def export(
     """
     del debug  # read from the command line by cli.main, before any option is parsed
     files = dict(zip(FORMATS, (mcap, rrd), strict=True))
-    wanted = Wanted(*(() if one is None else (one,) for one in (scene, policy, seed)), tuple(renderer or ()))
+    wanted = Wanted(
+        () if scene is None else (scene,), () if policy is None else (policy,), () if seed is None else (seed,), tuple(renderer or ())
+    )
     if (alpasim is None) == (not any(files.values())):
         found = "nothing to write" if alpasim is None else "--alpasim beside --mcap or --rrd"
         raise InputError(DOING, " ".join(items), found, "give --alpasim DIR, or --mcap FILE and --rrd FILE")
