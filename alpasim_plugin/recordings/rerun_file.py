@@ -103,8 +103,8 @@ class _Writer:
             self._camera([*base, "rig", camera.name], camera)
         for name, (t_us, value) in drive.metrics.items():
             self._scalars(["metrics", name, drive.renderer], t_us, value, rgba)
-        for t_us, text in drive.events:
-            self._at(t_us, ["events", drive.renderer], rr.TextLog(text, level="WARN"))
+        for at_us, text in drive.events:
+            self._at(at_us, ["events", drive.renderer], rr.TextLog(text, level="WARN"))
 
     def _box(self, parts: list[str], box: Box, track: Trajectory, steps: I64, label: str, rgba: Rgba) -> None:
         """Log a box that moves; it appears and goes as the log's steps ``(T,)`` have a pose of it."""
