@@ -78,6 +78,21 @@ def one_writer(
         taken()
 
 
+def holder_of(path: Path) -> ProcessName | None:
+    """Return the process that holds a lock file, or None; nothing is locked, and a holder that is gone holds nothing.
+
+    Where only another machine could tell whether the process still runs, it is taken to.
+    """
+    for one in (path, _named(path)):
+        try:
+            owner = _owner(one.read_bytes())
+        except OSError:
+            continue
+        if owner is not None and owner.life != "gone":
+            return owner
+    return None
+
+
 def _in_use(path: Path, doing: str, what: str, owner: ProcessName | None) -> InfrastructureError:
     if owner is None:
         return InfrastructureError(doing, what, "another process is writing it", "wait for it (--wait), or name another folder")

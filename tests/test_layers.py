@@ -50,6 +50,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.log": {"alpasim_plugin.alpasim"},
     "evaluators": set(),
     "alpasim_plugin.viewer": {"alpasim_plugin.log", "evaluators"},
+    "alpasim_plugin.recordings": {"alpasim_plugin.log", "alpasim_plugin.viewer", "evaluators"},
     "alpasim_plugin.runtime": {
         "alpasim_plugin.alpasim",  # the messages of logs that it exports
         "alpasim_plugin.alpasim.client",  # road users behind a service

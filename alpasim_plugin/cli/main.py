@@ -39,9 +39,13 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "view", "view", "EPILOG",
         "Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run.",
     ),
+    "runs": (
+        "runs", "runs", "EPILOG",
+        "List run folders: what was driven, with what, when, and how far it came; filtered, and with metrics side by side.",
+    ),
     "export": (
         "export", "export", "EPILOG",
-        "Write a run as AlpaSim run folders, one for each renderer and policy, and its scenes as .usdz; or scenes alone.",
+        "Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove or Rerun.",
     ),
     "serve-policy": (
         "serve_policy", "serve_policy", "EPILOG",

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -108,7 +109,7 @@ def run(
         of_scene = (*of_scene, f"timing.timeline={timeline}")
     refs = [ref for item in scenarios for ref in expand(item, of_scene, source)]
     options = RunOptions(preset, images, video, device, baseline, of_fixer, controller, tuple(evaluators or ()), traffic)
-    plan = make_plan(refs, names, drivers, parse_seeds(seeds), options)
+    plan = replace(make_plan(refs, names, drivers, parse_seeds(seeds), options), asked=tuple(scenarios))
     root = out or default_folder(plan)
     if dry_run:
         _print_plan(plan, root, workers, as_json)

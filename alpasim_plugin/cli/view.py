@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.cli.rollout_folders import find_cell, narrowed
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.contents import CONTENTS, RUN_INFO
-from alpasim_plugin.runtime.manifests import MANIFEST, read_manifest
+from alpasim_plugin.runtime.contents import CONTENTS
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.unfinished import read_so_far
 from alpasim_plugin.stopping import Stopped
@@ -59,9 +59,9 @@ def view(
 ) -> None:
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run."""
     del debug
-    root, wanted = _find(what)
+    root, of_rollout = find_cell(what, DOING)
     asked = Wanted(tuple(scene or ()), tuple(policy or ()), tuple(seed or ()), tuple(renderer or ()))
-    wanted = asked if wanted is None else _narrowed(what, wanted, asked)
+    wanted = narrowed(what, of_rollout, asked, DOING)
     options = Options(int(max_mb * MB), Fineness(every, width), camera)
     if serve is not None:
         if out is not None:
@@ -88,30 +88,6 @@ def view(
     for note in made.notes:
         print(f"note     {note}")
     print(f"page     {shlex.quote(str(path))}, {made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} cells")
-
-
-def _find(what: Path) -> tuple[Path, Wanted | None]:
-    """Return the run folder of a run or a rollout, and which rollouts to show if a rollout was named.
-
-    Raises:
-        InputError: Neither.
-    """
-    if (what / RUN_INFO).exists() or (what / CONTENTS).exists():
-        return what, None
-    if (what / MANIFEST).exists():
-        manifest, _ = read_manifest(what)
-        root = next((folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None)
-        if root is not None:
-            return root, Wanted((str(manifest["scene"]),), (str(manifest["policy"]),), (int(manifest["seed"]),))
-    found = "no run.json and no manifest.json" if what.is_dir() else "no such folder"
-    raise InputError(DOING, str(what), found, "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED")
-
-
-def _narrowed(what: Path, rollout: Wanted, asked: Wanted) -> Wanted:
-    """Return which rollouts to show of a rollout's cell; only renderers can be chosen there."""
-    if asked.scenes or asked.policies or asked.seeds:
-        raise InputError(DOING, str(what), "--scene, --policy or --seed beside a rollout, which has one of each", "name its run folder")
-    return Wanted(rollout.scenes, rollout.policies, rollout.seeds, asked.renderers)
 
 
 def _serve(root: Path, address: str, wanted: Wanted, options: Options, as_json: bool) -> None:

@@ -20,6 +20,7 @@ from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
 SLUG_LENGTH = 80
+LOOP, SCORING = "alpasim_plugin.runtime.rollout", "alpasim_plugin.runtime.scoring"  # modules whose code, with its imports, decides
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class RunPlan:
     policies: tuple[PartSpec, ...]
     seeds: tuple[int, ...]
     options: RunOptions
+    asked: tuple[str, ...] = ()  # the scenarios as the command named them: files, folders, suites; not in any key
 
     @property
     def command_key(self) -> str:
@@ -186,7 +188,7 @@ def _cell(
     }
     if options.traffic is not None:
         content[f"traffic service {options.traffic}"] = None
-    loop = own_code_digest("alpasim_plugin.runtime.rollout")
+    loop = own_code_digest(LOOP)
     rollout_key = digest([loop, scenario.content_hash, content, seed, options.images, options.device])
     undigested = tuple(what for what, known in content.items() if known is None)
     stops = scenario.stop_at_path_end and preset(options.preset).stop_at_path_end
@@ -196,7 +198,7 @@ def _cell(
 
 def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:
     """Return the content key of a rollout's scores; it changes with the preset and the code of the evaluators and of the reduction."""
-    own = own_code_digest("alpasim_plugin.runtime.scoring")
+    own = own_code_digest(SCORING)
     return digest([rollout_key, preset(preset_name).as_dict(), own, [(spec.name, spec.digest) for spec in evaluators]])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +141,8 @@ def plan_of_run(info: Mapping[str, Any]) -> RunPlan:
             raise InputError("repairing a run", RUN_INFO, f"it has no path of the scenario {name}", "give the command of the run again")
         refs.append(ScenarioRef(ref["path"], ref.get("seed"), tuple(ref.get("overrides") or ()), ref.get("source")))
     refuse_commands(info["policies"], "repairing a run", RUN_INFO)
-    return make_plan(refs, info["renderers"], info["policies"], info["seeds"], options)
+    plan = make_plan(refs, info["renderers"], info["policies"], info["seeds"], options)
+    return replace(plan, asked=tuple(info.get("asked") or ()))
 
 
 def command_of(found: Inspection) -> str:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.child import end_children
 from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.parts.source import own_code_digest
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.certificate import Certify, certify
@@ -31,7 +32,8 @@ from alpasim_plugin.runtime.contents import (
 )
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.manifests import read_manifest
-from alpasim_plugin.runtime.plan import RunPlan, slug
+from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan, slug
+from alpasim_plugin.runtime.project import project
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.scene_dump import scene_as_json
@@ -156,7 +158,8 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
         report: Write ``report.html``.
     """
     info = read_run_json(root)
-    write_run_json(root, info | dict(more))
+    outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
+    write_run_json(root, info | dict(more) | {"outcome": outcome})
     summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
@@ -244,6 +247,8 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "command": list(command),
             "version": versions()["alpasim-onefixer"],
             "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "project": project(),
+            "asked": list(plan.asked),
             "config": asdict(plan.options) | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
             "preset": plan.options.preset,
             "renderers": [spec.name for spec in plan.renderers],
@@ -273,6 +278,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "bases": {spec.name: spec.base.name for spec in plan.renderers if spec.fixer is not None},
             "fixers": {spec.name: spec.fixer.as_dict() for spec in plan.renderers if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
+            "code": {"loop": own_code_digest(LOOP)[:12], "scoring": own_code_digest(SCORING)[:12]},
             "metrics": declared(),
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),

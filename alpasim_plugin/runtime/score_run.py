@@ -14,11 +14,13 @@ from typing import Any
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.parts import PartSpec, digest
+from alpasim_plugin.parts.source import own_code_digest
 from alpasim_plugin.runtime.contents import AGGREGATE, CONTENTS, SCENES, find_contents, read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.manifests import write_manifest
-from alpasim_plugin.runtime.plan import slug
+from alpasim_plugin.runtime.plan import SCORING, slug
+from alpasim_plugin.runtime.project import project
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run
 from alpasim_plugin.runtime.scene_dump import scene_as_json
@@ -184,6 +186,7 @@ def _write_info(
             "command": list(command),
             "version": versions()["alpasim-onefixer"],
             "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "project": project(),
             "config": {"preset": preset.as_dict(), "settings": None if settings is None else settings.model_dump(mode="json")},
             "preset": preset.name,
             "renderers": names("renderer"),
@@ -193,6 +196,7 @@ def _write_info(
             "scenes": {
                 name: {"source": one.source, "content_hash": one.content_hash, "notes": list(one.notes)} for name, one in used.items()
             },
+            "code": {"scoring": own_code_digest(SCORING)[:12]},
             "metrics": declared(),
             "weights": {},
             "hardware": hardware(),

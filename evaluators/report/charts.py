@@ -81,7 +81,9 @@ class Curve:
     high: npt.NDArray[np.float64] | None = None
 
 
-def new_axes(height_in: float = SIZE_IN[1], left_in: float = 0.78, bottom_in: float = 0.5) -> tuple[Figure, Axes]:
+def new_axes(
+    height_in: float = SIZE_IN[1], left_in: float = 0.78, bottom_in: float = 0.5, width_in: float = SIZE_IN[0]
+) -> tuple[Figure, Axes]:
     """Return a figure with one set of axes and fixed margins.
 
     Margins are given, not measured: measuring text takes two thirds of the time of a chart, and the page has a font of its own.
@@ -90,8 +92,8 @@ def new_axes(height_in: float = SIZE_IN[1], left_in: float = 0.78, bottom_in: fl
         height_in: Height of the figure, inches.
         left_in: Room for the tick labels and the label of the y axis, inches.
         bottom_in: Room for those of the x axis, inches.
+        width_in: Width of the figure, inches.
     """
-    width_in = SIZE_IN[0]
     figure = Figure(figsize=(width_in, height_in))
     box = (left_in / width_in, bottom_in / height_in, 1.0 - (left_in + 0.08) / width_in, 1.0 - (bottom_in + 0.1) / height_in)
     return figure, figure.add_axes(box)

@@ -42,6 +42,7 @@ def provenance(run: Run) -> Provenance:
     facts = {
         "preset": run.summary.get("preset") or info.get("preset"),
         "started": info.get("started_at"),
+        "commit": commit_text(info),
         "simrun": info.get("version"),
         "run key": info.get("key"),
         "seeds": ", ".join(str(s) for s in info.get("seeds") or []),
@@ -64,6 +65,12 @@ def provenance(run: Run) -> Provenance:
         tuple(str(note) for note in info.get("left_out") or ()),
         json.dumps(info.get("config") or {}, indent=2),
     )
+
+
+def commit_text(info: Mapping[str, Any]) -> str:
+    """Name the project's commit of a ``run.json``, with a word where files differed from it; empty where there is none."""
+    project = info.get("project") or {}
+    return f"{project['commit']}{', files changed' if project.get('dirty') else ''}" if project.get("commit") else ""
 
 
 def _pairs(value: Any) -> tuple[tuple[str, str], ...]:

@@ -22,10 +22,34 @@ class SceneFacts(TypedDict, total=False):
     ref: dict[str, Any]
 
 
+class ProjectFacts(TypedDict, total=False):
+    """The user's own project, in ``run.json``."""
+
+    commit: str | None
+    committed_at: str | None
+    branch: str | None
+    dirty: bool | None
+    reason: str
+
+
+class OutcomeFacts(TypedDict):
+    """How many rollouts a finished run has, in ``run.json``."""
+
+    n_rollouts: int
+    n_failed: int
+
+
 class RunInfo(TypedDict, total=False):
     """``run.json``."""
 
     key: str
+    kind: str
+    project: ProjectFacts
+    asked: list[str]
+    parts: dict[str, dict[str, Any]]
+    fixers: dict[str, dict[str, Any]]
+    code: dict[str, str]
+    outcome: OutcomeFacts
     command: list[str]
     version: str
     started_at: str

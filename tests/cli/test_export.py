@@ -12,6 +12,7 @@ import yaml
 from alpasim_plugin.alpasim.asl import AslReader
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.runtime.contents import read_run_json
 from evaluators.alpasim import load_settings
 
 FRONT = "camera_front_wide_120fov"
@@ -33,6 +34,14 @@ def exported(run: Path) -> Path:
     out = run.parent / "exported"
     assert run_command(["export", str(run), "--alpasim", str(out), "--quiet"]) == 0
     return out
+
+
+def test_run_json_says_what_was_asked_and_of_which_commit_and_code(run: Path) -> None:
+    info = read_run_json(run)
+    assert info["asked"] == ["smoke/straight"]
+    assert info["outcome"] == {"n_rollouts": 4, "n_failed": 0}
+    assert (info["project"]["commit"] is None) == bool(info["project"]["reason"])  # the tests may run outside a repository
+    assert all(len(info["code"][name]) == 12 for name in ("loop", "scoring"))
 
 
 def logs(exported: Path, policy: str) -> list[Path]:

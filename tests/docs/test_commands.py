@@ -155,8 +155,8 @@ def call(simrun: Path, folder: Path, words: list[str]) -> subprocess.CompletedPr
 @pytest.mark.parametrize("command", RUN, ids=str)
 def test_the_command_works_from_an_empty_folder_with_the_wheel(simrun: Path, empty: Path, command: Command) -> None:
     words = shortened(command.words)
-    if command.words[0] in ("fork", "probe", "compare", "report", "score", "check", "view"):
-        prepare(simrun, empty, words)
+    if command.words[0] in ("fork", "probe", "compare", "report", "score", "check", "view", "runs", "export"):
+        prepare(simrun, empty, [*words, "runs/smoke"] if words[0] == "runs" else words)
     done = call(simrun, empty, words)
     assert done.returncode in (0, 1, 3) if "check-policy" in words or "compare" in words else done.returncode == 0, done.stderr[-3000:]
     assert "Traceback" not in done.stderr

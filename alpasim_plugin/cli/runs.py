@@ -1,0 +1,163 @@
+"""``simrun runs``: list, choose and compare run folders."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.cli.progress import warn
+from alpasim_plugin.errors import InputError
+from evaluators.metrics import METRICS
+from evaluators.report.metric_info import HEADLINE
+from evaluators.report.numbers import plural
+from evaluators.runs.choose import Choice, as_day, chosen, shown_folder
+from evaluators.runs.entry import DOING, STATES, RunEntry, State
+from evaluators.runs.find import find_runs
+from evaluators.runs.table import runs_table, variants_of
+
+EPILOG = """
+Examples:
+
+- `simrun runs`: every run folder below runs/, the newest first; unfinished and damaged ones too
+
+- `simrun runs nightly --metric offroad --metric progress --last 10`: with means and 95 % intervals
+
+- `simrun runs nightly --renderer onefixer --weights 99bf50 --since 7d`
+
+- `simrun runs nightly --commit 3f2a9c1 --json`
+
+- `simrun runs nightly --steps --metric lateral_distance_m`: from run to run, with verdicts and what changed
+
+- `simrun runs nightly --trend trend.html`: the headline metrics over the runs, as a page
+
+Filters given twice: any of the commits, weights, presets or states; all of the renderers, policies and scenes.
+
+Exit codes: 0, also where nothing is found; 2 no such folder, no two runs to compare, or an option makes no sense.
+"""
+
+
+def runs(
+    roots: Annotated[list[Path] | None, typer.Argument(metavar="ROOT...", help="Folders of run folders; by default runs.")] = None,
+    commit: Annotated[list[str] | None, typer.Option("--commit", help="Project's commit, its first digits. Repeatable.")] = None,
+    weights: Annotated[
+        list[str] | None, typer.Option("--weights", help="Weight file: the first digits of its SHA-256, or its name. Repeatable.")
+    ] = None,
+    renderer: Annotated[list[str] | None, typer.Option("--renderer", help="A renderer of the run; * and ? match. Repeatable.")] = None,
+    policy: Annotated[list[str] | None, typer.Option("--policy", help="A policy of the run; * and ? match. Repeatable.")] = None,
+    scene: Annotated[list[str] | None, typer.Option("--scene", help="A scene or suite of the run; * and ? match. Repeatable.")] = None,
+    preset: Annotated[list[str] | None, typer.Option("--preset", help="Evaluator preset. Repeatable.")] = None,
+    state: Annotated[list[str] | None, typer.Option("--state", help=f"One of {', '.join(STATES)}. Repeatable.")] = None,
+    since: Annotated[str | None, typer.Option("--since", help="Begun at or after: 2026-03-01, 2026-03-01T18:00 (UTC), 7d, 12h.")] = None,
+    until: Annotated[str | None, typer.Option("--until", help="Begun before.")] = None,
+    last: Annotated[int | None, typer.Option("--last", min=1, help="The newest N of them.")] = None,
+    metric: Annotated[list[str] | None, typer.Option("--metric", help="Show this metric, by renderer. Repeatable.")] = None,
+    steps: Annotated[
+        bool, typer.Option("--steps", help="Compare each run with the comparable one before it, and name what changed.")
+    ] = False,
+    page: Annotated[Path | None, typer.Option("--trend", metavar="FILE", help="Write the same as an offline page.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file that --trend names.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """List run folders: what was driven, with what, when, and how far it came; filtered, and with metrics side by side."""
+    del debug
+    places = roots or [Path("runs")]
+    now = datetime.now(UTC)
+    choice = Choice(
+        tuple(commit or ()), tuple(weights or ()), tuple(renderer or ()), tuple(policy or ()), tuple(scene or ()), tuple(preset or ()),
+        _states(state or []), as_day(since, "--since", now) if since else None, as_day(until, "--until", now) if until else None,
+    )  # fmt: skip
+    if page is not None and page.exists() and not overwrite:
+        raise InputError(DOING, f"--trend {page}", "it exists already", "name another file, or pass --overwrite")
+    found = find_runs(places, bool(metric) or steps or page is not None)
+    taken, lost = chosen(found, choice)
+    taken = taken[:last]
+    names = _metrics(metric or [], taken)
+    if steps or page is not None:
+        _trend(taken, names or list(HEADLINE), places, page, as_json)
+        _say(lost)
+        return
+    if as_json:
+        rows = [one.as_dict() | ({"metrics": _values(one, names)} if names else {}) for one in taken]
+        unreadable = [{"folder": str(one.folder), "problem": one.problem} for one in lost]
+        print(json.dumps({"runs": rows, "found": len(found), "unreadable": unreadable}))
+        return
+    if taken:
+        table, same = runs_table(taken, places, names)
+        Console().print(table)
+        if same:
+            print(f"in all: {same}")
+    print(f"{plural(len(taken), 'run')} of {len(found)} below {', '.join(map(str, places))}")
+    _say(lost)
+
+
+def _say(lost: Sequence[RunEntry]) -> None:
+    for one in lost:
+        warn(f"not judged, its run.json cannot be read: {one.folder}: {one.problem or one.state}")
+
+
+def _trend(entries: Sequence[RunEntry], metrics: Sequence[str], places: Sequence[Path], page: Path | None, as_json: bool) -> None:
+    """Print the steps from run to run, or write the page of them.
+
+    Raises:
+        InputError: No two of the runs are comparable.
+    """
+    from evaluators.runs.steps import as_json as trend_json
+    from evaluators.runs.steps import steps_tables
+    from evaluators.runs.trend import trend
+
+    found = trend(entries, metrics)
+    if not any(series.lines for series in found.series):
+        why = "; ".join(dict.fromkeys(reason for _, reason in found.left_out)) or "no finished run has these metrics"
+        do_this = "keep a run folder for each commit, with the same scenes, seeds, policy and preset"
+        raise InputError(DOING, f"{plural(len(entries), 'run')} below {', '.join(map(str, places))}", f"none to compare: {why}", do_this)
+    if page is not None:
+        from evaluators.runs.page import write_trend  # draws charts, which takes a second to load
+
+        write_trend(found, places, page)
+    if as_json:
+        print(json.dumps({"trend": None if page is None else str(page), **trend_json(found)}))
+        return
+    if page is not None:
+        print(f"page     {page}, {page.stat().st_size / 1e6:.1f} MB, {plural(len(found.series), 'line of runs', 'lines of runs')}")
+        return
+    for title, table in steps_tables(found, places):
+        print(title)
+        Console().print(table)
+    for entry, why in found.left_out:
+        print(f"left out  {shown_folder(entry.folder, places)}: {why}")
+
+
+def _states(asked: list[str]) -> tuple[State, ...]:
+    strange = [one for one in asked if one not in STATES]
+    if strange:
+        raise InputError(DOING, f"--state {strange[0]}", "no such state", f"name one of {', '.join(STATES)}")
+    return tuple(one for one in STATES if one in asked)
+
+
+def _metrics(asked: list[str], entries: list[RunEntry]) -> list[str]:
+    """Return the metrics to show; refuse one that neither simrun nor any of the runs knows."""
+    strange = [name for name in asked if name not in METRICS]
+    seen = {name for entry in entries for table in (entry.summary.get("metrics") or {}).values() for name in table} if strange else set()
+    for name in strange:
+        if name not in seen:
+            near = difflib.get_close_matches(name, {*METRICS, *seen}, 1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise InputError(DOING, f"--metric {name}", "no such metric", f"{hint}simrun list metrics names those that ship")
+    return asked
+
+
+def _values(entry: RunEntry, names: list[str]) -> list[dict[str, Any]]:
+    kept = ("mean", "ci95_clustered", "n_rollouts")
+    return [
+        {"renderer": r, "policy": p, "metric": name} | {key: entry.metric(name, r, p).get(key) for key in kept}
+        for r, p in variants_of(entry)
+        for name in names
+    ]
