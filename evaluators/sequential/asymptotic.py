@@ -14,11 +14,16 @@ import scipy  # its submodules load on first use
 
 from alpasim_plugin.types import F64, I64
 from evaluators.sequential.draws import Draws
-from evaluators.sequential.plan import LOG_SHARES, MIXTURE, Plan
+from evaluators.sequential.plan import LOG_SHARES as SHARES_OF_BETS
+from evaluators.sequential.plan import MULTIPLES as BETS
+from evaluators.sequential.plan import Plan
 
-FIRST_LOOK = 15  # scenes before the first statement; the error by first look is in docs/experiments/sequential.md
+FIRST_LOOK = 20  # scenes before the first statement; the error by first look is in docs/experiments/sequential.md
 LEAST_SPREAD = 0.25  # of the planned distance: scenes that are all alike show no spread, which is not the absence of one
 HALVINGS = 60
+# The largest bet is for bounded differences that hardly ever occur; here the others share what it would begin with.
+MULTIPLES = BETS[:-1]
+LOG_SHARES = SHARES_OF_BETS[:-1] - np.logaddexp.reduce(SHARES_OF_BETS[:-1])
 
 
 def log_evidence(draws: Draws, mean: F64 | float, plan: Plan, first_look: int = FIRST_LOOK) -> F64:
@@ -67,10 +72,8 @@ def _scales(draws: Draws, plan: Plan, first_look: int) -> tuple[F64, F64]:
 def _log_mixture(z: F64, rate: F64, n: I64) -> F64:
     """Return the log of the mixture of likelihood ratios of a Brownian motion at z sqrt(n)."""
     with np.errstate(invalid="ignore"):
-        logs = [
-            shape + multiple * rate * np.sqrt(n) * z - 0.5 * (multiple * rate) ** 2 * n
-            for (multiple, _), shape in zip(MIXTURE, LOG_SHARES, strict=True)
-        ]
+        slopes = [multiple * rate * np.sqrt(n) for multiple in MULTIPLES]
+        logs = [share + slope * z - 0.5 * slope**2 for slope, share in zip(slopes, LOG_SHARES, strict=True)]
     return np.asarray(np.logaddexp.reduce(np.stack(logs), axis=0))
 
 
@@ -79,7 +82,7 @@ def _bar(rate: F64, n: I64, log_bar: float) -> F64:
     shape = np.broadcast_shapes(rate.shape, n.shape)
     low, high = np.full(shape, -100.0), np.full(shape, 100.0)
     # One rate alone reaches the bar at (log_bar - log share) / (rate sqrt n) + rate sqrt n / 2: no z above the least of them is needed.
-    for (multiple, _), share in zip(MIXTURE, LOG_SHARES, strict=True):
+    for multiple, share in zip(MULTIPLES, LOG_SHARES, strict=True):
         slope = multiple * rate * np.sqrt(n)
         high = np.minimum(high, (log_bar - share) / slope + 0.5 * slope)
     for _ in range(HALVINGS):

@@ -4,7 +4,7 @@ A gambler bets against "the mean is at most m": after every scene the capital is
 capital is a nonnegative supermartingale that starts at 1, so the chance that it ever reaches 1 / alpha is at most alpha (Ville's
 inequality), at whatever scene one stops. All m that are not refuted make the confidence sequence (Waudby-Smith and Ramdas, Estimating
 means of bounded random variables by betting, JRSS B 86, 2024). The capital is shared among bets of several sizes (`plan.MIXTURE`). A bet
-depends on earlier scenes only. It is cut where it would risk more than `MOST_AT_RISK` of the capital, so the capital never reaches 0.
+depends on earlier scenes only. It is cut where it would risk more than its limit, so the capital never reaches 0.
 """
 
 from __future__ import annotations
@@ -13,23 +13,22 @@ import numpy as np
 
 from alpasim_plugin.types import F64
 from evaluators.sequential.draws import Draws
-from evaluators.sequential.plan import LOG_SHARES, MIXTURE, Plan
+from evaluators.sequential.plan import AT_RISK, LOG_SHARES, MULTIPLES, Plan
 
-MOST_AT_RISK = 0.95
-PRIOR_WIDTH = 0.25  # standard deviation that the first bets assume, as a share of the range
+PRIOR_SCENES, PRIOR_WIDTH = 10.0, 0.15  # the first bets assume so many scenes with this standard deviation, as a share of the range
 HALVINGS = 32
 
 
 def bet_sizes(draws: Draws, threshold: float, plan: Plan) -> F64:
     """Return the planned bet on every scene ``(..., n)``, from the scenes before it.
 
-    The variance is the mean square about the threshold of the scenes so far, and of one imagined scene with the standard deviation
-    `PRIOR_WIDTH` times the range.
+    The variance is the mean square about the threshold of the scenes so far, and of `PRIOR_SCENES` imagined ones with the standard
+    deviation `PRIOR_WIDTH` times the range.
     """
     square = (draws.x - draws.offset - draws.slope * threshold) ** 2
-    first = (PRIOR_WIDTH * (draws.high[..., :1] - draws.low[..., :1])) ** 2
-    before = first + np.cumsum(square, axis=-1) - square
-    return plan.rate(before / np.arange(1, draws.n + 1))
+    imagined = PRIOR_SCENES * (PRIOR_WIDTH * (draws.high[..., :1] - draws.low[..., :1])) ** 2
+    before = imagined + np.cumsum(square, axis=-1) - square
+    return plan.rate(before / (PRIOR_SCENES + np.arange(draws.n)))
 
 
 def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
@@ -47,8 +46,9 @@ def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
     room = centre - draws.low
     gain = draws.x - centre
     with np.errstate(divide="ignore", invalid="ignore"):
-        most = np.where(room > 0.0, MOST_AT_RISK / room, np.inf)
-        logs = [np.where(room < 0.0, np.inf, np.log1p(np.minimum(multiple * sizes, most) * gain)) for multiple, _ in MIXTURE]
+        most = np.where(room > 0.0, 1.0 / room, np.inf)
+        bets = [np.minimum(multiple * sizes, risk * most) for multiple, risk in zip(MULTIPLES, AT_RISK, strict=True)]
+        logs = [np.where(room < 0.0, np.inf, np.log1p(bet * gain)) for bet in bets]
     paths = np.cumsum(np.stack(logs), axis=-1)
     return np.asarray(np.logaddexp.reduce(paths + LOG_SHARES.reshape(-1, *[1] * draws.x.ndim), axis=0))
 

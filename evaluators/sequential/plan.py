@@ -9,10 +9,12 @@ import numpy as np
 
 from alpasim_plugin.types import F64
 
-# Bets on the planned distance, half of it and twice it, with the share of the capital that each begins with. Measured against other
-# mixtures in docs/experiments/sequential.md.
-MIXTURE: tuple[tuple[float, float], ...] = ((0.5, 0.2), (1.0, 0.5), (2.0, 0.3))
-LOG_SHARES = np.log([share for _, share in MIXTURE])
+# Bets on the planned distance, half of it, twice and four times it; the share of the capital that each begins with; and the share that it
+# may risk on one scene. Small bets that risk little survive the scene that changes for the worse among many that do not change; large bets
+# that risk nearly all decide fast where nothing changes. Measured against other mixtures in docs/experiments/sequential.md.
+MIXTURE: tuple[tuple[float, float, float], ...] = ((0.5, 0.15, 0.3), (1.0, 0.5, 0.5), (2.0, 0.2, 0.8), (4.0, 0.15, 0.98))
+MULTIPLES, LOG_SHARES, AT_RISK = (np.array(column) for column in zip(*MIXTURE, strict=True))
+LOG_SHARES = np.log(LOG_SHARES)
 
 
 @dataclass(frozen=True)
