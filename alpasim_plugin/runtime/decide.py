@@ -273,7 +273,7 @@ class _Drawing:
 
     def _reason_to_stop(self) -> str:
         if self.failed.cause != "pass":
-            return "rollouts failed: the same command runs them again"
+            return "rollouts failed"
         if self.state.answer != "open":
             return "decided"
         if self.lacking:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from evaluators.aggregate.outcome import WORDS
 from evaluators.metrics import info
 from evaluators.report.ending import LABEL
 from evaluators.report.metric_info import in_percent
@@ -38,7 +39,8 @@ def verdict_line(decision: Decision) -> str:
     """Say in one line what was decided, after how much."""
     n, most = len(decision["order"]), decision["ceiling"]
     after = f"after {n} of {most['scenes']} scenes, {decision['rollouts']} of at most {most['rollouts']} rollouts"
-    verdict = decision["outcome"]["cause"] if decision["outcome"]["cause"] not in ("pass", "regression") else decision["verdict"]
+    cause = decision["outcome"]["cause"]
+    verdict = decision["verdict"] if cause in ("pass", "regression", "undecided") else WORDS[cause].lower()
     text = f"{decision['candidate']} against {decision['baseline']}: {verdict}, {after}"
     why = "" if decision["stopped"] == "decided" else f" ({decision['stopped']})"
     return _line("verdict", text + why)
