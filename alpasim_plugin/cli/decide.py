@@ -102,7 +102,7 @@ def decide(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the end.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
-    """Drive scenes in random order until it is decided whether a renderer is worse than another; looking often costs nothing.
+    """Drive scenes in random order until it is decided whether a renderer is worse than another.
 
     An interrupted decision continues when the same command is given again, and decides the same.
     """
