@@ -23,6 +23,7 @@ from evaluators.gate import GateVerdict, check_matches, judge, judge_decided, lo
 from evaluators.report.gate import write_gate_files
 from evaluators.report.run_folder import read_run
 from evaluators.sequential.question import Question
+from evaluators.sequential.record import stopping_note
 
 EPILOG = """
 Examples:
@@ -85,6 +86,8 @@ def gate(
         write_baseline(found, approve)
         print(json.dumps({"baseline": str(approve)}) if as_json else f"baseline  {approve}")
         return
+    if note := stopping_note(run):
+        warn(note)
     spec, source = load_gate(gate_file)
     preset = str(found.summary.get("preset"))
     if spec.preset is not None and spec.preset != preset:

@@ -33,6 +33,8 @@ from evaluators.sequential.question import OPPOSITE, Question
 from evaluators.sequential.record import SCHEMA_VERSION, Decision, look_as_dict, question_as_dict, write_decision
 from evaluators.sequential.seeds import next_seeds
 
+KIND = "decide"  # of run.json
+
 
 class DecisionProgress(Progress, Protocol):
     """Shows a decision to a person or a log file."""
@@ -127,6 +129,7 @@ def execute_decision(
     with writing(root, wait, progress.noticed):
         contents = find_contents(root)
         held = claim(root, plan, command, threads, False, contents, progress.noticed)
+        write_run_json(root, read_run_json(root) | {"kind": KIND})  # so that nothing takes all scenes of the plan for wanted
         progress.started(plan, root, threads)
         began = time.perf_counter()
 
@@ -156,7 +159,7 @@ def _describe(root: Path, driven: RunPlan, command: Sequence[str], threads: Thre
     """Write run.json again with the scenes that were driven."""
     write_run_info(root, driven, command, threads)
     kept = {"started_at": held["started_at"]} if "started_at" in held else {}
-    write_run_json(root, read_run_json(root) | kept | {"kind": "decide"})
+    write_run_json(root, read_run_json(root) | kept | {"kind": KIND})
 
 
 class _Drawing:

@@ -20,6 +20,7 @@ from evaluators.sequential.plan import Plan
 
 FIRST_LOOK = 20  # scenes before the first statement; the error by first look is in docs/experiments/sequential.md
 LEAST_SPREAD = 0.25  # of the planned distance: scenes that are all alike show no spread, which is not the absence of one
+NO_SPREAD = 1e-150  # its square is above 0
 HALVINGS = 60
 # The largest bet is for bounded differences that hardly ever occur; here the others share what it would begin with.
 MULTIPLES = BETS[:-1]
@@ -62,7 +63,7 @@ def _scales(draws: Draws, plan: Plan, first_look: int) -> tuple[F64, F64]:
     x = draws.x - draws.x[..., :1]
     square = np.cumsum(x * x, axis=-1) - np.cumsum(x, axis=-1) ** 2 / n
     spread = np.sqrt(np.maximum(square, 0.0) / np.maximum(n - 1, 1))
-    floor = LEAST_SPREAD * plan.distance if plan.distance is not None else np.finfo(np.float64).tiny
+    floor = LEAST_SPREAD * plan.distance if plan.distance is not None else NO_SPREAD
     spread = np.maximum(spread, floor)
     at = min(first_look, draws.n) - 1
     scale = spread[..., at : at + 1]

@@ -122,6 +122,13 @@ def write_decision(root: Path, decision: Decision) -> None:
     write_sealed(root / DECISION, decision, "writing a decision")
 
 
+def stopping_note(root: Path) -> str | None:
+    """Say that the intervals of a fixed number of scenes do not hold for a run that stopped when it was decided; None of any other run."""
+    if read_decision(root) is None:
+        return None
+    return f"note: {root} was driven until it was decided: only the intervals of {DECISION} and of the report's first section hold for it"
+
+
 def read_decision(root: Path) -> Decision | None:
     """Read ``decision.json`` of a run folder; None where the run was no decision.
 

@@ -170,6 +170,11 @@ def plain_log_evidence(x: Sequence[float], mean: float, plan: Plan, first: int) 
     return out
 
 
+def test_renderers_that_never_differ_give_no_evidence_without_a_plan():
+    found = asymptotic.log_evidence(independent(np.zeros(40), -np.inf, np.inf), 0.0, Plan(None, 100, 0.05))
+    assert np.all(found[asymptotic.FIRST_LOOK - 1 :] < 0.0)
+
+
 @pytest.mark.parametrize("case", ["normal", "far from zero", "all equal", "two scenes"])
 def test_the_asymptotic_evidence_is_that_of_the_formula(case):
     x = {

@@ -107,12 +107,22 @@ def test_other_commands_read_the_run_and_the_report_shows_the_decision(worse, ca
     root = str(worse[0])
     assert run_command(["check", root]) == 0
     assert run_command(["compare", root]) == 0
-    assert "lateral_distance_m" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "lateral_distance_m" in said.out
+    assert "was driven until it was decided" in said.err
     page = render_report(read_run(worse[0]))
     assert 'id="decision"' in page
     assert "after 4 of 8 scenes, 8 of at most 16 rollouts" in page
     assert "wrong in at most 5 % of runs, over all looks" in page
     assert page.count("<svg") >= 2
+
+
+def test_a_damaged_decision_is_not_repaired_by_driving_all_its_scenes(worse, tmp_path: Path, capsys) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(worse[0], root)
+    next(root.glob("rollouts/*/*/*/0/rollout.asl")).unlink()
+    assert run_command(["check", str(root), "--repair"]) == 2
+    assert "its scenes were drawn one after another" in capsys.readouterr().err
 
 
 def test_a_damaged_record_is_named(worse, tmp_path: Path) -> None:
