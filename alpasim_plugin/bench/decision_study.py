@@ -11,11 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from alpasim_plugin.bench.interval_study import RATES, SHARED_NOISE, Design, pairs
+from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
+from evaluators.aggregate.power import scenes_needed
 from evaluators.sequential import asymptotic, betting
 from evaluators.sequential.control import predictions
 from evaluators.sequential.differences import SceneDifferences
@@ -127,13 +128,16 @@ def ends(case: Case, runs: int, scenes: int, alpha: float = ALPHA, look_every: i
 
 
 def fixed_scenes(distance: float, spread: float, power: float, tail: float) -> int:
-    """Return the scenes at which a one-sided t test of level ``tail`` has the power; `power.scenes_needed` for any level."""
-    n = 2
-    while True:
-        wanted = ((stats.t.ppf(1 - tail, n - 1) + stats.t.ppf(power, n - 1)) * spread / distance) ** 2
-        if n >= wanted:
-            return n
-        n = max(n + 1, math.ceil(wanted) if n > 30 else n + 1) if wanted - n > 1 else n + 1
+    """Return the scenes at which a one-sided t test of level ``tail`` has the power.
+
+    Raises:
+        EvaluatorError: No number of scenes that can be driven has it.
+    """
+    found = scenes_needed(distance, spread, power, tail)
+    if found is None:
+        why = "too many scenes, or none would do"
+        raise EvaluatorError("planning a fixed design", f"distance {distance:g}, spread {spread:g}", why, "plan for a larger difference")
+    return found
 
 
 def spread_of(draw: Draw, name: str, scenes: int = 200_000) -> float:
@@ -144,7 +148,8 @@ def spread_of(draw: Draw, name: str, scenes: int = 200_000) -> float:
 def _when(path: F64, bar: float, look_every: int) -> I64:
     over = path >= bar
     first = np.where(over.any(axis=1), over.argmax(axis=1) + 1, NEVER)
-    return np.where(first == NEVER, NEVER, -(-first // look_every) * look_every)
+    looked = np.minimum(-(-first // look_every) * look_every, path.shape[1])  # the last look is at the ceiling
+    return np.where(first == NEVER, NEVER, looked)
 
 
 def overall(runs: int, k: int, correlation: float, truths: str, scenes: int = 300) -> tuple[float, float]:
