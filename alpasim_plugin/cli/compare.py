@@ -18,6 +18,7 @@ from evaluators.report.metric_info import HEADLINE, in_percent
 from evaluators.report.numbers import plural
 from evaluators.report.run_folder import read_run
 from evaluators.report.tables import PairRow, pair_rows
+from evaluators.sequential.record import stopping_note
 
 EPILOG = """
 Examples:
@@ -49,6 +50,8 @@ def compare(
         margins = {name: rule.margin for name, rule in load_gate(gate)[0].metrics.items() if rule.margin is not None}
     for run in runs:
         use_run(run, warn)
+        if note := stopping_note(run):
+            warn(note)
     found = [read_run(run) for run in runs]
     result = (
         compare_within(found[0], baseline, margins, EVERY_MISSING)

@@ -5,18 +5,25 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from alpasim_plugin.cli.deciding import What, decide_into, plan_of, print_end, questions_of_gate
 from alpasim_plugin.cli.progress import make_progress, warn
+from alpasim_plugin.cli.run import parse_seeds
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.decide import Design
+from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
-from evaluators.gate import GateVerdict, check_matches, judge, load_gate, read_baseline, rows_of_run, write_baseline
+from evaluators.gate import GateVerdict, check_matches, judge, judge_decided, load_gate, read_baseline, rows_of_run, write_baseline
 from evaluators.report.gate import write_gate_files
 from evaluators.report.run_folder import read_run
+from evaluators.sequential.question import Question
+from evaluators.sequential.record import stopping_note
 
 EPILOG = """
 Examples:
@@ -24,6 +31,8 @@ Examples:
 - `simrun gate runs/nightly --gate default`
 
 - `simrun gate runs/main --write-baseline baseline.json`, then `simrun gate runs/change --gate gate.yaml --baseline-file baseline.json`
+
+- `simrun gate runs/change --until-decided --scenes suites/all --renderer clean,onefixer`: drives only as many scenes as the margins need
 
 - `simrun gate --self-test`
 
@@ -33,13 +42,23 @@ Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken poli
 
 
 def gate(
-    run: Annotated[Path | None, typer.Argument(help="A run folder.")] = None,
+    run: Annotated[Path | None, typer.Argument(help="A run folder; with --until-decided it is written.")] = None,
     gate_file: Annotated[str, typer.Option("--gate", help="A gate file, or the name of a shipped gate.")] = "default",
     baseline_file: Annotated[Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline.")] = None,
     approve: Annotated[Path | None, typer.Option("--write-baseline", help="Store the run as a baseline and stop.")] = None,
     self_test: Annotated[bool, typer.Option("--self-test", help="Drive broken renderers; fail unless the gate catches each.")] = False,
+    until_decided: Annotated[bool, typer.Option("--until-decided", help="Drive --scenes until every binding margin is decided.")] = False,
+    scenes: Annotated[list[str] | None, typer.Option("--scenes", help="Until decided: a scenario, suite or folder. Repeatable.")] = None,
+    renderer: Annotated[str | None, typer.Option("--renderer", help="Until decided: baseline and renderer in question.")] = None,
+    policy: Annotated[str, typer.Option("--policy", help="Until decided: the policy.")] = "lane-camera",
+    seeds: Annotated[str, typer.Option("--seeds", help="Until decided: seeds of every scene.")] = "1",
+    images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Until decided: frames in rollout.asl.")] = "jpeg",
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="Until decided: override a scenario key.")] = None,
+    alpha: Annotated[float, typer.Option("--alpha", min=1e-6, max=0.5, help="Until decided: chance of a wrong decision.")] = 0.05,
+    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Until decided: key of the order of scenes.")] = 0,
+    budget: Annotated[int | None, typer.Option("--budget", min=2, help="Until decided: most rollouts.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Where gate.md and gate.junit.xml go; by default the run folder.")] = None,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Self-test: worker processes.")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Self-test, until decided: worker processes.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
@@ -51,12 +70,24 @@ def gate(
         raise typer.Exit(_self_test(gate_file, out, workers, as_json))
     if run is None:
         raise InputError("judging a run", "simrun gate", "no run folder is named", "name one, or use --self-test")
+    if not until_decided and (scenes or renderer is not None):
+        raise InputError("judging a run", "--scenes, --renderer", "nothing is driven without --until-decided", "add it, or leave them out")
+    if until_decided:
+        if baseline_file is not None or approve is not None:
+            found_as_well = "a stored baseline is named as well"
+            raise InputError("judging a run", "--until-decided", found_as_well, "compare two renderers, or judge a run that is driven")
+        if not scenes or renderer is None:
+            raise InputError("judging a run", "--until-decided", "no scenes or renderers", "name them: --scenes SUITE --renderer A,B")
+        what = What(scenes, renderer, policy, parse_seeds(seeds), RunOptions(images=images), tuple(overrides or ()))
+        raise typer.Exit(_until_decided(run, gate_file, what, alpha, Design(order_seed, budget=budget), out, workers, as_json))
     use_run(run, warn)
     found = read_run(run)
     if approve is not None:
         write_baseline(found, approve)
         print(json.dumps({"baseline": str(approve)}) if as_json else f"baseline  {approve}")
         return
+    if note := stopping_note(run):
+        warn(note)
     spec, source = load_gate(gate_file)
     preset = str(found.summary.get("preset"))
     if spec.preset is not None and spec.preset != preset:
@@ -73,6 +104,27 @@ def gate(
     else:
         print_verdict(verdict)
     raise typer.Exit(verdict.exit_code)
+
+
+def _until_decided(
+    run: Path, gate_file: str, what: What, alpha: float, design: Design, out: Path | None, workers: int | None, as_json: bool
+) -> int:
+    """Drive until the gate's margins are decided, judge, write the gate's files, and return the exit code."""
+    spec, source = load_gate(gate_file)
+    options = replace(what.options, preset=spec.preset or what.options.preset, baseline=spec.baseline)
+    plan = plan_of(replace(what, options=options))
+    question = Question(questions_of_gate(spec), alpha, min_scenes=spec.min_scenes)
+    design = replace(design, max_failed=spec.max_failed, max_missing=spec.max_missing)
+    decided = decide_into(plan, question, design, {}, run, as_json, workers=workers)
+    found = read_run(run)
+    verdict = judge_decided(rows_of_run(found), spec, decided.record)
+    files = write_gate_files(verdict, source, found, out or run)
+    if as_json:
+        print(json.dumps({**verdict.as_dict(), "decision": decided.record, "files": [str(path) for path in files]}))
+    else:
+        print_verdict(verdict)
+        print_end(decided)
+    return verdict.exit_code
 
 
 def print_verdict(verdict: GateVerdict) -> None:

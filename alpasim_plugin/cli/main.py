@@ -32,6 +32,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "compare", "compare", "EPILOG",
         "Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are listed.",
     ),
+    "decide": ("decide", "decide", "EPILOG", "Drive scenes in random order until it is decided whether a renderer is worse than another."),
     "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
     "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
     "report": ("report", "report", "EPILOG", "Write report.html, summary.md and junit.xml of a run again and print its table."),

@@ -101,7 +101,7 @@ def run(
         raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is implemented", "use --executor local")
     names = [name.strip() for name in renderer.split(",") if name.strip()]
     drivers = split_policies(policy)
-    _check_preset(preset)
+    check_preset(preset)
     if baseline is not None and baseline not in names:
         raise InputError("choosing a baseline", f"--baseline {baseline}", f"the run has renderers {names}", "name one of them")
     of_scene, of_fixer = split_overrides(overrides or ())
@@ -172,7 +172,12 @@ def parse_seeds(text: str) -> list[int]:
     raise InputError("reading --seeds", f"--seeds {text}", found, "write a count such as 3, or a list such as 4,7")
 
 
-def _check_preset(preset: str) -> None:
+def check_preset(preset: str) -> None:
+    """Refuse a preset that is not there.
+
+    Raises:
+        InputError: It is unknown.
+    """
     if preset not in PRESETS:
         raise InputError("choosing a preset", f"--preset {preset}", "no such preset", f"known: {', '.join(PRESETS)}")
 

@@ -67,7 +67,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """A resolved run."""
+    """A resolved run.
+
+    Attributes:
+        asked: The scenarios as the command named them: files, folders, suites; in no key.
+        question: Digest of a question that decides which of the cells are driven; empty where all are.
+        whole: The plan that this is a part of, whose keys it bears; see `part_of`.
+    """
 
     cells: tuple[Cell, ...]
     scenarios: dict[str, Scenario]
@@ -75,17 +81,23 @@ class RunPlan:
     policies: tuple[PartSpec, ...]
     seeds: tuple[int, ...]
     options: RunOptions
-    asked: tuple[str, ...] = ()  # the scenarios as the command named them: files, folders, suites; not in any key
+    asked: tuple[str, ...] = ()
+    question: str = ""
+    whole: RunPlan | None = None
 
     @property
     def command_key(self) -> str:
         """Give a short digest of the command: names, paths and options, not the content of the parts."""
+        if self.whole is not None:
+            return self.whole.command_key
         named = [[*cell.names.values(), cell.ref.path, cell.ref.seed, cell.ref.overrides] for cell in self.cells]
-        return digest([named, asdict(self.options)])[:12]
+        return digest([named, asdict(self.options), *([self.question] if self.question else [])])[:12]
 
     @property
     def content(self) -> str:
         """Give a short digest of everything that determines the results; it changes with any part."""
+        if self.whole is not None:
+            return self.whole.content
         return digest([[cell.score_key for cell in self.cells], asdict(self.options)])[:12]
 
     @property
@@ -151,6 +163,14 @@ def make_plan(
         for seed in seeds
     ]
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:
+    """Return the part of a plan that consists of some of its cells, with the keys of the whole."""
+    scenes, seeds = {cell.scene for cell in cells}, {cell.seed for cell in cells}
+    scenarios = {name: scenario for name, scenario in plan.scenarios.items() if name in scenes}
+    kept = tuple(seed for seed in plan.seeds if seed in seeds)
+    return replace(plan, cells=tuple(cells), scenarios=scenarios, seeds=kept, whole=plan.whole or plan)
 
 
 def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:

@@ -113,8 +113,9 @@ def repair_run(found: Inspection, workers: int | None, progress: Progress, wait:
         with writing(found.root, wait, progress.noticed):
             remake_tables(inspect_run(found.root, full=True))
         return
-    if found.info.get("kind") in ("score", "fork"):
-        what = {"score": "they are scored logs", "fork": "it is a fork"}[found.info["kind"]]
+    if found.info.get("kind") in ("score", "fork", "decide"):
+        kinds = {"score": "they are scored logs", "fork": "it is a fork", "decide": "its scenes were drawn one after another"}
+        what = kinds[found.info["kind"]]
         raise InputError("repairing a run", str(found.root), f"{found.damage[0]}; {what}", f"give the command again: {command_of(found)}")
     plan = plan_of_run(found.info)
     if plan.content != found.info.get("content"):

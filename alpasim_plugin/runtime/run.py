@@ -129,7 +129,7 @@ def execute_run(
         return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
         contents = find_contents(root)
-        held = _claim(root, plan, command, threads, resume, contents, progress.noticed)
+        held = claim(root, plan, command, threads, resume, contents, progress.noticed)
         progress.started(plan, root, threads)
         began = time.perf_counter()
 
@@ -185,7 +185,7 @@ def _finished_already(plan: RunPlan, root: Path) -> RunResult:
     return RunResult(root, summary, len(plan.cells), summary["failures"]["n_failed"])
 
 
-def _claim(
+def claim(
     root: Path,
     plan: RunPlan,
     command: Sequence[str],

@@ -13,7 +13,7 @@ MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 LEAST_DECIDED_FLAGS = 6  # fewer changed scenes cannot reach p < 0.05 in the two-sided sign test
 
 
-def scenes_needed(distance: float, spread: float, power: float = POWER) -> int | None:
+def scenes_needed(distance: float, spread: float, power: float = POWER, tail: float = TAIL) -> int | None:
     """Return the number of scenes at which a 95 % t interval leaves out the margin with probability ``power``.
 
     N is the least with N >= ((t(0.975, N-1) + t(power, N-1)) spread / distance)^2, the usual sample size of a one-sample t test.
@@ -22,6 +22,7 @@ def scenes_needed(distance: float, spread: float, power: float = POWER) -> int |
         distance: Of the true difference from the margin, in the metric's unit.
         spread: Standard deviation of the difference between scenes (seeds averaged), same unit.
         power: Wanted probability.
+        tail: Probability of the interval's one end, 2.5 % for one of 95 %.
 
     Returns:
         At least 2; None where more than `MOST_SCENES` would be needed, or the difference lies on the margin.
@@ -35,11 +36,11 @@ def scenes_needed(distance: float, spread: float, power: float = POWER) -> int |
     if distance == 0.0 or not math.isfinite(spread / distance):
         return None
     low, high = 2, MOST_SCENES
-    if not _decides(high, distance, spread, power):
+    if not _decides(high, distance, spread, power, tail):
         return None
     while low < high:
         middle = (low + high) // 2
-        low, high = (low, middle) if _decides(middle, distance, spread, power) else (middle + 1, high)
+        low, high = (low, middle) if _decides(middle, distance, spread, power, tail) else (middle + 1, high)
     return low
 
 
@@ -79,6 +80,6 @@ def more_scenes(harm: float, spread: float, n_scenes: int, margin: float, is_fla
     return max(1, needed - n_scenes)
 
 
-def _decides(n: int, distance: float, spread: float, power: float) -> bool:
-    quantiles = float(scipy.special.stdtrit(n - 1, 1 - TAIL) + scipy.special.stdtrit(n - 1, power))
+def _decides(n: int, distance: float, spread: float, power: float, tail: float) -> bool:
+    quantiles = float(scipy.special.stdtrit(n - 1, 1 - tail) + scipy.special.stdtrit(n - 1, power))
     return math.sqrt(n) * abs(distance) >= quantiles * spread

@@ -1,6 +1,7 @@
 """The gate: criteria, baseline and verdict of a run."""
 
 from evaluators.gate.baseline import Baseline, baseline_of, check_matches, read_baseline, write_baseline
+from evaluators.gate.decided import judge_decided
 from evaluators.gate.judge import Check, GateVerdict, judge
 from evaluators.gate.rows import rows_of_run
 from evaluators.gate.spec import GateSpec, MetricRule, load_gate
@@ -14,6 +15,7 @@ __all__ = [
     "baseline_of",
     "check_matches",
     "judge",
+    "judge_decided",
     "load_gate",
     "read_baseline",
     "rows_of_run",

@@ -82,7 +82,9 @@ def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
     for check in verdict.checks:
         names = {"classname": clean(f"gate.{_variant(check)}"), "name": clean(f"{check.metric} {check.kind}")}
         case = ET.SubElement(suite, "testcase", names)
-        values = {key: check.entry[key] for key in ("diff", "ci95", "margin", "mean", "max", "min", "n_scenes") if key in check.entry}
+        values = {
+            key: check.entry[key] for key in ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes") if key in check.entry
+        }
         holder = ET.SubElement(case, "properties")
         for key, value in values.items():
             ET.SubElement(holder, "property", {"name": clean(key), "value": clean(str(value))})

@@ -19,6 +19,7 @@ from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.certificate import certificate
 from evaluators.report.charts import drift_charts
+from evaluators.report.decision import section
 from evaluators.report.events import events_of, read_series
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
 from evaluators.report.figures import forest, speed_against_error, strata_chart
@@ -101,6 +102,7 @@ def context(run: Run) -> dict[str, Any]:
         "title": ", ".join(run.renderers) or "empty run",
         "when": _when(run.info.get("started_at")),
         "finding": find(run),
+        "decision": section(run),
         "facts": _facts(run),
         "columns": tables.columns(run),
         "variant_colour": colours,

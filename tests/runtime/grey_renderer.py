@@ -12,6 +12,14 @@ GREY = "tests.runtime.grey_renderer:Grey"
 class Grey:
     """One grey level."""
 
+    level = 90
+
     def render(self, request: RenderRequest) -> Frame:
         shape = (request.camera.height, request.camera.width, 3)
-        return Frame(request.t_us, request.camera.name, np.full(shape, 90, dtype=np.uint8))
+        return Frame(request.t_us, request.camera.name, np.full(shape, self.level, dtype=np.uint8))
+
+
+class Darker(Grey):
+    """A darker one."""
+
+    level = 30

@@ -1,0 +1,308 @@
+"""Drive scenes in random order until a question is decided, into an ordinary run folder.
+
+Scenes are driven in batches. After each, the state follows from the scenes so far and their order alone (`evaluators.sequential`), and so
+does what is driven next: never from workers, times or interruptions. The same command therefore reaches the same decision after any kill.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from alpasim_plugin.child import end_children
+from alpasim_plugin.parts import digest
+from alpasim_plugin.runtime.certificate import Certify, certify
+from alpasim_plugin.runtime.contents import find_contents, read_run_json, write_run_json
+from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
+from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, write_run_info
+from alpasim_plugin.runtime.tables import pool_of, rollout_rows
+from alpasim_plugin.runtime.writing import writing
+from alpasim_plugin.seeding import stream
+from evaluators.aggregate.outcome import Outcome, outcome_of_failures
+from evaluators.aggregate.rows import by_renderer
+from evaluators.gate.judge import failures_of
+from evaluators.sequential.control import Control, adjusted_draws
+from evaluators.sequential.decision import State, outcome_of, state_after
+from evaluators.sequential.differences import SceneDifferences, scene_differences
+from evaluators.sequential.question import OPPOSITE, Question
+from evaluators.sequential.record import SCHEMA_VERSION, Decision, look_as_dict, question_as_dict, write_decision
+from evaluators.sequential.seeds import next_seeds
+
+KIND = "decide"  # of run.json
+
+
+class DecisionProgress(Progress, Protocol):
+    """Shows a decision to a person or a log file."""
+
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Announce a look."""
+        ...
+
+
+@dataclass(frozen=True)
+class Design:
+    """How scenes are drawn.
+
+    Attributes:
+        order_seed: Key of the random order.
+        look_every: Scenes between looks.
+        budget: Most rollouts; None: as many as the plan has.
+        auto_seeds: Choose the seeds of a scene by cost against variance; otherwise all of the plan are driven.
+        scene_cost: What a new scene costs, in pairs of rollouts.
+        max_failed: Share of rollouts that may fail.
+        max_missing: Share of pairs of a metric that may lack.
+    """
+
+    order_seed: int = 0
+    look_every: int = 5
+    budget: int | None = None
+    auto_seeds: bool = False
+    scene_cost: float = 0.0
+    max_failed: float = 0.0
+    max_missing: float = 0.0
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A decision and its run."""
+
+    run: RunResult
+    record: Decision
+    state: State
+    outcome: Outcome
+
+
+def key_of(question: Question, design: Design, controls: Mapping[str, Control]) -> str:
+    """Return the digest of what decides which rollouts are driven, besides the plan."""
+    return digest([asdict(question), asdict(design), {name: one.digest for name, one in controls.items()}])
+
+
+def drawing_order(scenes: Sequence[str], order_seed: int) -> list[str]:
+    """Return scenes in random order; it depends on their names and the seed, not on how they were listed."""
+    names = sorted(scenes)
+    return [names[i] for i in stream("decide", order_seed, "decide/order").permutation(len(names))]
+
+
+def execute_decision(
+    plan: RunPlan,
+    question: Question,
+    design: Design,
+    root: Path,
+    workers: int | None,
+    command: Sequence[str],
+    progress: DecisionProgress,
+    controls: Mapping[str, Control],
+    *,
+    certificate: Certify = "one",
+    report: bool = True,
+    wait: bool = False,
+    limit_s: float | None = None,
+) -> Decided:
+    """Drive scenes of a plan until the question is decided or the ceiling is reached.
+
+    Args:
+        plan: All cells that may be driven: two renderers, the baseline of ``plan.options`` and another, and one policy. Its ``question`` is
+            `key_of` the question.
+        question: What is to be decided.
+        design: How scenes are drawn.
+        root: The run folder; one process writes it at a time.
+        workers: As for a run; the results do not depend on them.
+        command: For ``run.json``.
+        progress: Shows rollouts and looks.
+        controls: METRIC -> what takes out variance; for the population ``suite`` only.
+        certificate: Whether to repeat a rollout.
+        report: Write ``report.html``.
+        wait: Wait for a process that writes the folder; otherwise refuse.
+        limit_s: Seconds that one rollout may take.
+
+    Raises:
+        InputError: The folder holds another run.
+        InfrastructureError: Another process writes the folder.
+    """
+    drawing = _Drawing(plan, question, design, controls)
+    threads = thread_budget(workers, design.look_every * drawing.per_seed * len(plan.seeds))
+    with writing(root, wait, progress.noticed):
+        contents = find_contents(root)
+        held = claim(root, plan, command, threads, False, contents, progress.noticed)
+        write_run_json(root, read_run_json(root) | {"kind": KIND})  # so that nothing takes all scenes of the plan for wanted
+        progress.started(plan, root, threads)
+        began = time.perf_counter()
+
+        def on_done(manifest: dict[str, Any], reused: bool) -> None:
+            manifest["reused"] = reused
+            progress.rollout_done(manifest, reused)
+
+        how, known = HowToRun(threads, limit_s=limit_s), contents.rollouts if contents else ()
+        try:
+            while cells := drawing.next_cells():
+                drawing.add(cells, execute(part_of(plan, cells), root, how, on_done, progress.noticed, known))
+                progress.looked(drawing.state, drawing.rollouts, drawing.ceiling)
+                write_decision(root, drawing.record())
+            driven = part_of(plan, drawing.cells)
+            manifests = [drawing.manifests[cell.folder.as_posix()] for cell in driven.cells]
+            pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
+            repeat = certify(driven, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+        finally:
+            end_children()
+        _describe(root, driven, command, threads, held)
+        summary = finish_run(root, manifests, {"pool": pool, "determinism": repeat}, report)
+    result = RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+    return Decided(result, drawing.record(), drawing.state, drawing.outcome)
+
+
+def _describe(root: Path, driven: RunPlan, command: Sequence[str], threads: Threads, held: Mapping[str, Any]) -> None:
+    """Write run.json again with the scenes that were driven."""
+    write_run_info(root, driven, command, threads)
+    kept = {"started_at": held["started_at"]} if "started_at" in held else {}
+    write_run_json(root, read_run_json(root) | kept | {"kind": KIND})
+
+
+class _Drawing:
+    """The scenes driven so far, what follows from them, and which come next."""
+
+    def __init__(self, plan: RunPlan, question: Question, design: Design, controls: Mapping[str, Control]) -> None:
+        self.plan, self.question, self.design, self.controls = plan, question, design, controls
+        first, second = (spec.name for spec in plan.renderers)
+        self.baseline = plan.options.baseline or first
+        self.candidate = second if self.baseline == first else first
+        self.order = drawing_order(list(plan.scenarios), design.order_seed)
+        self.per_seed = len(plan.renderers)
+        self.ceiling = min(design.budget or len(plan.cells), len(plan.cells))
+        self._of_scene: dict[str, list[Cell]] = {}
+        for cell in plan.cells:
+            self._of_scene.setdefault(cell.scene, []).append(cell)
+        self._chosen: dict[str, int] = {}  # scene -> seeds
+        self.manifests: dict[str, dict[str, Any]] = {}
+        self.looks: list[Any] = []
+        self.differences: dict[str, SceneDifferences] = {}
+        self.state = State(0, "open", ())
+        self.stopped = ""
+
+    @property
+    def rollouts(self) -> int:
+        """Give the number of rollouts so far."""
+        return len(self.manifests)
+
+    @property
+    def scenes(self) -> list[str]:
+        """Give the scenes driven so far, in their order."""
+        return self.order[: len(self._chosen)]
+
+    @property
+    def cells(self) -> list[Cell]:
+        """Give the cells driven so far, in the plan's order."""
+        return [cell for cell in self.plan.cells if cell.folder.as_posix() in self.manifests]
+
+    def next_cells(self) -> list[Cell]:
+        """Return the cells of the next batch; none where the decision has ended, and then ``stopped`` says why."""
+        if self.stopped:
+            return []
+        left = self.order[len(self._chosen) :]
+        if not left:
+            self.stopped = f"all {len(self.order)} scenes are driven"
+            return []
+        seeds = self._next_seeds()
+        affordable = (self.ceiling - self.rollouts) // (self.per_seed * seeds)
+        batch = left[: min(self.design.look_every, affordable)]
+        if not batch:
+            self.stopped = f"the budget of {self.ceiling} rollouts is spent"
+            return []
+        self._chosen |= dict.fromkeys(batch, seeds)
+        chosen = set(self.plan.seeds[:seeds])
+        return [cell for scene in batch for cell in self._of_scene[scene] if cell.seed in chosen]
+
+    def add(self, cells: Sequence[Cell], manifests: Sequence[dict[str, Any]]) -> None:
+        """Take in a batch and look."""
+        self.manifests |= {cell.folder.as_posix(): manifest for cell, manifest in zip(cells, manifests, strict=True)}
+        rows = rollout_rows(list(self.manifests.values()))
+        sides = by_renderer(rows)
+        self.failed = outcome_of_failures(failures_of(rows), self.design.max_failed)
+        values, adjusted = {}, {}
+        for one in self.question.metrics:
+            found = scene_differences(sides[self.candidate], sides[self.baseline], one.metric, self.scenes)
+            self.differences[one.metric] = found
+            values[one.metric] = found.harm(one.metric)
+            if self.question.population == "suite":
+                adjusted[one.metric] = adjusted_draws(values[one.metric], one, self.order, self.controls.get(one.metric))
+        self.state = state_after(self.question, values, self._horizon(), adjusted)
+        self.looks.append(look_as_dict(self.state, self.rollouts, self._chosen[self.scenes[-1]]))
+        self.stopped = self._reason_to_stop()
+
+    @property
+    def lacking(self) -> list[str]:
+        """Give the binding metrics that lack more pairs than allowed."""
+        return [
+            one.metric
+            for one in self.question.metrics
+            if one.binding and self.differences[one.metric].missing > self.design.max_missing * self.differences[one.metric].pairs.sum()
+        ]
+
+    @property
+    def outcome(self) -> Outcome:
+        """Give the outcome; failures of rollouts come first."""
+        if self.failed.cause != "pass":
+            return self.failed
+        if self.state.answer != "bad" and self.lacking:
+            return Outcome("undecided", (self.stopped,))
+        return outcome_of(self.question, self.state, self.stopped)
+
+    def record(self) -> Decision:
+        """Return ``decision.json``."""
+        outcome, asked = self.outcome, self.question.metrics[0].asked
+        words = {"pass": asked, "regression": OPPOSITE[asked]}
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "question": question_as_dict(self.question),
+            "candidate": self.candidate,
+            "baseline": self.baseline,
+            "policy": self.plan.policies[0].name,
+            "order_seed": self.design.order_seed,
+            "look_every": self.design.look_every,
+            "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},
+            "seeds": {"most": len(self.plan.seeds), "chosen_by": self._seeds_by(), "scene_cost": self.design.scene_cost},
+            "controls": {name: one.facts for name, one in self.controls.items()},
+            "order": self.scenes,
+            "looks": self.looks,
+            "verdict": words.get(outcome.cause, "undecided"),
+            "stopped": self.stopped,
+            "outcome": outcome.as_dict(),
+            "rollouts": self.rollouts,
+        }
+
+    def _reason_to_stop(self) -> str:
+        if self.failed.cause != "pass":
+            return "rollouts failed"
+        if self.state.answer != "open":
+            return "decided"
+        if self.lacking:
+            lost = ", ".join(f"{self.differences[name].missing} of {name}" for name in self.lacking)
+            return f"pairs lack a value: {lost}; more than the share of {self.design.max_missing:g} that is allowed"
+        return ""
+
+    def _horizon(self) -> int:
+        """Return the most scenes that can be driven: the size of the suite where that is the population."""
+        if self.question.population == "suite":
+            return len(self.order)
+        return max(1, min(len(self.order), self.ceiling // self.per_seed))
+
+    def _seeds_by(self) -> str:
+        return "cost against variance of earlier scenes" if self.design.auto_seeds else "all that were asked for"
+
+    def _next_seeds(self) -> int:
+        most = len(self.plan.seeds)
+        if not self.design.auto_seeds:
+            return most
+        if not self.differences:
+            return min(2, most)
+        log_bar, scenes = -math.log(self.question.alpha), len(self.order)
+        wanted = [
+            next_seeds(self.differences[one.metric], one.distance, log_bar, self.design.scene_cost, scenes, most)
+            for one, now in zip(self.question.metrics, self.state.metrics, strict=True)
+            if one.binding and now.answer == "undecided"
+        ]
+        return max(wanted, default=1)

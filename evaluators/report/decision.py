@@ -1,0 +1,178 @@
+"""How a decision is told: the last lines on a terminal, the section of the report and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evaluators.aggregate.outcome import WORDS
+from evaluators.metrics import info
+from evaluators.report.ending import LABEL
+from evaluators.report.metric_info import in_percent
+from evaluators.report.numbers import decimals, fixed
+from evaluators.report.run_folder import Run
+from evaluators.sequential.record import Decision, read_decision
+
+WORST_CASE = "any bound"
+
+
+@dataclass(frozen=True)
+class MetricRow:
+    """One metric in the report's table, printed."""
+
+    metric: str
+    verdict: str
+    tone: str
+    diff: str
+    interval: str
+    margin: str
+    evidence: str
+    n_scenes: int
+    guarantee: str
+    binding: bool
+
+
+def verdict_line(decision: Decision) -> str:
+    """Say in one line what was decided, after how much."""
+    n, most = len(decision["order"]), decision["ceiling"]
+    after = f"after {n} of {most['scenes']} scenes, {decision['rollouts']} of at most {most['rollouts']} rollouts"
+    cause = decision["outcome"]["cause"]
+    verdict = decision["verdict"] if cause in ("pass", "regression", "undecided") else WORDS[cause].lower()
+    text = f"{decision['candidate']} against {decision['baseline']}: {verdict}, {after}"
+    why = "" if decision["stopped"] == "decided" else f" ({decision['stopped']})"
+    return _line("verdict", text + why)
+
+
+def metric_lines(decision: Decision) -> list[str]:
+    """Return one line a metric, and one for the guarantee."""
+    lines = []
+    for row in metric_rows(decision):
+        note = "" if row.binding else ", not binding"
+        text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
+        lines.append(_line("", text))
+    return [*lines, *(_line("sure" if i == 0 else "", text) for i, text in enumerate(guarantee(decision)))]
+
+
+def guarantee(decision: Decision) -> list[str]:
+    """Say what is guaranteed, of what, and how far."""
+    asked = decision["question"]
+    of_what = {
+        "scenes": "about the population that the scenes were drawn from",
+        "suite": f"about the mean over the {decision['ceiling']['scenes']} scenes of this suite with these seeds",
+    }[asked["population"]]
+    first = f"wrong in at most {100 * asked['alpha']:g} % of runs, over all looks; {of_what}"
+    kinds: dict[str, list[str]] = {}
+    for name, one in asked["metrics"].items():
+        kinds.setdefault(one["guarantee"], []).append(name)
+    return [first, *(f"{', '.join(names)}: {kind}" for kind, names in kinds.items()), asked["rule"]]
+
+
+def metric_rows(decision: Decision) -> list[MetricRow]:
+    """Return the table of the last look."""
+    if not decision["looks"]:
+        return []
+    last = decision["looks"][-1]["metrics"]
+    rows = []
+    for name, one in decision["question"]["metrics"].items():
+        now = last[name]
+        scale, unit, places = _print_as(name, [now["diff"], one["margin"], *now["interval"]])
+        ends = [None if v is None else fixed(scale * v, places, sign=True) for v in now["interval"]]
+        tone = {"non-inferior": "better", "better": "better", "undecided": "unclear"}.get(now["verdict"], "worse")
+        rows.append(
+            MetricRow(
+                name, now["verdict"], tone,
+                "no pair" if now["diff"] is None else f"{fixed(scale * now['diff'], places, sign=True)}{unit}",
+                "no bound yet" if ends == [None, None] else f"{ends[0] or WORST_CASE} to {ends[1] or WORST_CASE}",
+                f"{scale * one['margin']:g}", f"{now['e_good']:.3g} and {now['e_bad']:.3g}",
+                now["n_scenes"], one["guarantee"], one["binding"],
+            )
+        )  # fmt: skip
+    return rows
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the report shows of a decision."""
+
+    decision: Decision
+    title: str
+    guarantee: list[str]
+    rows: list[MetricRow]
+    charts: list[Any]  # evaluators.report.charts.Chart
+
+
+def section(run: Run) -> Section | None:
+    """Return the section of a decided run, None of any other.
+
+    Raises:
+        InputError: decision.json is damaged.
+    """
+    decision = read_decision(run.folder)
+    if decision is None or not decision["looks"]:
+        return None
+    title = verdict_line(decision)[LABEL:]
+    return Section(
+        decision, title, guarantee(decision), metric_rows(decision), [chart(decision, name) for name in decision["question"]["metrics"]]
+    )
+
+
+def chart(decision: Decision, name: str) -> Any:
+    """Draw the confidence sequence of a metric over scenes, with the margin."""
+    import matplotlib as mpl
+
+    from evaluators.report.charts import INK, MUTED, RC, VARIANT, Chart, new_axes, themed_svg
+
+    one = decision["question"]["metrics"][name]
+    looks = decision["looks"]
+    scale, unit, _ = _print_as(name, [])
+    n = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
+    diff, low, high = (scale * _series([_at(look["metrics"][name], k) for look in looks]) for k in range(3))
+    sign = -1.0 if info(name).direction == "higher" else 1.0
+    threshold = scale * sign * one["threshold"]
+    limits = [threshold, -threshold] if info(name).direction == "none" else [threshold]
+    with mpl.rc_context(RC):
+        figure, axes = new_axes()
+        axes.fill_between(n, low, high, color=VARIANT[1], alpha=0.2, linewidth=0, step="post" if len(n) == 1 else None)
+        axes.plot(n, diff, color=VARIANT[1], marker="o", markersize=3)
+        axes.axhline(0.0, color=MUTED, linewidth=0.8)
+        for limit in limits:
+            axes.axhline(limit, color=INK, linewidth=1.0, linestyle=(0, (5.0, 2.0)))
+        known = np.concatenate([diff[np.isfinite(diff)], limits, [0.0], *_late(low, high)])
+        room = 0.15 * max(float(np.ptp(known)), 1e-9)
+        axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
+        axes.set_xlim(0.0, float(n[-1]) * 1.02)
+        axes.set_xlabel("scenes")
+        axes.set_ylabel((f"{unit.strip()}, " if unit.strip() else "") + f"{decision['candidate']} minus {decision['baseline']}")
+        axes.tick_params(length=0)
+        svg = themed_svg(figure)
+    return Chart(name, "Line: mean difference. Band: what is not refuted, at every look. Dashed: the margin.", svg)
+
+
+def _late(low: Any, high: Any) -> list[Any]:
+    """Return the bounds of the later half of the looks: the first ones would make the rest flat."""
+    half = len(low) // 2
+    return [ends[half:][np.isfinite(ends[half:])] for ends in (low, high)]
+
+
+def _at(look: Any, k: int) -> float | None:
+    value: float | None = look["diff"] if k == 0 else look["interval"][k - 1]
+    return value
+
+
+def _series(values: Sequence[float | None]) -> Any:
+    return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+
+
+def _print_as(name: str, values: Sequence[float | None]) -> tuple[float, str, int]:
+    """Return scale, unit and decimals in which a metric's differences are printed."""
+    unit = info(name).unit
+    if in_percent(name, unit):
+        return 100.0, " points", decimals(*(None if v is None else 100.0 * v for v in values))
+    return 1.0, f" {unit}" if unit else "", decimals(*values)
+
+
+def _line(label: str, text: str) -> str:
+    return f"{label:<{LABEL}}{text}".replace("\u00a0", " ")

@@ -1,0 +1,230 @@
+"""Decisions over real rollouts: resumed, by other numbers of workers, at a ceiling, with failures, and as a gate."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.contents import CONTENTS
+from alpasim_plugin.runtime.decide import Decided, Design, drawing_order, execute_decision, key_of
+from alpasim_plugin.runtime.manifests import MANIFEST
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
+from evaluators.report.html import render_report
+from evaluators.report.run_folder import read_run
+from evaluators.sequential.question import Question, metric_question
+from evaluators.sequential.record import DECISION, read_decision
+from scenarios.suite import ScenarioRef, expand
+from tests.runtime.grey_policy import BY_GREY
+from tests.runtime.grey_renderer import GREY
+from tests.runtime.test_runs import Heard
+
+DARKER = GREY.replace("Grey", "Darker")
+SHORT = ("timing.duration_us=700000", "timing.warmup_us=100000")
+SAME = Question((metric_question("offroad", 0.6, "non-inferior"),), alpha=0.2)
+WORSE = Question(
+    (metric_question("lateral_distance_m", 0.01, "non-inferior"), metric_question("offroad", 0.6, "non-inferior")), first_look=4
+)
+
+
+class Looks(Heard):
+    """Remembers looks, too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.looks: list[tuple[int, str]] = []
+
+    def looked(self, state, rollouts: int, ceiling: int) -> None:
+        self.looks.append((state.n_scenes, state.answer))
+
+
+def plan_of(scenes: int = 8, renderers: tuple[str, str] = (GREY, DARKER), policy: str = BY_GREY, seeds: tuple[int, ...] = (0,)) -> RunPlan:
+    ref = expand("smoke/straight", SHORT)[0]
+    refs = [ScenarioRef(ref.path, seed, ref.overrides) for seed in range(1, scenes + 1)]
+    return make_plan(refs, renderers, (policy,), seeds, RunOptions(images="none", baseline=renderers[0]))
+
+
+def decide(root: Path, question: Question, plan: RunPlan, design: Design, workers: int = 1, report: bool = False) -> tuple[Decided, Looks]:
+    heard = Looks()
+    asked = replace(plan, question=key_of(question, design, {}))
+    return execute_decision(asked, question, design, root, workers, ["simrun"], heard, {}, certificate="none", report=report), heard
+
+
+@pytest.fixture(scope="module")
+def worse(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Decided, Looks]:
+    """Drive until the darker renderer is shown to be worse."""
+    root = tmp_path_factory.mktemp("worse") / "run"
+    return root, *decide(root, WORSE, plan_of(), Design(look_every=2))
+
+
+def told(root: Path) -> dict:
+    return {key: value for key, value in (read_decision(root) or {}).items()}
+
+
+def test_a_renderer_that_is_worse_is_found_before_all_scenes_are_driven(worse) -> None:
+    root, decided, heard = worse
+    assert (decided.outcome.exit_code, decided.record["verdict"], decided.record["stopped"]) == (1, "worse", "decided")
+    assert decided.outcome.reasons == ("lateral_distance_m is worse",)
+    assert heard.looks == [(2, "open"), (4, "bad")]
+    assert decided.record["order"] == drawing_order(list(plan_of().scenarios), 0)[:4]
+    assert (decided.record["rollouts"], decided.record["ceiling"]) == (8, {"scenes": 8, "rollouts": 16})
+    assert len(read_run(root).rollouts) == 8
+
+
+def test_the_order_depends_on_the_seed_and_the_names_alone() -> None:
+    names = [f"s{i}" for i in range(20)]
+    assert drawing_order(names, 3) == drawing_order(names[::-1], 3)
+    assert drawing_order(names, 3) != drawing_order(names, 4)
+    assert sorted(drawing_order(names, 3)) == sorted(names)
+
+
+def test_an_interrupted_decision_continues_and_decides_the_same(worse, tmp_path: Path) -> None:
+    before = told(worse[0])
+    root = tmp_path / "again"
+    shutil.copytree(worse[0], root)
+    (root / CONTENTS).unlink()
+    for scene in before["order"][2:]:  # as after a kill during the second batch
+        for manifest in root.glob(f"rollouts/*/*/{scene}/0/{MANIFEST}"):
+            manifest.unlink()
+            break
+    decided, heard = decide(root, WORSE, plan_of(), Design(look_every=2))
+    assert sorted(heard.fates) == [("ok", False)] * 2 + [("ok", True)] * 6
+    assert told(root) == before
+    assert decided.record == before
+
+
+def test_another_question_in_the_same_folder_is_refused(worse) -> None:
+    with pytest.raises(InputError, match="it holds another run"):
+        decide(worse[0], SAME, plan_of(), Design(look_every=2))
+
+
+def test_other_commands_read_the_run_and_the_report_shows_the_decision(worse, capsys) -> None:
+    root = str(worse[0])
+    assert run_command(["check", root]) == 0
+    assert run_command(["compare", root]) == 0
+    said = capsys.readouterr()
+    assert "lateral_distance_m" in said.out
+    assert "was driven until it was decided" in said.err
+    page = render_report(read_run(worse[0]))
+    assert 'id="decision"' in page
+    assert "after 4 of 8 scenes, 8 of at most 16 rollouts" in page
+    assert "wrong in at most 5 % of runs, over all looks" in page
+    assert page.count("<svg") >= 2
+
+
+def test_a_damaged_decision_is_not_repaired_by_driving_all_its_scenes(worse, tmp_path: Path, capsys) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(worse[0], root)
+    next(root.glob("rollouts/*/*/*/0/rollout.asl")).unlink()
+    assert run_command(["check", str(root), "--repair"]) == 2
+    assert "its scenes were drawn one after another" in capsys.readouterr().err
+
+
+def test_a_damaged_record_is_named(worse, tmp_path: Path) -> None:
+    (tmp_path / DECISION).write_text((worse[0] / DECISION).read_text().replace("worse", "better"))
+    with pytest.raises(InputError, match="not the content that was written"):
+        read_decision(tmp_path)
+
+
+def test_at_the_ceiling_the_decision_is_undecided(tmp_path: Path) -> None:
+    decided, heard = decide(tmp_path, SAME, plan_of(renderers=(GREY, DARKER)), Design(look_every=3, budget=5))
+    assert (decided.outcome.exit_code, decided.record["rollouts"]) == (3, 4)
+    assert decided.outcome.reasons == ("offroad undecided: the budget of 5 rollouts is spent",)
+    assert heard.looks == [(2, "open")]
+
+
+def test_a_failed_rollout_ends_the_decision(tmp_path: Path) -> None:
+    broken = "tests.runtime.broken_policies:Raises"
+    decided, heard = decide(tmp_path, SAME, plan_of(policy=broken), Design(look_every=1))
+    assert decided.outcome.exit_code == 2  # the policy's own fault
+    assert heard.looks == [(1, "open")]
+    assert "rollouts failed" in decided.record["stopped"]
+
+
+def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, capsys) -> None:
+    words = [
+        "decide",
+        "--renderer",
+        f"{GREY},{DARKER}",
+        "--policy",
+        BY_GREY,
+        "--metric",
+        "offroad=0.6",
+        "--alpha",
+        "0.4",
+        "--look-every",
+        "1",
+    ]
+    words += [word for text in SHORT for word in ("--set", text)]
+    words += ["--images", "none", "--certify", "none", "--no-report", "--quiet", "--workers", "1", "smoke/straight", "smoke/curve", "--out"]
+    assert run_command([*words, str(tmp_path / "run")]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("verdict  ")
+    assert "non-inferior, after 2 of 2 scenes" in out
+    assert "wrong in at most 40 % of runs, over all looks" in out
+    assert run_command([*words, str(tmp_path / "run"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["decision"]["verdict"] == "non-inferior"
+
+
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        (["--renderer", GREY], "1 renderers"),
+        (["--renderer", f"{GREY},{DARKER}", "--metric", "progress=much"], "no number"),
+        (["--renderer", f"{GREY},{DARKER}", "--metric", "progress,progress"], "named twice"),
+        (["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--control", "family"], "--population suite"),
+        (["--renderer", f"{GREY},{DARKER}", "--ask", "better"], "no metric is named"),
+        (
+            ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--population", "suite", "--max-missing", "0.1"],
+            "left out of the suite",
+        ),
+        (
+            ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--population", "suite", "--seeds", "auto:3"],
+            "same seeds in every scene",
+        ),
+    ],
+)
+def test_questions_that_cannot_be_asked_are_refused(more, found, tmp_path: Path, capsys) -> None:
+    assert run_command(["decide", *more, "--policy", "log-replay", "smoke/straight", "--out", str(tmp_path / "run")]) == 2
+    assert found in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> None:
+    gate = tmp_path / "gate.yaml"
+    gate.write_text(
+        "version: 1\nmetrics:\n  offroad: {margin: 0.6}\n  lateral_distance_m: {margin: 0.1, must_decide: false}\n  progress: {min: 0.0}\n"
+    )
+    words = ["gate", str(tmp_path / "run"), "--until-decided", "--gate", str(gate), "--scenes", "smoke/straight", "--scenes", "smoke/curve"]
+    words += ["--renderer", f"{GREY},{DARKER}", "--policy", BY_GREY, "--images", "none", "--workers", "1", "--alpha", "0.4"]
+    words += [word for text in SHORT for word in ("--set", text)]
+    assert run_command(words) == 0
+    out = capsys.readouterr().out
+    assert "at every look, margin 60): non-inferior after 2 scenes" in out
+    assert "PASS (exit code 0)" in out
+    assert (tmp_path / "run" / "gate.md").read_text().startswith("## Gate: PASS")
+    assert run_command(["gate", str(tmp_path / "run"), "--scenes", "smoke/curve"]) == 2
+    assert run_command(["gate", str(tmp_path / "run"), "--until-decided"]) == 2
+
+
+@pytest.mark.slow
+def test_one_and_two_workers_reach_the_same_decision(worse, tmp_path: Path) -> None:
+    decide(tmp_path / "two", WORSE, plan_of(), Design(look_every=2), workers=2)
+    assert told(tmp_path / "two") == told(worse[0])
+
+
+@pytest.mark.slow
+def test_seeds_are_chosen_as_the_run_goes(tmp_path: Path) -> None:
+    design = Design(look_every=3, auto_seeds=True, scene_cost=4.0)
+    question = Question((metric_question("lateral_distance_m", 10.0, "non-inferior"),), first_look=9, min_scenes=9)
+    decided, _ = decide(tmp_path, question, plan_of(12, seeds=(0, 1, 2)), design)
+    seeds = [look["seeds"] for look in decided.record["looks"]]
+    assert seeds[0] == 2  # the pilot
+    assert all(1 <= m <= 3 for m in seeds)
+    assert decided.record["rollouts"] == 2 * sum(3 * m for m in seeds)
+    assert decided.outcome.exit_code == 0
