@@ -91,7 +91,8 @@ def render_trend(found: Trend, roots: Sequence[Path], beside: Path) -> str:
     return environment.get_template("trend.html.j2").render(
         style=Markup(style), script=Markup(script), script_hash=digest, plural=plural, sections=sections, colours=colours,
         moved=moved[:MOST_MOVED], more_moved=max(0, len(moved) - MOST_MOVED), n_steps=len(steps), false_alarms=0.05 * len(steps),
-        n_runs=len({id(run) for series in found.series for run in series.runs}), by_commit=found.by_commit, open_rows=OPEN_ROWS, most_rows=MOST_ROWS,
+        n_runs=len({id(run) for series in found.series for run in series.runs}), by_commit=found.by_commit,
+        open_rows=OPEN_ROWS, most_rows=MOST_ROWS,
         left_out=[(shown_folder(entry.folder, roots), why) for entry, why in found.left_out], where=", ".join(map(str, roots)),
         folder=lambda run: shown_folder(run.folder, roots), href=lambda run: report_href(run, beside),
     )  # fmt: skip

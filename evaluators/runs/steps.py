@@ -48,10 +48,9 @@ class StepRow:
 
 def step_rows(series: Series, line: Line) -> list[StepRow]:
     """Return the runs of a line, the newest first."""
-    rows = [StepRow(line.runs[0], _value(series, line, line.runs[0]), None, "", False)]
-    for step in line.steps:
-        rows.append(StepRow(step.after, _value(series, line, step.after), pair_row(line, step), changed_text(step), step.moved))
-    return rows[::-1]
+    first = StepRow(line.runs[0], _value(series, line, line.runs[0]), None, "", False)
+    later = [StepRow(s.after, _value(series, line, s.after), pair_row(line, s), changed_text(s), s.moved) for s in line.steps]
+    return [*reversed(later), first]
 
 
 def pair_row(line: Line, step: Step) -> PairRow:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from typing import Any
 
 from alpasim_plugin.errors import EvaluatorError, InputError
@@ -184,8 +185,7 @@ def _series(setting: Setting, runs: Sequence[RunEntry], metrics: Sequence[str], 
         for renderer in renderers:
             have = [one for one in runs if tables.has(one, renderer, setting.policy, metric)]
             if len(have) > 1:
-                pairs = zip(have, have[1:], strict=False)
-                steps = tuple(_step(before, after, metric, renderer, setting.policy, tables) for before, after in pairs)
+                steps = tuple(_step(before, after, metric, renderer, setting.policy, tables) for before, after in pairwise(have))
                 whole = steps[0] if len(steps) == 1 else _step(have[0], have[-1], metric, renderer, setting.policy, tables)
                 lines.append(Line(metric, renderer, tuple(have), steps, whole))
     return Series(setting, tuple(runs), tuple(lines))
