@@ -35,6 +35,7 @@ def check(sample: DriveSample, frames: int) -> None:
     assert all(sum(parts) < total for parts, total in zip(zip(*sample.stages.values(), strict=True), sample.ms, strict=True))
 
 
+@pytest.mark.slow
 def test_a_drive_in_chunks_shows_the_whole_clips_pictures() -> None:
     sample = drive_small("chunk")
     check(sample, 13)

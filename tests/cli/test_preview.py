@@ -43,6 +43,7 @@ def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsy
     assert "it exists already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_page_holds_the_picture_and_asks_for_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.html"

@@ -12,7 +12,9 @@ import subprocess
 import sys
 import venv
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,10 +30,15 @@ COMMANDS = commands(REPO)
 RUN = [command for command in COMMANDS if not command.why_not_run]
 
 
+@cache
+def _command(verb: str) -> Any:
+    return typer.main.get_command(make_app(verb))
+
+
 def parse(words: list[str]) -> None:
     """Parse a command line as `simrun` does, without running it."""
     args = with_verb(words)
-    command = typer.main.get_command(make_app(args[0]))
+    command = _command(args[0])
     context = command.make_context("simrun", args)
     while hasattr(command, "resolve_command"):
         rest = [*getattr(context, "_protected_args", ()), *context.args]

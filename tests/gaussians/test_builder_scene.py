@@ -117,6 +117,7 @@ def test_environment_without_houses_trees_and_poles_builds_none() -> None:
     assert kinds == {"ground", "far-ground", "paint", "surroundings", "kerb"}
 
 
+@pytest.mark.slow
 def test_everything_follows_a_sloping_ground() -> None:
     scenario, graph = empty_street(curve)
     for node in graph.background:
@@ -147,6 +148,7 @@ def test_scene_far_from_the_origin_equals_the_local_scene() -> None:
     assert np.abs(a.rgb - b.rgb).mean() < 1e-3
 
 
+@pytest.mark.slow
 def test_parked_log_of_one_pose_still_gives_a_scene() -> None:
     base = straight(actors=())
     log = Trajectory(np.array([0]), base.ego_log.xyz[:1], base.ego_log.quat[:1])

@@ -192,6 +192,7 @@ def blocks() -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs() -> None:
     space: dict[str, Any] = {}
     exec(compile(blocks()[0], "docs/gym.md", "exec"), space)

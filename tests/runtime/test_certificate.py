@@ -75,6 +75,7 @@ def test_one_changed_pixel_is_found_without_images_in_the_log(tmp_path: Path) ->
     assert "DIFFERENT" in certificate_line(found)
 
 
+@pytest.mark.slow
 def test_a_policy_that_remembers_is_named_before_the_motion_that_follows_from_it(tmp_path: Path) -> None:
     found = certificate(plan_of(policy=FORGETFUL, overrides=("timing.warmup_us=0",)), tmp_path)
     first = found["first_difference"]

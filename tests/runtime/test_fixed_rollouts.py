@@ -115,7 +115,7 @@ def test_where_every_forecast_is_right_the_drafts_are_the_offline_result(straigh
     assert_same_pictures(run.policy.seen, run.frames)
 
 
-@pytest.mark.parametrize("mode", ["speculative", "chunk"])
+@pytest.mark.parametrize("mode", first_of(["chunk", "speculative"]))
 def test_the_streaming_network_has_the_history_of_the_true_frames(straight_road: Scenario, mode: str) -> None:
     sizes = ("dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32")
     small = ("weights.bundle=null", *sizes, "untrained=random", "uses_map=false")
@@ -166,6 +166,7 @@ def test_the_shown_frame_of_a_hit_is_the_one_of_the_foretold_pose(straight_road:
         assert_same_pictures(run.frames[start : start + size - 1], draft[:-1])
 
 
+@pytest.mark.slow
 def test_without_tolerance_a_fixer_that_changes_nothing_leaves_no_trace_in_the_log(straight_road: Scenario) -> None:
     def digest(renderer: object) -> str:
         recorder = Recorder(straight_road, 0)
@@ -244,7 +245,7 @@ class BothWays(Watching):
     sensors: Sequence[SensorSpec] = (SensorSpec("front"), SensorSpec("rear"))
 
 
-@pytest.mark.parametrize("mode", ["speculative", "chunk"])
+@pytest.mark.parametrize("mode", first_of(["chunk", "speculative"]))
 def test_cameras_in_step_share_a_fixer_and_not_their_histories(straight_road: Scenario, mode: str) -> None:
     scenario = with_rear_camera(straight_road)
     run = drive(scenario, BothWays, mode=mode)

@@ -136,6 +136,7 @@ def test_v7_divides_its_updates_between_its_two_terms() -> None:
     assert [k.horizon for k in kinds] == [0, 0, 0, 4, 4]
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_with_the_same_weights(data: Path, tmp_path: Path) -> None:
     whole = train_fixer(run_of(data, "V9", steps=3), tmp_path / "whole", ("brightness", brightness))
 
