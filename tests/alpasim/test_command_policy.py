@@ -131,6 +131,7 @@ def test_check_policy_takes_a_command(folder: Path, capfd: pytest.CaptureFixture
     assert "FAIL" not in capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_command_that_dies_is_told_with_its_last_words_and_starts_anew(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     command = ["--renderer", "clean", "--policy", python("worse.py", "dies"), "smoke/straight", "--seeds", "1,2", "--out", "out", *SHORT]
     assert run_command([*command, "--json"]) == 2

@@ -89,6 +89,7 @@ def rollout(stub: Any, lengths: tuple[int, ...] = (5, 8, 8), **options: Any) -> 
 
 
 @pytest.mark.parametrize(("lengths", "others"), [((1, 4), (5,)), pytest.param((5, 8, 8), (9, 12), marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_chunks_equal_chunks_of_other_lengths_in_another_session(
     served: tuple[Any, Assembled], lengths: tuple[int, ...], others: tuple[int, ...]
 ) -> None:

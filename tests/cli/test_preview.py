@@ -29,6 +29,7 @@ def near(picture: np.ndarray, rgb: tuple[int, int, int]) -> int:
     return int((np.abs(picture[..., ::-1].astype(int) - rgb).max(axis=2) < 24).sum())
 
 
+@pytest.mark.slow
 def test_a_preview_shows_the_ego_the_others_and_the_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     out = tmp_path / "scene.png"

@@ -20,6 +20,7 @@ SCENE = "smoke/straight"
 SMALL = ["--steps", "3", "--views", "6", "--width", "32", "--gaussians", "240", "--threads", "1"]
 
 
+@pytest.mark.slow
 def test_files_metrics_and_pictures_and_the_same_command_continues(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["train", "splat", SCENE, "--out", str(tmp_path), *SMALL, "--json"]
     assert run_command(command) == 0

@@ -132,6 +132,7 @@ def test_a_contact_ends_the_episode() -> None:
     env.close()
 
 
+@pytest.mark.slow
 def test_episodes_follow_from_the_seed_and_a_left_episode_leaves_nothing_behind() -> None:
     env = DriveEnv("smoke/curve", camera="", scene_seeds=(0, 1), overrides=SHORT)
     env.reset(seed=12)

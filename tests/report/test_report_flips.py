@@ -99,6 +99,7 @@ def test_a_run_whose_pairs_all_end_alike_says_so(tmp_path: Path) -> None:
     assert "None: all 1\u00a0pair of rollouts end as they do behind clean." in write_report(folder).read_text()
 
 
+@pytest.mark.slow
 def test_a_changed_outcome_links_to_its_replay_where_there_is_one(usual_run: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(usual_run, tmp_path / "run"))
     flips, _ = find_flips(read_run(folder))

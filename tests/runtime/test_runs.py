@@ -67,6 +67,7 @@ def comparable(root: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("scenes", [("smoke/straight",), pytest.param(("smoke/straight", "smoke/lead_car"), marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_one_and_two_workers_give_the_same_run(tmp_path: Path, scenes: tuple[str, ...]) -> None:
     _, one = run(plan_of(scenes=scenes), tmp_path / "one", workers=1)
     _, two = run(plan_of(scenes=scenes), tmp_path / "two", workers=2)

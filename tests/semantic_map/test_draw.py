@@ -151,6 +151,7 @@ def test_concave_area_stays_concave():
     assert not pixel(10.0, 0.0).any()
 
 
+@pytest.mark.slow
 def test_road_users_go_from_the_front_colour_to_the_back_colour():
     side_on = draw_map(prepare_map(EMPTY, style=PLAIN), PIN, at(), (ActorBox(se2(10, 0, np.pi / 2, 0.8), CAR, "car"),))
     row = side_on[78]  # heading left: front at the left
@@ -386,6 +387,7 @@ def test_any_line_is_drawn_like_its_dense_points(a, b, fish, yaw):
 
 @settings(max_examples=examples(15), deadline=None)
 @given(x=st.floats(-4, 30), y=st.floats(-8, 8), yaw=st.floats(-3.1, 3.1), fish=st.booleans())
+@pytest.mark.slow
 def test_any_box_is_drawn_like_its_small_pieces(x, y, yaw, fish):
     camera = SMALL[fish]
     scene, boxes = prepare_map(EMPTY, style=PLAIN), (ActorBox(se2(x, y, yaw, 0.8), CAR, "car"),)

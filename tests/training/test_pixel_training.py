@@ -188,6 +188,7 @@ def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path: Path) -> None
     assert torch.equal(saved["mix.weight"], one["average.mix.weight"].half())
 
 
+@pytest.mark.slow
 def test_a_run_may_be_prolonged_until_its_decay_begins(tmp_path: Path) -> None:
     train_per_frame(run_of(20, 12), tmp_path / "long", None, stop_at=3)
     train_per_frame(run_of(6, 4), tmp_path / "run", None, stop_at=2)
