@@ -1,11 +1,11 @@
 # simrun in a container. On a CPU:        docker build -t simrun .
-# With CUDA (an Ubuntu 24.04 base):       docker build -t simrun-cuda --build-arg TORCH_INDEX=https://pypi.org/simple \
-#                                             --build-arg BASE=nvidia/cuda:12.8.1-runtime-ubuntu24.04 .
+# With CUDA (an Ubuntu 24.04 base):       docker build -t simrun-cuda --build-arg BASE=nvidia/cuda:12.8.1-runtime-ubuntu24.04 .
+# torch comes from pip's own index, which has its CUDA build; --build-arg TORCH_INDEX=URL names an index with CPU builds: gigabytes less.
 # Then:                                   docker run --rm -v "$PWD:/work" simrun --renderer clean,3dgs smoke/curve
 ARG BASE=python:3.11-slim-bookworm
 
 FROM ${BASE} AS build
-ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+ARG TORCH_INDEX=
 SHELL ["/bin/sh", "-euc"]
 RUN if ! command -v python3 >/dev/null || ! python3 -c "import ensurepip"; then \
         apt-get update; \
@@ -15,7 +15,7 @@ RUN if ! command -v python3 >/dev/null || ! python3 -c "import ensurepip"; then 
 RUN python3 -m venv /opt/simrun
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 # torch first, in a layer of its own: it is large, and changes seldom
-RUN /opt/simrun/bin/pip install --index-url "${TORCH_INDEX}" "torch>=2.8,<2.14"
+RUN /opt/simrun/bin/pip install ${TORCH_INDEX:+--index-url "${TORCH_INDEX}"} "torch>=2.8,<2.14"
 WORKDIR /source
 COPY pyproject.toml README.md LICENSE ./
 COPY alpasim_plugin alpasim_plugin

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import settings
 
 from tests.examples import PROFILE, examples
+from tests.report.browser import Browser, find_chromium
 
 settings.register_profile(PROFILE, derandomize=PROFILE == "quick", deadline=None, max_examples=examples(100))
 settings.load_profile(PROFILE)
@@ -88,3 +89,13 @@ def shared_data() -> Path:
 def repo() -> Path:
     """Give the repository root."""
     return REPO
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Give an installed Chromium; the test skips where there is none."""
+    executable = find_chromium()
+    if executable is None:
+        pytest.skip("no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)")
+    with Browser(executable) as opened:
+        yield opened

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.optional import require_library
 
 Library = Literal["pandas", "polars"]
 LIBRARIES: tuple[Library, ...] = ("pandas", "polars")
@@ -24,12 +24,9 @@ def require(library: str) -> Any:
     """
     if library not in LIBRARIES:
         raise InputError(DOING, f"frames={library!r}", "no such library", f"the libraries are {' and '.join(LIBRARIES)}")
-    try:
-        return import_module(library)
-    except ImportError as error:
-        other = next(name for name in LIBRARIES if name != library)
-        do_this = f"install the extra [notebook], or pip install {library}; frames={other!r} gives frames of {other}"
-        raise InputError(DOING, f"library {library}", f"it cannot be imported: {error}", do_this) from error
+    other = next(name for name in LIBRARIES if name != library)
+    do_this = f"install the extra [notebook], or pip install {library}; frames={other!r} gives frames of {other}"
+    return require_library(library, DOING, f"frames={library!r}", do_this)
 
 
 def frame_of(table: pa.Table, library: Library) -> Any:

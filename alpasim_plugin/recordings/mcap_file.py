@@ -5,15 +5,14 @@ from __future__ import annotations
 import heapq
 import json
 from collections.abc import Iterator, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.atomic import atomic_file
-from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import quat_from_matrix
+from alpasim_plugin.optional import require_library
 from alpasim_plugin.recordings import foxglove as fg
 from alpasim_plugin.recordings.colors import MAP, ROAD_USER, fainter, of_renderer
 from alpasim_plugin.recordings.content import DOING, Camera, Drive, Line, Recording, present
@@ -63,16 +62,8 @@ def write_mcap(recording: Recording, path: Path) -> dict[str, int]:
 
 
 def require_mcap() -> Any:
-    """Import the library.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    try:
-        return import_module("mcap.writer")
-    except ImportError as error:
-        do_this = "install the extra [mcap], or pip install mcap"
-        raise InputError(DOING, "--mcap", f"the library mcap cannot be imported: {error}", do_this) from error
+    """Import the library; see `require_library`."""
+    return require_library("mcap.writer", DOING, "--mcap", "install the extra [mcap], or pip install mcap")
 
 
 def _streams(recording: Recording) -> Iterator[Iterator[Item]]:

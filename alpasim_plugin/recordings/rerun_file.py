@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.atomic import atomic_file
-from alpasim_plugin.errors import InputError
 from alpasim_plugin.geometry import quat_from_matrix
+from alpasim_plugin.optional import require_library
 from alpasim_plugin.recordings.colors import MAP, ROAD_USER, Rgba, as_bytes, fainter, of_renderer
 from alpasim_plugin.recordings.content import DOING, Camera, Drive, Recording, present
 from alpasim_plugin.types import F64, I64, Box, Trajectory
@@ -54,16 +54,8 @@ def write_rrd(recording: Recording, path: Path) -> dict[str, int]:
 
 
 def require_rerun() -> Any:
-    """Import the library.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    try:
-        return import_module("rerun")
-    except ImportError as error:
-        do_this = "install the extra [rerun], or pip install rerun-sdk (half a gigabyte)"
-        raise InputError(DOING, "--rrd", f"the library rerun-sdk cannot be imported: {error}", do_this) from error
+    """Import the library; see `require_library`."""
+    return require_library("rerun", DOING, "--rrd", "install the extra [rerun], or pip install rerun-sdk (half a gigabyte)")
 
 
 class _Writer:

@@ -1,7 +1,7 @@
 """The state of the user's own project when a run began: the commit that a result belongs to.
 
-Git is asked, not imitated: worktrees, packed references and submodules are its business. It is told to run no program that the repository
-names (``core.fsmonitor``) and to write nothing.
+The ``git`` command reads the repository, so worktrees, packed references and submodules are handled. It runs with options that disable
+programs named by the repository (``core.fsmonitor``) and writes nothing.
 """
 
 from __future__ import annotations

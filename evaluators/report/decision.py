@@ -1,4 +1,4 @@
-"""How a decision is told: the last lines on a terminal, the section of the report and its picture."""
+"""Presentation of a decision: the last lines on a terminal, the section of the report and its picture."""
 
 from __future__ import annotations
 

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from evaluators.report import write_report
-from tests.report.browser import Browser, find_chromium
+from tests.report.browser import Browser
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    executable = find_chromium()
-    if executable is None:
-        pytest.skip("no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)")
-    with Browser(executable) as opened:
-        yield opened
 
 
 def column(browser: Browser, table: str, index: int) -> list[str]:

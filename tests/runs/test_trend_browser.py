@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from tests.report.browser import Browser, find_chromium
+from tests.report.browser import Browser
 from tests.runs.make_many import COMMITS, Many, make_one
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings
 
 pytestmark = pytest.mark.slow
 SHIFTS = (0.0, 0.0, 0.3, 0.3, 0.05)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    executable = find_chromium()
-    if executable is None:
-        pytest.skip("no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)")
-    with Browser(executable) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
@@ -18,7 +17,7 @@ from alpasim_plugin.viewer.serve import RunServer
 from alpasim_plugin.viewer.write import write_page
 from evaluators.report import write_report
 from evaluators.report.run_folder import read_run
-from tests.report.browser import Browser, find_chromium
+from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings
 from tests.viewer.make_watched import BARS, make_watched, unfinished
@@ -34,15 +33,6 @@ SEEN = f"""(() => {{
   }};
   return [...document.querySelectorAll('#cameras canvas')].map(bars);
 }})()"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    executable = find_chromium()
-    if executable is None:
-        pytest.skip("no Chromium on this machine (looked for chromium, chromium-browser, google-chrome)")
-    with Browser(executable) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

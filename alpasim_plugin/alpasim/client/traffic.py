@@ -1,7 +1,7 @@
 """``--traffic HOST:PORT``: the road users that move are driven by AlpaSim's TrafficService; those that stand stay where they are.
 
-The session gets the ego and every track, and the time at which the service takes over. At each step the service is told where the ego is
-and answers where everybody else is then; who is not in its answer is not there.
+The session gets the ego and every track, and the time of the hand-over. Each request holds the ego's pose; the reply holds the poses of all
+other road users at that time, and a road user without a pose is absent.
 """
 
 from __future__ import annotations
