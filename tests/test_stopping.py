@@ -6,12 +6,24 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
 
 import pytest
 
 from alpasim_plugin.stopping import Stopped, stoppable
 
 
+@pytest.fixture
+def nothing_ignored() -> Iterator[None]:
+    """Default handlers, also where the tests were started under nohup, which ignores SIGHUP."""
+    before = {one: signal.signal(one, signal.SIG_DFL) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for one, handler in before.items():
+        signal.signal(one, handler)
+
+
+@pytest.mark.usefixtures("nothing_ignored")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_unwinds_the_block_and_names_the_exit_code(number: signal.Signals, code: int) -> None:
     before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
@@ -19,7 +31,7 @@ def test_a_signal_unwinds_the_block_and_names_the_exit_code(number: signal.Signa
     with pytest.raises(Stopped) as caught, stoppable():  # noqa: PT012 - the block is what is stopped
         try:
             os.kill(os.getpid(), number)
-            signal.pause()
+            time.sleep(60)
         finally:
             unwound = True
     assert unwound
