@@ -34,6 +34,8 @@ def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, be
     if float(change.amax()) <= LARGE[0]:
         return None
     trusted = _ramp(_cells(opacity), *OPAQUE) * _ramp(change, *LARGE)
+    if not trusted.any():
+        return None
     mapped = F.max_pool2d((_cells(sdmap).mean(1, keepdim=True) + 1) / 2, 2 * REACH + 1, 1, REACH) > MAPPED
     now, past = _cells(out), _cells(before)
     low, high = (-F.max_pool2d(-past, 2 * REACH + 1, 1, REACH), F.max_pool2d(past, 2 * REACH + 1, 1, REACH))
@@ -45,7 +47,9 @@ def render_share(out: Tensor, render: Tensor, opacity: Tensor, sdmap: Tensor, be
 
 def _cells(x: Tensor) -> Tensor:
     """Average ``(B, H, W, C)`` over cells: ``(B, C, H / 8, W / 8)``."""
-    return F.avg_pool2d(x.permute(0, 3, 1, 2), CELL)
+    b, h, w, c = x.shape  # rows first, whose values lie in runs: torch pools few channels slowly
+    rows = x.reshape(b, h // CELL, CELL, w * c).mean(2)
+    return rows.view(b, h // CELL, w // CELL, CELL, c).mean(3).permute(0, 3, 1, 2)
 
 
 def _ramp(x: Tensor, low: float, high: float) -> Tensor:

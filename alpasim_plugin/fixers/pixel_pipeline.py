@@ -34,7 +34,7 @@ class LoadedGenerator:
     """A generator ready to run; read-only and stateless, so rollouts share it."""
 
     net: PixelGenerator
-    step: RecordedStep  # the same at t = 1
+    step: Callable[..., tuple[Tensor, PixelState]]  # the same at t = 1
     trained: bool
     note: str  # description of the weights, for labels
     precision: Choice
@@ -104,7 +104,7 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
     else:
         net, trained, note = _untrained(settings), False, f"untrained ({settings.untrained})"
     net = net.requires_grad_(False).eval().to(device=device, dtype=DTYPES[precision.name])
-    step = RecordedStep(net) if device == "cpu" else RecordedStep(net, None)
+    step = RecordedStep(net) if device == "cpu" else net
     return LoadedGenerator(net, step, trained, note, precision, torch.device(device))
 
 

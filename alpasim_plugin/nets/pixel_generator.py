@@ -70,6 +70,27 @@ class PixelState(NamedTuple):
         return PixelState(*(torch.where(at, new, old) for new, old in zip(start, self, strict=True)))
 
 
+class GatheredCells(NamedTuple):
+    """What the network reads, as cells of pixels."""
+
+    coarse: Tensor  # (B, H / 4, W / 4, 16 * IMAGES + hidden)
+    fine: Tensor  # (B, H / 2, W / 2, 4 * DETAIL_IMAGES)
+
+
+def gather_cells(render: Tensor, opacity: Tensor, sdmap: Tensor, state: PixelState, source: Tensor | None = None) -> GatheredCells:
+    """Put what the network reads side by side; arguments as in `PixelGenerator.forward`, result in float32.
+
+    ``coarse`` holds per cell the `cells` of render, 2 opacity - 1, map, last output, last render and source minus render, then the
+    recurrent channels; ``fine`` those of render, 2 opacity - 1 and last output.
+    """
+    cover = 2 * opacity - 1
+    noise = torch.zeros_like(render) if source is None else source - render
+    images = render, cover, sdmap, state.output, state.render, noise
+    coarse = torch.cat([*(cells(image, CELL) for image in images), state.hidden], dim=-1)
+    fine = torch.cat([cells(image, DETAIL) for image in (render, cover, state.output)], dim=-1)
+    return GatheredCells(coarse, fine)
+
+
 class PixelGenerator(nn.Module):
     """The network.
 
@@ -145,13 +166,13 @@ class PixelGenerator(nn.Module):
         Returns:
             ``(B, H, W, 3)`` the clean frame x_0, float32, not clipped, and the state after it.
         """
+        return self.from_cells(gather_cells(render, opacity, sdmap, state, source), render, state, t)
+
+    def from_cells(self, gathered: GatheredCells, render: Tensor, state: PixelState, t: Tensor | None = None) -> tuple[Tensor, PixelState]:
+        """Predict the clean frame from what `gather_cells` gathered; see `forward`."""
         dtype = self.stem.weight.dtype
-        cover = 2 * opacity - 1
-        noise = torch.zeros_like(render) if source is None else source - render
-        parts = [cells(image.to(dtype), CELL) for image in (render, cover, sdmap, state.output, state.render, noise)]
-        if self.remember is not None:
-            parts.append(state.hidden.to(dtype))
-        x4 = self.encode4(self.mix(activation(self.stem(torch.cat(parts, dim=-1)), inplace=True)))
+        coarse, fine = gathered.coarse.to(dtype), gathered.fine.to(dtype)
+        x4 = self.encode4(self.mix(activation(self.stem(coarse), inplace=True)))
         x8 = self.down8(activation(x4))
         if t is not None:
             x8 = x8 + self.time(torch.stack([1 - t, (1 - t).square()], dim=-1).to(dtype))[:, None, None]
@@ -163,7 +184,6 @@ class PixelGenerator(nn.Module):
         y = self.decode8(self.up8(y).add_(x8))
         y = activation(self.decode4(self.up4(y).add_(x4)), inplace=True)
         hidden = state.hidden if self.remember is None else torch.tanh(self.remember(y)).float()
-        fine = torch.cat([cells(image.to(dtype), DETAIL) for image in (render, cover, state.output)], dim=-1)
         fine = activation(self.read(fine).add_(self.up2(y)), inplace=True)
         fine = activation(self.refine(fine), inplace=True)
         out = pixels(self.write(fine), DETAIL).float() + render

@@ -1,10 +1,10 @@
-"""Drive the held-out scenes behind four renderers and put the tables into docs/experiments/fixer-closed-loop.md.
+"""Drive the held-out scenes behind some renderers and put the tables into docs/experiments/fixer-closed-loop.md.
 
-    python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:2] [--set KEY=VALUE]...
+    python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:5:clean+3dgs+onefixer] [--seconds 8]
 
 SCENES is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen ones; RUNS (default:
-runs/closed-loop) keeps the run folders, so a second call continues an interrupted first one. Behind a policy's name stands its number of
-seeds.
+runs/closed-loop) keeps the run folders, so a second call continues an interrupted first one. Behind a policy's name stand its number of
+seeds and its renderers, all four by default. A scene whose events need more than ``--seconds`` is driven for as many seconds as it needs.
 """
 
 from __future__ import annotations
@@ -13,17 +13,22 @@ import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
+import yaml
 from results import DOCS, number, replace
 
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.frozen_scenes import check_scenes
+from scenarios.load import load_scenario
 
 VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided
 BASELINE = "3dgs"
 RENDERERS = ("clean", BASELINE, "onefixer", "onefixer-dit-tiny")
+SECONDS_MOST = 21  # the scenes are drawn for 19.8 s
 EVENT = "offroad_or_collision_at_fault"
 SHOWN = ("collision_at_fault", "offroad", EVENT, "lateral_distance_m", "progress", "min_distance_to_obstacle_m")
 
@@ -48,13 +53,13 @@ def paired_cell(entry: dict[str, Any] | None, rate: bool) -> str:
     return f"{scale * entry['diff']:+.{digits}f}{bounds}{p}"
 
 
-def table(summary: dict[str, Any]) -> str:
+def table(summary: dict[str, Any], renderers: Sequence[str]) -> str:
     """Return metrics x renderers, and below it the paired differences from the baseline."""
-    others = [name for name in RENDERERS if name != BASELINE]
-    means = ["| metric | " + " | ".join(RENDERERS) + " |", "|---" * (len(RENDERERS) + 1) + "|"]
+    others = [name for name in renderers if name != BASELINE]
+    means = ["| metric | " + " | ".join(renderers) + " |", "|---" * (len(renderers) + 1) + "|"]
     pairs = [f"| minus {BASELINE} | " + " | ".join(others) + " |", "|---" * (len(others) + 1) + "|"]
     for metric in SHOWN:
-        entries = [summary["metrics"][name][metric] for name in RENDERERS]
+        entries = [summary["metrics"][name][metric] for name in renderers]
         rate = entries[0]["unit"] == ""
         unit = " (%)" if rate else f" ({entries[0]['unit']})" if entries[0]["unit"] else ""
         means.append(f"| `{metric}`{unit} | " + " | ".join(number(entry, rate) for entry in entries) + " |")
@@ -63,13 +68,13 @@ def table(summary: dict[str, Any]) -> str:
     return "\n".join(means) + "\n\n" + "\n".join(pairs)
 
 
-def families(rows: list[dict[str, Any]]) -> str:
+def families(rows: list[dict[str, Any]], renderers: Sequence[str]) -> str:
     """Return how many rollouts of each family of scenes left the road or were at fault in a contact, by renderer."""
     names = sorted({family(row) for row in rows})
-    lines = ["| left the road or at fault, rollouts | " + " | ".join(RENDERERS) + " |", "|---" * (len(RENDERERS) + 1) + "|"]
+    lines = ["| left the road or at fault, rollouts | " + " | ".join(renderers) + " |", "|---" * (len(renderers) + 1) + "|"]
     for name in names:
         cells = []
-        for renderer in RENDERERS:
+        for renderer in renderers:
             events = [row[EVENT] for row in rows if family(row) == name and row["renderer"] == renderer]
             known = [event for event in events if event is not None]
             cells.append(f"{int(sum(known))} of {len(known)}")
@@ -77,13 +82,13 @@ def families(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def events(rows: list[dict[str, Any]]) -> str:
+def events(rows: list[dict[str, Any]], renderers: Sequence[str]) -> str:
     """Return the rollouts with an event behind ``onefixer``, and what happened in the same rollout behind the others."""
     happened = {(row["scene"], row["seed"], row["renderer"]): word(row) for row in rows}
     named = sorted({(scene, seed) for scene, seed, renderer in happened if renderer == "onefixer" and happened[scene, seed, renderer]})
-    lines = ["| scene | seed | " + " | ".join(RENDERERS) + " |", "|---" * (len(RENDERERS) + 2) + "|"]
+    lines = ["| scene | seed | " + " | ".join(renderers) + " |", "|---" * (len(renderers) + 2) + "|"]
     for scene, seed in named:
-        lines.append(f"| `{scene}` | {seed} | " + " | ".join(happened[scene, seed, name] or "-" for name in RENDERERS) + " |")
+        lines.append(f"| `{scene}` | {seed} | " + " | ".join(happened[scene, seed, name] or "-" for name in renderers) + " |")
     return "\n".join(lines) if named else "No rollout behind `onefixer` has an event."
 
 
@@ -99,24 +104,42 @@ def family(row: dict[str, Any]) -> str:
     return str(row["scene"]).split("-")[-2].replace("_", " ")
 
 
+def duration_us(scenario: Path, seconds: int) -> int:
+    """Return a drive's length: as asked, or the least number of whole seconds in which the scenario's events fit."""
+    for longer in range(seconds, SECONDS_MOST):
+        try:
+            load_scenario(scenario, overrides=[f"timing.duration_us={longer * 1_000_000}"])
+        except InputError:
+            continue
+        return longer * 1_000_000
+    sys.exit(f"{scenario}: no duration below {SECONDS_MOST} s fits its events")
+
+
 def main() -> None:
     """Run what is missing and fill in the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("runs", type=Path, nargs="?", default=Path("runs/closed-loop"))
     parser.add_argument("--policies", default="learned:5,lane-camera:5")
-    parser.add_argument("--set", dest="settings", action="append", default=[])
+    parser.add_argument("--seconds", type=int, default=8)
     given = parser.parse_args()
-    scenes = [str(given.scenes / split / f"{name}.yaml") for split, frozen in check_scenes(given.scenes).items() for name in frozen.scenes]
-    settings = [word for value in given.settings for word in ("--set", value)]
-    parts = []
+    scenes = [given.scenes / split / f"{name}.yaml" for split, frozen in check_scenes(given.scenes).items() for name in frozen.scenes]
+    suite = given.runs / "suite.yaml"
+    given.runs.mkdir(parents=True, exist_ok=True)
+    entries = [{"path": str(path.resolve()), "set": {"timing.duration_us": duration_us(path, given.seconds)}} for path in scenes]
+    suite.write_text(yaml.safe_dump({"version": 1, "scenarios": entries}))
+    longer = [f"`{path.stem}` {of['set']['timing.duration_us'] / 1e6:g} s" for path, of in zip(scenes, entries, strict=True)
+              if of["set"]["timing.duration_us"] != given.seconds * 1_000_000]  # fmt: skip
+    parts = [f"{given.seconds} s each{'; ' + ', '.join(longer) if longer else ''}."]
     for name in given.policies.split(","):
-        policy, _, seeds = name.partition(":")
-        options = ["--renderer", ",".join(RENDERERS), "--baseline", BASELINE, "--policy", policy, "--seeds", seeds or "5", *settings]
-        summary = drive(given.runs / policy, [*options, "--images", "none", "--resume", *scenes])
+        words = name.split(":")
+        policy, seeds, renderers = words + ["", "5", "+".join(RENDERERS)][len(words) :]
+        shown = renderers.split("+")
+        options = ["--renderer", ",".join(shown), "--baseline", BASELINE, "--policy", policy, "--seeds", seeds]
+        summary = drive(given.runs / policy, [*options, "--images", "none", "--resume", str(suite)])
         rows = pq.read_table(given.runs / policy / "rollouts.parquet").to_pylist()
-        head = f"**{policy}**: {len(scenes)} scenes x {seeds or '5'} seeds"
-        parts.append("\n\n".join((head, table(summary), families(rows), events(rows))))
+        head = f"**{policy}**: {len(scenes)} scenes x {seeds} seeds"
+        parts.append("\n\n".join((head, table(summary, shown), families(rows, shown), events(rows, shown))))
     page = DOCS / "experiments" / "fixer-closed-loop.md"
     page.write_text(replace(page.read_text(), "closed-loop", "\n\n".join(parts)))
 

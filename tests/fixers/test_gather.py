@@ -1,0 +1,48 @@
+"""The fast gathering of what the generator reads equals the readable one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.fixers.gather import gather_cells_cpu
+from alpasim_plugin.nets.pixel_generator import PixelState, gather_cells
+
+
+def images(batch: int, height: int, width: int, hidden: int) -> tuple[Tensor, Tensor, Tensor, PixelState]:
+    draw = torch.Generator().manual_seed(batch + height + width + hidden)
+
+    def image(h: int, w: int, channels: int) -> Tensor:
+        return torch.rand(batch, h, w, channels, generator=draw) * 2 - 1
+
+    render, sdmap, output, last = (image(height, width, 3) for _ in range(4))
+    state = PixelState(
+        output, last, image(height // 4, width // 4, hidden), render.new_zeros(batch, 0, 1, 0), render.new_zeros(batch, 1, 1, 1)
+    )
+    return render, image(height, width, 1).abs(), sdmap, state
+
+
+@pytest.mark.parametrize(("batch", "height", "width", "hidden"), [(1, 16, 16, 16), (3, 32, 48, 16), (2, 16, 80, 0)])
+@pytest.mark.parametrize("noisy", [True, False])
+def test_one_pass_gathers_the_same_bits(batch: int, height: int, width: int, hidden: int, noisy: bool) -> None:
+    render, opacity, sdmap, state = images(batch, height, width, hidden)
+    source = render * 0.25 if noisy else render
+    fast, plain = (gather(render, opacity, sdmap, state, source) for gather in (gather_cells_cpu, gather_cells))
+    assert torch.equal(fast.coarse, plain.coarse)
+    assert torch.equal(fast.fine, plain.fine)
+
+
+def test_views_of_larger_images_and_values_that_are_not_numbers_pass_through() -> None:
+    render, opacity, sdmap, state = images(2, 32, 64, 16)
+    render[0, 3, 5, 1], opacity[1, 0, 0, 0] = float("nan"), float("inf")
+    half = slice(None), slice(0, 16), slice(16, 48)
+    views = (
+        render[half],
+        opacity[half],
+        sdmap[half],
+        state._replace(output=state.output[half], render=state.render[half], hidden=state.hidden[:, :4, :8]),
+    )
+    fast, plain = (gather(*views, views[2]) for gather in (gather_cells_cpu, gather_cells))
+    assert torch.equal(fast.coarse.nan_to_num(7.0), plain.coarse.nan_to_num(7.0))
+    assert torch.equal(fast.fine.nan_to_num(7.0), plain.fine.nan_to_num(7.0))
