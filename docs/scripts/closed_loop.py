@@ -1,6 +1,6 @@
 """Drive the held-out scenes behind some renderers and put the tables into docs/experiments/fixer-closed-loop.md.
 
-    python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5,lane-camera:5:clean+3dgs+onefixer] [--seconds 8]
+    python docs/scripts/closed_loop.py SCENES [RUNS] [--policies learned:5:clean+3dgs+onefixer,learned:2] [--seconds 8]
 
 SCENES is the folder that ``simrun train scenes`` wrote, with both test splits, which must be the frozen ones; RUNS (default:
 runs/closed-loop) keeps the run folders, so a second call continues an interrupted first one. Behind a policy's name stand its number of
@@ -136,8 +136,8 @@ def main() -> None:
         policy, seeds, renderers = words + ["", "5", "+".join(RENDERERS)][len(words) :]
         shown = renderers.split("+")
         options = ["--renderer", ",".join(shown), "--baseline", BASELINE, "--policy", policy, "--seeds", seeds]
-        summary = drive(given.runs / policy, [*options, "--images", "none", "--resume", str(suite)])
-        rows = pq.read_table(given.runs / policy / "rollouts.parquet").to_pylist()
+        summary = drive(given.runs / f"{policy}-{seeds}", [*options, "--images", "none", "--resume", str(suite)])
+        rows = pq.read_table(given.runs / f"{policy}-{seeds}" / "rollouts.parquet").to_pylist()
         head = f"**{policy}**: {len(scenes)} scenes x {seeds} seeds"
         parts.append("\n\n".join((head, table(summary, shown), families(rows, shown), events(rows, shown))))
     page = DOCS / "experiments" / "fixer-closed-loop.md"

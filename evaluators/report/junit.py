@@ -55,8 +55,9 @@ def junit(run: Run) -> ET.Element:
 
 
 def _suite_name(run: Run) -> str:
-    config = run.info.get("config") or {}
-    return str(run.info.get("suite") or config.get("suite") or run.folder.resolve().name)
+    """Return the suite or scenario that the command named, where it was one; a list of them has the name of the run's folder."""
+    asked = run.info.get("asked") or []
+    return str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
 
 
 def _case(suite: ET.Element, rollout: Rollout) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -53,6 +54,19 @@ def test_empty_run_is_an_empty_suite(tmp_path: Path) -> None:
     suite = ET.parse(write_junit(make_run(tmp_path / "empty-run", Plan(renderers=(), scenes=())))).getroot().find("testsuite")
     assert suite is not None
     assert (suite.attrib["name"], suite.attrib["tests"]) == ("empty-run", "0")
+
+
+def test_the_suite_has_the_name_that_the_command_gave(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "named", Plan(renderers=(), scenes=()))
+    file = run / "run.json"
+    info = json.loads(file.read_text())
+    names = []
+    for asked in (["suites/first"], ["a.yaml", "b.yaml"]):
+        file.write_text(json.dumps(info | {"asked": asked}))
+        suite = ET.parse(write_junit(run)).getroot().find("testsuite")
+        assert suite is not None
+        names.append(suite.attrib["name"])
+    assert names == ["suites/first", "named"]
 
 
 @given(st.text(st.characters(codec="utf-8")))
