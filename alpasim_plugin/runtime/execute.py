@@ -15,6 +15,7 @@ from typing import Any
 
 from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.runtime.cell import find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.kernels import compile_for
 from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.workers import Lost, in_workers
@@ -92,6 +93,8 @@ def execute(
         manifests[cell.folder] = manifest
         on_done(manifest, True)
     here = how.threads.workers == 1 and how.limit_s is None
+    if not here:
+        compile_for(todo, plan.scenarios, how.threads.workers)
     runner = _run_here if here else _run_in_workers
     for cell, manifest in runner(todo, plan.options, root, how):
         manifests[cell.folder] = manifest

@@ -112,7 +112,8 @@ def actor_geometry(actors: Sequence[ActorBox], scene: PreparedMap, pose: F64) ->
     shades = [style.box_colours[box_class(actors[i].label)] for i in order]
     colours = np.array([(0.0, *front, *back) for front, back in shades], dtype=np.float64).reshape(-1, 7)
     n = len(TRIANGLES)
-    shade = np.tile((0.5 - CORNERS[:, 0])[TRIANGLES], (len(actors), 1))
+    # Tiled once, an array keeps the order of its index; the kernel would be compiled for that order as well.
+    shade = np.ascontiguousarray(np.tile((0.5 - CORNERS[:, 0])[TRIANGLES], (len(actors), 1)))
     faces = Triangles(corners[:, TRIANGLES].reshape(-1, 3, 3), np.repeat(uncut, n), shade, np.repeat(colours, n, axis=0))
     edge = np.array((style.box_edge_px, 1.0, style.edge_bias_m, *style.colours["box_edge"]), dtype=np.float64)
     ends = corners[:, EDGES].reshape(-1, 2, 3)
