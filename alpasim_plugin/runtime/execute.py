@@ -1,4 +1,4 @@
-"""Run the cells of a plan: in this process for one worker, in spawned processes for more.
+"""Run the cells of a plan: in this process for one worker, in spawned processes for more, or on the nodes of a cluster.
 
 A cell's result does not depend on where or when it runs: every random stream is keyed by (scene, seed, component, step) and the
 rasteriser is bit-equal for any number of threads. Workers may therefore run cells in any order.
@@ -14,11 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.errors import InfrastructureError
-from alpasim_plugin.runtime.cell import find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool
+from alpasim_plugin.runtime.executors.dispatch import dispatch
+from alpasim_plugin.runtime.executors.identity import targets_of
+from alpasim_plugin.runtime.executors.local import run_local
+from alpasim_plugin.runtime.executors.parcel import unpack
 from alpasim_plugin.runtime.kernels import compile_for
 from alpasim_plugin.runtime.manifests import write_manifest
-from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runtime.workers import Lost, in_workers
+from alpasim_plugin.runtime.plan import Cell, RunPlan
+from alpasim_plugin.runtime.workers import Lost
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
 
@@ -31,13 +36,16 @@ class Threads:
     per_worker: int
 
 
-def thread_budget(workers: int | None, n_cells: int) -> Threads:
-    """Divide the cores that this process may use among the workers.
+def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL) -> Threads:
+    """Divide the cores that this process may use among the workers; those of other nodes have the cores that the executor asks for.
 
     Args:
-        workers: Number of workers; None is one per core. Never more than cells.
+        workers: Number of workers; None is one per core. Never more than cells. On other nodes it is the most, and None is no bound.
         n_cells: Number of cells to run.
+        executor: Where rollouts run.
     """
+    if not executor.is_local:
+        return Threads(max(1, min(workers or n_cells, n_cells)), executor.resources.cores)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     chosen = max(1, min(workers or cores, max(n_cells, 1)))
     return Threads(chosen, max(1, cores // chosen))
@@ -53,6 +61,7 @@ class HowToRun:
         full: Read every file of a finished rollout before it is reused, even if size and time are as written.
         retry: Drive again also what failed by the policy's own fault.
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
+        executor: Where rollouts run.
     """
 
     threads: Threads
@@ -60,6 +69,7 @@ class HowToRun:
     full: bool = False
     limit_s: float | None = None
     retry: bool = False
+    executor: Executor = LOCAL
 
 
 def execute(
@@ -92,57 +102,46 @@ def execute(
         manifest = state.manifest if remedy == "none" else rescore_cell(cell, plan.options, root, state.manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
-    here = how.threads.workers == 1 and how.limit_s is None
-    if not here:
-        compile_for(todo, plan.scenarios, how.threads.workers)
-    runner = _run_here if here else _run_in_workers
-    for cell, manifest in runner(todo, plan.options, root, how):
+    runner = _run_local if how.executor.is_local else _run_elsewhere
+    for cell, manifest in runner(todo, plan, root, how, noticed):
         manifests[cell.folder] = manifest
         on_done(manifest, False)
     return [manifests[cell.folder] for cell in plan.cells]
 
 
-def _run_here(todo: Sequence[Cell], options: RunOptions, root: Path, how: HowToRun) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    for cell in todo:
-        yield cell, run_cell(cell, options, root, how.threads.per_worker)
+Done = Iterator[tuple[Cell, dict[str, Any]]]
 
 
-def _run_in_workers(todo: Sequence[Cell], options: RunOptions, root: Path, how: HowToRun) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Run cells in workers. A cell whose worker died runs again at the end, alone: it may have been the victim of another's memory."""
-    work = partial(run_cell, options=options, root=root, threads=how.threads.per_worker)
-    victims: list[Cell] = []
-    for cell, got in in_workers(work, todo, how.threads.workers, how.threads.per_worker, how.limit_s):
-        if not isinstance(got, Lost):
-            yield cell, got
-        elif got.hung:
-            yield cell, _lost(cell, root, got)
-        else:
-            victims.append(cell)
-    for cell in victims:
-        remedy, state = find_rollout_state(cell, root, reuse_undigested=True)  # the worker may have died after writing it
-        if remedy == "none" and state.manifest is not None:
-            yield cell, state.manifest
-            continue
-        for _, got in in_workers(work, [cell], 1, how.threads.per_worker, how.limit_s):
-            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
+def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, noticed: Callable[[str], None]) -> Done:
+    """Run cells in this process, or in workers that write the run folder themselves."""
+    if how.threads.workers > 1 or how.limit_s is not None:
+        compile_for(todo, plan.scenarios, how.threads.workers)
+    work = partial(run_cell, options=plan.options, root=root, threads=how.threads.per_worker)
+
+    def recall(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
+        remedy, state = find_rollout_state(cell, root, reuse_undigested=True)
+        return state.manifest if remedy == "none" else None
+
+    for cell, got in run_local(work, todo, how.threads.workers, how.threads.per_worker, how.limit_s, recall):
+        yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
+
+
+def _run_elsewhere(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, noticed: Callable[[str], None]) -> Done:
+    """Run cells on other nodes; only this process writes the run folder."""
+    if not todo:
+        return
+    from alpasim_plugin.runtime.executors.mission import mission_of  # a run on this machine needs none of it
+
+    mission, contents = mission_of(plan, todo, how.threads.per_worker)
+    most = min(how.threads.workers, len(todo))
+    with opened_pool(how.executor, mission, contents, targets_of(plan.parts), most, root, noticed) as pool:
+        for cell, got in dispatch(pool, todo, noticed, how.limit_s):
+            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
-    """Write the manifest of a rollout whose worker died twice, or was killed since it took too long."""
-    if lost.hung:
-        found, do_this = lost.found, "look at what hangs with --workers 1, or raise --time-limit"
-    else:
-        found = f"{lost.found}, twice, without an error message"
-        do_this = "look for the out-of-memory killer in the system log, or use --workers 1"
-    error = InfrastructureError("running a rollout in a worker process", cell.folder.as_posix(), found, do_this)
-    manifest = {
-        **cell.names,
-        "path": cell.folder.as_posix(),
-        "rollout_key": cell.rollout_key,
-        "score_key": cell.score_key,
-        "status": "failed",
-        "error": error.as_dict(),
-        "wall_s": None,
-    }
+    """Write the manifest of a rollout whose workers died, or that was ended since it took too long."""
+    error = InfrastructureError("running a rollout in a worker process", cell.folder.as_posix(), lost.found, lost.do_this)
+    manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

@@ -31,6 +31,7 @@ from alpasim_plugin.runtime.contents import (
     write_run_json,
 )
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
 from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan, slug
 from alpasim_plugin.runtime.project import project
@@ -103,6 +104,7 @@ def execute_run(
     full: bool = False,
     limit_s: float | None = None,
     retry: bool = False,
+    executor: Executor = LOCAL,
 ) -> RunResult:
     """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
 
@@ -119,12 +121,13 @@ def execute_run(
         full: Read every file of a finished rollout before it is reused, even if size and time are as written.
         limit_s: Seconds that one rollout may take.
         retry: Drive again also what failed by the policy's own fault.
+        executor: Where rollouts run; the results do not depend on it.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
         InfrastructureError: Another process writes the folder, or it is read-only and the run is not finished.
     """
-    threads = thread_budget(workers, len(plan.cells))
+    threads = thread_budget(workers, len(plan.cells), executor)
     if root.exists() and not os.access(root, os.W_OK):
         return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
@@ -137,11 +140,12 @@ def execute_run(
             manifest["reused"] = reused
             progress.rollout_done(manifest, reused)
 
-        how = HowToRun(threads, resume, full, limit_s, retry)
+        how = HowToRun(threads, resume, full, limit_s, retry, executor)
+        repeating = threads if executor.is_local else thread_budget(1, 1)
         try:
             manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
             pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
-            determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+            determinism = certify(plan, root, manifests, repeating.workers * repeating.per_worker, certificate, held.get("determinism"))
         finally:
             end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
