@@ -187,7 +187,7 @@ def _choose(books: _Books[A, R], pool: Pool[A], place: Place, now_s: float, limi
     for index in list(books.again):
         if index in books.done:
             books.again.remove(index)
-        elif place.node not in books.tried.get(index, ()) or nodes <= books.tried[index]:
+        elif not place.node or place.node not in books.tried.get(index, ()) or nodes <= books.tried[index]:
             books.again.remove(index)
             return (index,)
     if books.todo:
