@@ -41,6 +41,10 @@ Examples:
 - `simrun --renderer 3dgs --policy pure-pursuit suites/smoke --out runs/smoke --video all`
 
 - `simrun --renderer clean --policy log-replay ../data/av2/7fab2350`
+
+- `simrun --renderer clean,3dgs --executor ray --cores 2 suites/urban`
+
+- `simrun --renderer clean,3dgs --executor slurm:cpu --workers 64 --store s3://bucket/night suites/urban`
 """
 
 
@@ -62,6 +66,9 @@ def run(
     cores: Annotated[int | None, typer.Option("--cores", min=1, help="Cores of each worker on a cluster; by default 1.")] = None,
     gpus: Annotated[float | None, typer.Option("--gpus", min=0.0, help="Share of a GPU of each worker on a cluster.")] = None,
     memory: Annotated[float | None, typer.Option("--memory", min=0.001, help="Memory of each worker on a cluster, in GiB.")] = None,
+    store: Annotated[
+        str | None, typer.Option("--store", metavar="URL", help="Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.")
+    ] = None,
     video: Annotated[Literal["none", "failures", "all"], typer.Option("--video", help="Write front.mp4.")] = "none",
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
     overrides: Annotated[
@@ -134,6 +141,7 @@ def run(
             limit_s=time_limit,
             retry=retry,
             executor=where,
+            store=store,
         )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"

@@ -7,7 +7,7 @@ rasteriser is bit-equal for any number of threads. Workers may therefore run cel
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,10 +19,12 @@ from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool
 from alpasim_plugin.runtime.executors.dispatch import dispatch
 from alpasim_plugin.runtime.executors.identity import targets_of
 from alpasim_plugin.runtime.executors.local import run_local
-from alpasim_plugin.runtime.executors.parcel import unpack
+from alpasim_plugin.runtime.executors.parcel import Parcel, unpack
 from alpasim_plugin.runtime.kernels import compile_for
 from alpasim_plugin.runtime.manifests import write_manifest
-from alpasim_plugin.runtime.plan import Cell, RunPlan
+from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
+from alpasim_plugin.runtime.stores.commits import Commits
+from alpasim_plugin.runtime.stores.stored import commit_key, opened, run_stored_cell
 from alpasim_plugin.runtime.workers import Lost
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
@@ -62,6 +64,7 @@ class HowToRun:
         retry: Drive again also what failed by the policy's own fault.
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
         executor: Where rollouts run.
+        store: URL of a store in which rollouts are looked up and committed; None: the run folder alone.
     """
 
     threads: Threads
@@ -70,6 +73,7 @@ class HowToRun:
     limit_s: float | None = None
     retry: bool = False
     executor: Executor = LOCAL
+    store: str | None = None
 
 
 def execute(
@@ -90,6 +94,7 @@ def execute(
     """
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
+    shelf = None if how.store is None else Shelf(opened(how.store), plan.options, how.reuse_undigested)
     for cell in plan.cells:
         folder = cell.folder.as_posix()
         remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
@@ -97,26 +102,71 @@ def execute(
             doing = "driving again" if remedy == "drive" else "scoring again"
             noticed(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
         if remedy == "drive" or state.manifest is None:
-            todo.append(cell)
-            continue
-        manifest = state.manifest if remedy == "none" else rescore_cell(cell, plan.options, root, state.manifest)
+            stored = shelf and shelf.find(cell)
+            if not stored:
+                todo.append(cell)
+                continue
+            manifest = _scored(cell, plan.options, root, unpack(stored, root))
+        else:
+            manifest = state.manifest if remedy == "none" else rescore_cell(cell, plan.options, root, state.manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
     runner = _run_local if how.executor.is_local else _run_elsewhere
-    for cell, manifest in runner(todo, plan, root, how, noticed):
+    for cell, manifest in runner(todo, plan, root, how, shelf, noticed):
+        manifest = _scored(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, False)
+        if shelf is not None:
+            shelf.add(cell, manifest)
+    if shelf is not None:
+        shelf.commits.index.flush()
     return [manifests[cell.folder] for cell in plan.cells]
 
 
+class Shelf:
+    """The driver's view of a store: what it knows to be committed.
+
+    Args:
+        commits: The store.
+        options: Of the run.
+        reuse_undigested: Also reuse rollouts with parts that have no digest.
+    """
+
+    def __init__(self, commits: Commits, options: RunOptions, reuse_undigested: bool) -> None:
+        self.commits, self._options = commits, options
+        self.fresh = "" if reuse_undigested else os.urandom(8).hex()
+        commits.index.load()
+
+    def find(self, cell: Cell) -> Parcel | None:
+        """Return a rollout that the index names."""
+        key = commit_key(cell, self._options, self.fresh)
+        return self.commits.find(key) if key in self.commits.index.keys else None
+
+    def add(self, cell: Cell, manifest: Mapping[str, Any]) -> None:
+        """Take in a rollout that a worker has committed."""
+        if manifest["status"] == "ok":
+            self.commits.index.add([commit_key(cell, self._options, self.fresh)])
+
+
+def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    """Score a rollout that comes from a store, or from an earlier driver, again if its scores are another preset's."""
+    if manifest["status"] != "ok" or manifest["score_key"] == cell.score_key:
+        return manifest
+    return rescore_cell(cell, options, root, manifest)
+
+
 Done = Iterator[tuple[Cell, dict[str, Any]]]
+Noticed = Callable[[str], None]
 
 
-def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, noticed: Callable[[str], None]) -> Done:
+def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, shelf: Shelf | None, noticed: Noticed) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
     if how.threads.workers > 1 or how.limit_s is not None:
         compile_for(todo, plan.scenarios, how.threads.workers)
-    work = partial(run_cell, options=plan.options, root=root, threads=how.threads.per_worker)
+    work: Callable[[Cell], dict[str, Any]] = partial(run_cell, options=plan.options, root=root, threads=how.threads.per_worker)
+    if how.store is not None and shelf is not None:
+        more = {"store": how.store, "fresh": shelf.fresh}
+        work = partial(run_stored_cell, options=plan.options, root=root, threads=how.threads.per_worker, **more)
 
     def recall(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
         remedy, state = find_rollout_state(cell, root, reuse_undigested=True)
@@ -126,13 +176,15 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, n
         yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
 
 
-def _run_elsewhere(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, noticed: Callable[[str], None]) -> Done:
+def _run_elsewhere(
+    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, shelf: Shelf | None, noticed: Callable[[str], None]
+) -> Done:
     """Run cells on other nodes; only this process writes the run folder."""
     if not todo:
         return
     from alpasim_plugin.runtime.executors.mission import mission_of  # a run on this machine needs none of it
 
-    mission, contents = mission_of(plan, todo, how.threads.per_worker)
+    mission, contents = mission_of(plan, todo, how.threads.per_worker, how.store, shelf.fresh if shelf else "")
     most = min(how.threads.workers, len(todo))
     with opened_pool(how.executor, mission, contents, targets_of(plan.parts), most, root, noticed) as pool:
         for cell, got in dispatch(pool, todo, noticed, how.limit_s):

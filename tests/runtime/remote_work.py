@@ -11,12 +11,14 @@ from typing import Any
 
 from alpasim_plugin.runtime.executors.base import Faulty, Node
 
+DAY_S = 86_400
+
 
 @dataclass(frozen=True)
 class Scripted:
-    """Do what the item says, and note in a folder that all nodes see who did what.
+    """Do what the item says, and note in a folder that all nodes see which node did it, and which day it is there.
 
-    Items: ``sleep S``, ``die``, ``die once``, ``raise``, ``fetch SHA256``, ``late S`` (slow only the first time), ``pid``.
+    Items: ``sleep S``, ``die``, ``die once``, ``raise``, ``fetch SHA256``, ``late S`` (slow only the first time).
     """
 
     notes: Path
@@ -25,7 +27,7 @@ class Scripted:
     def __call__(self, item: str, node: Node) -> Any:
         name = item.replace(" ", "-")[:60]
         seen = len(list(self.notes.glob(f"{name}.*")))
-        (self.notes / f"{name}.{os.getpid()}.{time.monotonic_ns()}").write_text(node.name)
+        (self.notes / f"{name}.{os.getpid()}.{time.monotonic_ns()}").write_text(f"{node.name} {int(time.time() // DAY_S)}")
         words = item.split("#")[0].split()
         if words[0] == "sleep" or (words[0] == "late" and seen == 0):
             time.sleep(float(words[1]))

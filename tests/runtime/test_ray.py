@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,11 +23,13 @@ from alpasim_plugin.runtime.executors.choice import Executor
 from alpasim_plugin.runtime.executors.dispatch import dispatch
 from alpasim_plugin.runtime.executors.identity import identity_of
 from alpasim_plugin.runtime.executors.placing import Contents
-from alpasim_plugin.runtime.plan import RunPlan
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from alpasim_plugin.runtime.workers import Lost
+from scenarios.suite import expand
+from tests.runtime.grey_renderer import GREY
 from tests.runtime.remote_work import Scripted
-from tests.runtime.test_runs import Heard, cheap_plan, comparable, plan_of
+from tests.runtime.test_runs import SHORT, Heard, cheap_plan, comparable, plan_of
 
 pytest.importorskip("ray", reason="the extra [ray] is not installed")
 pytestmark = pytest.mark.slow
@@ -193,3 +198,125 @@ def test_stopping_ends_the_workers_and_removes_what_they_left(tmp_path: Path, th
         while any(Path("/proc", str(pid)).exists() for pid in pids):
             assert time.monotonic() < until, "a worker outlives the run"
             time.sleep(0.05)
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from alpasim_plugin.runtime.executors.choice import Executor
+from alpasim_plugin.runtime.run import execute_run
+from tests.runtime.test_runs import Heard, cheap_plan
+execute_run(cheap_plan((0, 1, 2)), Path(sys.argv[1]), None, ["simrun"], Heard(), certificate="none", report=False,
+            executor=Executor("ray", sys.argv[2]))
+"""
+
+
+def serving() -> set[int]:
+    """Return the processes that are workers of ours."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"ray::Serving" in path.read_bytes():
+                found.add(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(tmp_path: Path, three: Nodes, repo: Path) -> None:
+    command = [sys.executable, "-c", DRIVER, str(tmp_path / "run"), three.address]
+    driver = subprocess.Popen(command, cwd=repo, env={**os.environ, "PYTHONPATH": str(repo)})
+    until = time.monotonic() + 200
+    while len(list((tmp_path / "run").rglob("manifest.json"))) < 2:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    workers = serving()
+    driver.kill()
+    driver.wait()
+    assert workers
+    until = time.monotonic() + 60
+    while serving() & workers:
+        assert time.monotonic() < until, "a worker outlives its driver"
+        time.sleep(0.1)
+    done = len(list((tmp_path / "run").rglob("manifest.json")))
+    assert done < 12
+    _, heard = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
+    assert heard.fates.count(("ok", True)) == done
+    assert len(heard.fates) == 12
+    run(cheap_plan((0, 1, 2)), tmp_path / "here", Executor())
+    assert comparable(tmp_path / "run") == comparable(tmp_path / "here")
+
+
+KILLER = "tests.runtime.broken_policies:KillsItsProcess"
+
+
+def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path: Path, three: Nodes) -> None:
+    refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
+    plan = make_plan(refs, (GREY,), ("constant-velocity", KILLER), (0,), RunOptions())
+    result, heard = run(plan, tmp_path / "run", on(three))
+    assert sorted(heard.fates) == [("failed", False)] * 2 + [("ok", False)] * 2
+    assert result.exit_code == 4
+    for cell in result.summary["failures"]["cells"]:
+        assert cell["policy"] == KILLER
+        assert "3 workers died of it" in cell["error"]["found"]
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """Give a file system of 64 KiB, less than a rollout takes."""
+    disk = tmp_path / "tiny"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)], check=False, capture_output=True)
+    if mounted.returncode:
+        pytest.skip("mounting needs root")
+    yield disk
+    subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+def test_a_node_whose_disk_is_full_is_set_aside(tmp_path: Path, three: Nodes, tiny_disk: Path) -> None:
+    full = three.add(env_vars={"SIMRUN_SCRATCH": str(tiny_disk)})
+    result, heard = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
+    three.cluster.remove_node(full)
+    assert heard.fates == [("ok", False)] * 12
+    assert result.exit_code == 0
+    aside = [text for text in heard.notices if "set aside" in text]
+    assert len(aside) == 1
+    assert full.node_id[:8] in aside[0]
+    assert "No space left on device" in aside[0]
+
+
+AHEAD = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <sys/time.h>
+#include <time.h>
+int clock_gettime(clockid_t id, struct timespec *t) {
+  int (*real)(clockid_t, struct timespec *) = dlsym(RTLD_NEXT, "clock_gettime");
+  int code = real(id, t);
+  if (id == CLOCK_REALTIME || id == CLOCK_REALTIME_COARSE) t->tv_sec += 86400;
+  return code;
+}
+time_t time(time_t *out) { struct timespec t; clock_gettime(CLOCK_REALTIME, &t); if (out) *out = t.tv_sec; return t.tv_sec; }
+int gettimeofday(struct timeval *t, void *zone) {
+  struct timespec now; clock_gettime(CLOCK_REALTIME, &now); t->tv_sec = now.tv_sec; t->tv_usec = now.tv_nsec / 1000; return 0;
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a C compiler to put a node's clock ahead")
+def test_a_node_whose_clock_is_a_day_ahead_gives_the_same_run(tmp_path: Path, three: Nodes) -> None:
+    (tmp_path / "ahead.c").write_text(AHEAD)
+    library = tmp_path / "ahead.so"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(library), str(tmp_path / "ahead.c"), "-ldl"], check=True)
+    ahead = three.add(env_vars={"LD_PRELOAD": str(library)})
+    (tmp_path / "notes").mkdir()
+    scripted(three, Scripted(tmp_path / "notes"), [f"sleep 0.5 #{i}" for i in range(24)])
+    _, heard = run(cheap_plan((0, 1)), tmp_path / "run", on(three))
+    three.cluster.remove_node(ahead)
+    days = dict(note.read_text().split() for note in (tmp_path / "notes").iterdir())
+    assert int(days.pop(next(name for name in days if ahead.node_id[:8] in name))) > max(map(int, days.values()))
+    assert heard.fates == [("ok", False)] * 8
+    run(cheap_plan((0, 1)), tmp_path / "here", Executor())
+    assert comparable(tmp_path / "run") == comparable(tmp_path / "here")
+    _, again = run(cheap_plan((0, 1)), tmp_path / "run", Executor())
+    assert again.fates == [("ok", True)] * 8

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from alpasim_plugin.atomic import disk_error, scratch_folder
 from alpasim_plugin.errors import InfrastructureError, SimrunError
-from alpasim_plugin.parts import PartSpec, digest
+from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction import KIND as MODELS
 from alpasim_plugin.renderers.reconstruction_key import model_key
@@ -21,7 +21,9 @@ from alpasim_plugin.runtime.executors.parcel import Parcel, pack
 from alpasim_plugin.runtime.executors.placing import Contents, place, placed_path, with_paths
 from alpasim_plugin.runtime.executors.scratch import scratch_root
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
+from alpasim_plugin.runtime.stores.stored import commit_key, run_stored_cell
 from alpasim_plugin.types import Scenario
+from scenarios.suite import ScenarioRef
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Mission:
         scenes: Scene -> SHA-256 of the pickled scenario.
         backgrounds: Scene -> its background file (path on the driver -> SHA-256).
         models: Scene -> files of its reconstruction (name -> SHA-256), where the driver has it; otherwise each node fits its own.
+        store: URL of a store in which rollouts are looked up and committed.
+        fresh: As for `alpasim_plugin.runtime.stores.stored.commit_key`.
     """
 
     options: RunOptions
@@ -41,6 +45,8 @@ class Mission:
     scenes: Mapping[str, str]
     backgrounds: Mapping[str, Mapping[str, str]]
     models: Mapping[str, Mapping[str, str]]
+    store: str | None = None
+    fresh: str = ""
 
     def __call__(self, item: Cell, node: Node) -> Parcel | Faulty[Parcel]:
         """Drive one cell; what says more of the node than of the rollout comes back as `Faulty`."""
@@ -48,7 +54,7 @@ class Mission:
         try:
             with scratch_folder(scratch_root() / "rollout", "driving on a node") as scratch:
                 here = self._placed(cell, node)
-                run_cell(here, self.options, scratch, self.threads, load=lambda ref: self._scenario(cell.scene, node))
+                self._drive(here, scratch, node)
                 parcel = pack(scratch / cell.folder, node.name)
         except InfrastructureError as error:
             return self._faulty(cell, node, error)
@@ -58,9 +64,18 @@ class Mission:
             return Faulty(parcel, parcel.manifest["error"]["found"])
         return parcel
 
+    def _drive(self, cell: Cell, scratch: Path, node: Node) -> None:
+        def load(ref: ScenarioRef) -> Scenario:
+            return self._scenario(cell.scene, node)
+
+        if self.store is None:
+            run_cell(cell, self.options, scratch, self.threads, load=load)
+        else:
+            run_stored_cell(cell, self.options, scratch, self.threads, self.store, self.fresh, load)
+
     def key(self, cell: Cell) -> str:
         """Return the digest of everything that decides the rollout's files."""
-        return digest([cell.rollout_key, cell.score_key, self.options.video, cell.stops_at_path_end])
+        return commit_key(cell, self.options, self.fresh)
 
     def needs(self, cell: Cell) -> list[str]:
         """Return the SHA-256 of the scene, of its background and reconstruction, and of the files of the cell's parts."""
@@ -123,7 +138,7 @@ def place_model(scenario: Scenario, files: Mapping[str, str], node: Node) -> Non
     cached(MODELS, key, make, lambda folder: folder, f"reconstruction of {scenario.scene_id} for {node.name}")
 
 
-def mission_of(plan: RunPlan, cells: Sequence[Cell], threads: int) -> tuple[Mission, Contents]:
+def mission_of(plan: RunPlan, cells: Sequence[Cell], threads: int, store: str | None, fresh: str) -> tuple[Mission, Contents]:
     """Return what the nodes need to drive cells of a plan, and the contents that they will ask for.
 
     Raises:
@@ -146,4 +161,4 @@ def mission_of(plan: RunPlan, cells: Sequence[Cell], threads: int) -> tuple[Miss
     for part in plan.parts:
         for file in part.files:
             contents.add_file(Path(file))
-    return Mission(plan.options, threads, scenes, backgrounds, models), contents
+    return Mission(plan.options, threads, scenes, backgrounds, models, store, fresh), contents

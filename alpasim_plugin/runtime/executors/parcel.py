@@ -39,7 +39,7 @@ def pack(folder: Path, node: str) -> Parcel:
     manifest, _ = read_manifest(folder)
     names = list(manifest["files"]) or [OUTPUT_NAME]  # of a failed rollout only what its parts printed
     files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
-    return Parcel({**manifest, "node": node}, files)
+    return Parcel({"node": node, **manifest}, files)
 
 
 def unpack(parcel: Parcel, root: Path) -> dict[str, Any]:

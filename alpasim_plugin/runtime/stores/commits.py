@@ -33,6 +33,7 @@ class Commits:
     def __init__(self, url: str, objects: Objects | None = None) -> None:
         self.url = url
         self._objects = objects or open_objects(url)
+        self.index = Index(self._objects)
 
     def find(self, key: str) -> Parcel | None:
         """Return a committed rollout; None where there is none.
