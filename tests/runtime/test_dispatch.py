@@ -32,11 +32,14 @@ class Stage:
         self.handed: list[tuple[str, tuple[str, ...]]] = []
         self.ended: list[int] = []
         self.aside: dict[str, str] = {}
+        self.to_come: dict[float, str] = {}  # when -> node whose worker is there from then on
 
     def inherited(self, items: Sequence[str]) -> Iterable[tuple[int, Any]]:
         return [(i, "left over") for i, item in enumerate(items) if item == "inherited"]
 
     def free(self) -> list[Place]:
+        for due_s in [due_s for due_s in self.to_come if due_s <= self.now_s]:
+            self.workers[len(self.workers)] = self.to_come.pop(due_s)
         return [Place(n, node) for n, node in self.workers.items() if n not in self.busy]
 
     def start(self, worker: int, items: Sequence[str]) -> None:
@@ -64,7 +67,7 @@ class Stage:
         self.busy.pop(worker, None)
 
     def nodes(self) -> frozenset[str]:
-        return frozenset(self.workers.values()) - self.aside.keys()
+        return frozenset([*self.workers.values(), *self.to_come.values()]) - self.aside.keys()
 
     def set_aside(self, node: str, why: str) -> None:
         self.aside[node] = why
@@ -130,6 +133,20 @@ def test_a_node_that_only_fails_is_set_aside_and_its_work_is_done_elsewhere() ->
     items = [f"bad@a {i}" for i in range(30)]
     assert drive(stage, items) == {item: item.upper() for item in items}
     assert "3 failures in a row, the last: disk full" in stage.aside["a"]
+
+
+def test_what_the_only_node_fails_waits_for_one_that_is_starting() -> None:
+    stage = Stage("a")
+    stage.to_come = {20.0: "b"}
+    assert drive(stage, ["bad@a 1", "bad@a 2"]) == {"bad@a 1": "BAD@A 1", "bad@a 2": "BAD@A 2"}
+    assert stage.now_s < 30.0
+
+
+def test_what_waits_for_a_node_that_never_comes_is_tried_again_where_it_failed() -> None:
+    stage = Stage("a")
+    stage.to_come = {float("inf"): "b"}
+    assert isinstance(drive(stage, ["dies"])["dies"], Lost)
+    assert [node for node, _ in stage.handed] == ["a", "a", "a"]
 
 
 def test_what_is_faulty_on_every_node_stands() -> None:

@@ -308,7 +308,7 @@ def test_a_node_whose_clock_is_a_day_ahead_gives_the_same_run(tmp_path: Path, th
     (tmp_path / "ahead.c").write_text(AHEAD)
     library = tmp_path / "ahead.so"
     subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(library), str(tmp_path / "ahead.c"), "-ldl"], check=True)
-    ahead = three.add(env_vars={"LD_PRELOAD": str(library)})
+    ahead = three.add(env_vars={"LD_PRELOAD": str(library), "RAY_LD_PRELOAD_ON_WORKERS": "1"})
     (tmp_path / "notes").mkdir()
     scripted(three, Scripted(tmp_path / "notes"), [f"sleep 0.5 #{i}" for i in range(24)])
     _, heard = run(cheap_plan((0, 1)), tmp_path / "run", on(three))

@@ -24,6 +24,7 @@ A_contra = TypeVar("A_contra", contravariant=True)
 MOST_LOSSES = 3  # an item that its worker died of so often is given up
 STRIKES = 3  # so many failures in a row on one node, while others work, set it aside
 MOST_ITEMS = 64  # in a chunk
+ELSEWHERE_S = 30.0  # that a lost item waits for a node that has not failed it
 LATE_FACTOR, LATE_S = 3.0, 10.0  # late: slower than three times the median, and by more than this
 
 
@@ -113,7 +114,9 @@ class _Books(Generic[A, R]):
     done: set[int] = field(default_factory=set)
     losses: Counter[int] = field(default_factory=Counter)
     tried: dict[int, set[str]] = field(default_factory=dict)  # item -> nodes that failed it
-    faulty: dict[int, Any] = field(default_factory=dict)  # item -> what stands if no node does better
+    lost_s: dict[int, float] = field(default_factory=dict)  # item -> when it was lost last
+    copied: bool = False  # whether anything was ever handed out twice
+    good: set[str] = field(default_factory=set)  # nodes that have given a result
     strikes: Counter[str] = field(default_factory=Counter)
     took_s: deque[float] = field(default_factory=lambda: deque(maxlen=201))  # per item
 
@@ -144,8 +147,8 @@ def dispatch(
     books: _Books[A, R] = _Books(items, deque(range(len(items))))
     for index, known in pool.inherited(items):
         books.done.add(index)
-        books.todo.remove(index)
-        yield items[index], known.value if isinstance(known, Faulty) else known
+        yield items[index], known
+    books.todo = deque(index for index in books.todo if index not in books.done)
     while len(books.done) < len(items):
         for place in pool.free():
             chosen = _choose(books, pool, place, clock(), limit_s)
@@ -160,13 +163,14 @@ def dispatch(
                 continue
             if isinstance(event, Done):
                 books.took_s.append((clock() - unit.since_s) / len(unit.items))
-                finished = _take(books, pool, unit, event)
+                finished = _take(books, pool, unit, event, clock())
             else:
-                finished = _bury(books, pool, unit, event, noticed)
+                finished = _bury(books, pool, unit, event, noticed, clock())
             for index, got in finished:
                 books.done.add(index)
                 yield items[index], got
-            _call_off(books, pool)
+            if books.copied:
+                _call_off(books, pool)
         for worker, unit in list(books.running.items()):
             if limit_s is not None and clock() - unit.since_s > limit_s * len(unit.items):
                 pool.end(worker)
@@ -187,12 +191,18 @@ def _choose(books: _Books[A, R], pool: Pool[A], place: Place, now_s: float, limi
     for index in list(books.again):
         if index in books.done:
             books.again.remove(index)
-        elif not place.node or place.node not in books.tried.get(index, ()) or nodes <= books.tried[index]:
+        elif _suits(books, index, place.node, nodes, now_s):
             books.again.remove(index)
             return (index,)
     if books.todo:
         return tuple(books.todo.popleft() for _ in range(_chunk(books, pool, limit_s)))
     return _late(books, place, nodes, now_s)
+
+
+def _suits(books: _Books[A, R], index: int, node: str, nodes: frozenset[str], now_s: float) -> bool:
+    """Tell whether a lost item may go to a node: not to one that failed it, unless there is no other or none has come for a while."""
+    tried = books.tried.get(index, set())
+    return node not in tried or nodes <= tried or now_s - books.lost_s.get(index, now_s) > ELSEWHERE_S
 
 
 def _chunk(books: _Books[A, R], pool: Pool[A], limit_s: float | None) -> int:
@@ -217,6 +227,7 @@ def _late(books: _Books[A, R], place: Place, nodes: frozenset[str], now_s: float
         late_s = now_s - unit.since_s - max(LATE_FACTOR * usual_s, usual_s + LATE_S) * len(unit.items)
         if left and late_s > 0:
             overdue.append((late_s, left))
+    books.copied |= bool(overdue)
     return max(overdue)[1] if overdue else ()
 
 
@@ -228,7 +239,7 @@ def _patience_s(books: _Books[A, R], now_s: float, limit_s: float | None) -> flo
     return min(1.0, max(0.0, due - now_s) + 0.01)
 
 
-def _take(books: _Books[A, R], pool: Pool[A], unit: _Unit, event: Done) -> list[tuple[int, R | Lost]]:
+def _take(books: _Books[A, R], pool: Pool[A], unit: _Unit, event: Done, now_s: float) -> list[tuple[int, R | Lost]]:
     finished: list[tuple[int, R | Lost]] = []
     for index, answer in zip(unit.items, event.answers, strict=True):
         if index in books.done:
@@ -237,20 +248,24 @@ def _take(books: _Books[A, R], pool: Pool[A], unit: _Unit, event: Done) -> list[
             raise answer
         if not isinstance(answer, Faulty):
             books.strikes[event.node] = 0
+            books.good.add(event.node)
             finished.append((index, answer))
             continue
         tried = books.tried.setdefault(index, set())
         tried.add(event.node)
         books.losses[index] += 1
         _strike(books, pool, event.node, answer.found)
-        if pool.nodes() <= tried or books.losses[index] >= MOST_LOSSES:
+        if pool.nodes() <= tried or books.losses[index] >= 2 * MOST_LOSSES:
             finished.append((index, answer.value))
         else:
             books.again.append(index)
+            books.lost_s[index] = now_s
     return finished
 
 
-def _bury(books: _Books[A, R], pool: Pool[A], unit: _Unit, event: Died, noticed: Callable[[str], None]) -> list[tuple[int, R | Lost]]:
+def _bury(
+    books: _Books[A, R], pool: Pool[A], unit: _Unit, event: Died, noticed: Callable[[str], None], now_s: float
+) -> list[tuple[int, R | Lost]]:
     finished: list[tuple[int, R | Lost]] = []
     node = event.node or unit.node
     noticed(f"a worker on {node or 'a node'} was lost ({event.found}); its work is done again")
@@ -268,13 +283,14 @@ def _bury(books: _Books[A, R], pool: Pool[A], unit: _Unit, event: Died, noticed:
             finished.append((index, Lost(found, do_this="run it alone with --executor local --workers 1, and look at the memory it takes")))
         else:
             books.again.append(index)
+            books.lost_s[index] = now_s
     return finished
 
 
 def _strike(books: _Books[A, R], pool: Pool[A], node: str, found: str) -> None:
-    """Count a failure of a node; several in a row set it aside where others are left."""
+    """Count a failure of a node; several in a row set it aside where another gives results."""
     books.strikes[node] += 1
-    if node and books.strikes[node] >= STRIKES and len(pool.nodes() - {node}) > 0:
+    if node and books.strikes[node] >= STRIKES and (pool.nodes() & books.good) - {node}:
         pool.set_aside(node, f"{STRIKES} failures in a row, the last: {found}")
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 from alpasim_plugin.atomic import disk_error, scratch_folder
@@ -18,12 +18,14 @@ from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import failed_manifest, run_cell
 from alpasim_plugin.runtime.executors.base import Faulty, Node
 from alpasim_plugin.runtime.executors.parcel import Parcel, pack
-from alpasim_plugin.runtime.executors.placing import Contents, place, placed_path, with_paths
+from alpasim_plugin.runtime.executors.placing import Contents, is_here, paths_in, place, placed_path, with_paths
 from alpasim_plugin.runtime.executors.scratch import scratch_root
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.stores.stored import commit_key, run_stored_cell
 from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
+
+HELD_SCENES = 4  # by each worker
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,12 @@ class Mission:
         return Faulty(Parcel(manifest, {}), error.found)
 
     def _scenario(self, scene: str, node: Node) -> Scenario:
-        return _read_scenario(self, scene, node)
+        """Return a scene, whose background file is one of this node."""
+        scenario = _loaded(self.scenes[scene], node)
+        if scenario.background is None:
+            return scenario
+        path = placed_path(scenario.background.path, self.backgrounds[scene][scenario.background.path], node)
+        return replace(scenario, background=replace(scenario.background, path=path))
 
     def _placed(self, cell: Cell, node: Node) -> Cell:
         """Return a cell whose parts name files of this node, with the scene's reconstruction in this node's cache."""
@@ -98,26 +105,34 @@ class Mission:
         renderer = replace(cell.renderer, base=base, fixer=fixer)
         return replace(cell, renderer=renderer, policy=_part(cell.policy, node), controller=_part(cell.controller, node))
 
-    def __hash__(self) -> int:
-        return id(self)
 
-    def __eq__(self, other: object) -> bool:
-        return self is other
+_scenes: OrderedDict[str, Scenario] = OrderedDict()  # by SHA-256, as read last by this process
 
 
-@lru_cache(maxsize=4)
-def _read_scenario(mission: Mission, scene: str, node: Node) -> Scenario:
-    scenario: Scenario = pickle.loads(place(mission.scenes[scene], "scenario.pickle", node).read_bytes())
-    if scenario.background is None:
-        return scenario
-    path = placed_path(scenario.background.path, mission.backgrounds[scene][scenario.background.path], node)
-    return replace(scenario, background=replace(scenario.background, path=path))
+def _loaded(sha256: str, node: Node) -> Scenario:
+    if sha256 not in _scenes:
+        _scenes[sha256] = pickle.loads(place(sha256, "scenario.pickle", node).read_bytes())
+        while len(_scenes) > HELD_SCENES:
+            _scenes.popitem(last=False)
+    return _scenes[sha256]
 
 
 def _part(spec: PartSpec, node: Node) -> PartSpec:
-    if spec.settings is None or not spec.files:
+    """Return a part whose settings name files of this node.
+
+    Raises:
+        InfrastructureError: A file that no setting names is not on this node, or has another content here.
+    """
+    if not spec.files:
         return spec
-    moved = {path: placed_path(path, sha256, node) for path, sha256 in spec.files.items()}
+    named = paths_in(spec.settings)
+    for path, sha256 in spec.files.items():
+        if path not in named and not is_here(path, sha256):
+            what = f"{path} of {spec.kind} {spec.name} on {node.name}"
+            raise InfrastructureError("driving on a node", what, "not there, or another content", "install the part's files on the nodes")
+    if spec.settings is None:
+        return spec
+    moved = {path: placed_path(path, sha256, node) for path, sha256 in spec.files.items() if path in named}
     return replace(spec, settings=with_paths(spec.settings, moved))
 
 

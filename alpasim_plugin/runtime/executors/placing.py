@@ -78,10 +78,14 @@ def place(sha256: str, name: str, node: Node) -> Path:
 
 def placed_path(path: str, sha256: str, node: Node) -> str:
     """Return where this node has a file of the driver's: at the same path, in its own installation of simrun, or placed by content."""
-    for there in (Path(path), in_own_installation(path)):
-        if there.is_file() and sha_of_unchanged(there) == sha256:
-            return str(there)
-    return str(place(sha256, Path(path).name, node))
+    here = is_here(path, sha256)
+    return here or str(place(sha256, Path(path).name, node))
+
+
+def is_here(path: str, sha256: str) -> str:
+    """Return where this machine has a file of the driver's, at the same path or in its own installation of simrun; empty if nowhere."""
+    found = (there for there in (Path(path), in_own_installation(path)) if sha_of_unchanged(there) == sha256)
+    return str(next(found, ""))
 
 
 def in_own_installation(path: str) -> Path:
@@ -105,6 +109,15 @@ def sha_of_unchanged(path: Path) -> str:
 @lru_cache(maxsize=1024)
 def _sha(path: str, size: int, mtime_ns: int) -> str:
     return sha256_of(Path(path))
+
+
+def paths_in(settings: BaseModel | None) -> set[str]:
+    """Return every text and path among settings, nested ones too."""
+    found: set[str] = set()
+    for name in type(settings).model_fields if settings is not None else ():
+        value = getattr(settings, name)
+        found |= paths_in(value) if isinstance(value, BaseModel) else {str(value)} if isinstance(value, str | Path) else set()
+    return found
 
 
 def with_paths(settings: M, moved: dict[str, str]) -> M:

@@ -120,6 +120,7 @@ class RayPool(Generic[A]):
         self._failed: dict[str, tuple[int, float]] = {}  # node -> failed starts, time of the last
         self._ended: dict[str, list[int]] = {}  # node -> processes that were killed
         self._ids: dict[str, str] = {}  # name -> Ray's id of living nodes
+        self._usable: frozenset[str] = frozenset()  # living nodes with room for a worker
         self._looked_s = -LOOK_S
         self._alive_s = time.monotonic()
 
@@ -166,7 +167,7 @@ class RayPool(Generic[A]):
 
     def nodes(self) -> frozenset[str]:
         """Return the nodes that are in use."""
-        return frozenset(self._accepted & self._ids.keys() - self._refused.keys())
+        return self._usable - self._refused.keys()
 
     def set_aside(self, node: str, why: str) -> None:
         """Use a node no more."""
@@ -214,6 +215,7 @@ class RayPool(Generic[A]):
         alive = {f"{node['NodeManagerHostname']}/{node['NodeID'][:8]}": node for node in self._ray.nodes() if node["Alive"]}
         self._ids = {name: node["NodeID"] for name, node in alive.items()}
         room = {name: self._room(node["Resources"]) for name, node in alive.items() if name not in self._refused}
+        self._usable = frozenset(name for name, workers in room.items() if workers)
         if alive:
             self._alive_s = now
         if alive and not room:

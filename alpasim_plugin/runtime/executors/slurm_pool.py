@@ -22,7 +22,7 @@ from alpasim_plugin.atomic import write_bytes
 from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.optional import require_library
 from alpasim_plugin.processes import is_running, started_of
-from alpasim_plugin.runtime.executors.base import Resources, Work
+from alpasim_plugin.runtime.executors.base import Faulty, Resources, Work
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
 from alpasim_plugin.runtime.executors.placing import Contents
 from alpasim_plugin.runtime.executors.scratch import sweep
@@ -224,7 +224,7 @@ def _take_over(folder: Path, noticed: Callable[[str], None]) -> dict[str, Any]:
             outcome, answer = pickle.loads(path.read_bytes())
             if outcome == "success" and not answer.reasons:
                 done = zip(answer.keys, pickle.loads(answer.answers), strict=True)
-                results |= {key: got for key, got in done if not isinstance(got, Exception)}
+                results |= {key: got for key, got in done if not isinstance(got, Exception | Faulty)}
         noticed(f"an earlier run was cut off: {len(results)} of its results are taken over, {len(running)} of its jobs are cancelled")
         shutil.rmtree(session)
     return results
