@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,17 @@ pytestmark = pytest.mark.slow
 SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
 
 
+def patiently(start: Callable[[], Any]) -> Any:
+    """Start a node; Ray gives one 30 s to come up, which a busy machine may exceed."""
+    for _ in range(3):
+        try:
+            return start()
+        except Exception as error:
+            if "timed out during startup" not in str(error):
+                raise
+    return start()
+
+
 class Nodes:
     """A cluster on this machine, a core a node; its raylets can be killed."""
 
@@ -44,7 +55,7 @@ class Nodes:
         from ray.cluster_utils import Cluster
 
         head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SYSTEM}
-        self.cluster = Cluster(initialize_head=True, head_node_args=head)
+        self.cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
         for _ in range(number - 1):
             self.add()
 
@@ -53,7 +64,7 @@ class Nodes:
         return str(self.cluster.address)
 
     def add(self, **more: Any) -> Any:
-        return self.cluster.add_node(num_cpus=1, **more)
+        return patiently(lambda: self.cluster.add_node(num_cpus=1, **more))
 
     def close(self) -> None:
         self.cluster.shutdown()
