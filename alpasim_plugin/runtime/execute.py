@@ -163,10 +163,10 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, s
     """Run cells in this process, or in workers that write the run folder themselves."""
     if how.threads.workers > 1 or how.limit_s is not None:
         compile_for(todo, plan.scenarios, how.threads.workers)
-    work: Callable[[Cell], dict[str, Any]] = partial(run_cell, options=plan.options, root=root, threads=how.threads.per_worker)
+    threads = how.threads.per_worker
+    work: Callable[[Cell], dict[str, Any]] = partial(run_cell, options=plan.options, root=root, threads=threads)
     if how.store is not None and shelf is not None:
-        more = {"store": how.store, "fresh": shelf.fresh}
-        work = partial(run_stored_cell, options=plan.options, root=root, threads=how.threads.per_worker, **more)
+        work = partial(run_stored_cell, options=plan.options, root=root, threads=threads, store=how.store, fresh=shelf.fresh)
 
     def recall(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
         remedy, state = find_rollout_state(cell, root, reuse_undigested=True)
