@@ -18,7 +18,8 @@ from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_pro
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
-from alpasim_plugin.runtime.execute import thread_budget
+from alpasim_plugin.runtime.execute import Threads, thread_budget
+from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from alpasim_plugin.stopping import Stopped
@@ -40,6 +41,10 @@ Examples:
 - `simrun --renderer 3dgs --policy pure-pursuit suites/smoke --out runs/smoke --video all`
 
 - `simrun --renderer clean --policy log-replay ../data/av2/7fab2350`
+
+- `simrun --renderer clean,3dgs --executor ray --cores 2 suites/urban`
+
+- `simrun --renderer clean,3dgs --executor slurm:cpu --workers 64 --store s3://bucket/night suites/urban`
 """
 
 
@@ -55,7 +60,15 @@ def run(
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; by default one per core.")] = None,
-    executor: Annotated[Literal["local", "ray", "slurm"], typer.Option("--executor", help="Where rollouts run.")] = "local",
+    executor: Annotated[
+        str, typer.Option("--executor", help="Where rollouts run: `local`, `ray`, `ray:HOST:PORT`, `slurm` or `slurm:PARTITION`.")
+    ] = "local",
+    cores: Annotated[int | None, typer.Option("--cores", min=1, help="Cores of each worker on a cluster; by default 1.")] = None,
+    gpus: Annotated[float | None, typer.Option("--gpus", min=0.0, help="Share of a GPU of each worker on a cluster.")] = None,
+    memory: Annotated[float | None, typer.Option("--memory", min=0.001, help="Memory of each worker on a cluster, in GiB.")] = None,
+    store: Annotated[
+        str | None, typer.Option("--store", metavar="URL", help="Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.")
+    ] = None,
     video: Annotated[Literal["none", "failures", "all"], typer.Option("--video", help="Write front.mp4.")] = "none",
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
     overrides: Annotated[
@@ -97,8 +110,7 @@ def run(
     An interrupted run continues when the same command is given again.
     """
     del debug  # read from the command line by cli.main, before any option is parsed
-    if executor != "local":
-        raise InputError("choosing an executor", f"--executor {executor}", "only 'local' is implemented", "use --executor local")
+    where = parse_executor(executor, cores, gpus, memory)
     names = [name.strip() for name in renderer.split(",") if name.strip()]
     drivers = split_policies(policy)
     check_preset(preset)
@@ -112,11 +124,25 @@ def run(
     plan = replace(make_plan(refs, names, drivers, parse_seeds(seeds), options), asked=tuple(scenarios))
     root = out or default_folder(plan)
     if dry_run:
-        _print_plan(plan, root, workers, as_json)
+        _print_plan(plan, root, thread_budget(workers, len(plan.cells), where), as_json)
         return
     progress, command = make_progress(quiet or as_json), ["simrun", *sys.argv[1:]]
     try:
-        result = execute_run(plan, root, workers, command, progress, resume, certify, report, wait=wait, limit_s=time_limit, retry=retry)
+        result = execute_run(
+            plan,
+            root,
+            workers,
+            command,
+            progress,
+            resume,
+            certify,
+            report,
+            wait=wait,
+            limit_s=time_limit,
+            retry=retry,
+            executor=where,
+            store=store,
+        )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {root}; the same command continues"
         raise
@@ -182,8 +208,7 @@ def check_preset(preset: str) -> None:
         raise InputError("choosing a preset", f"--preset {preset}", "no such preset", f"known: {', '.join(PRESETS)}")
 
 
-def _print_plan(plan: RunPlan, root: Path, workers: int | None, as_json: bool) -> None:
-    threads = thread_budget(workers, len(plan.cells))
+def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
     frames = sum((s.end_us - s.start_us) // s.rates.camera_us for s in plan.scenarios.values())
     per_cell = len(plan.renderers) * len(plan.policies) * len(plan.seeds)
     facts = {

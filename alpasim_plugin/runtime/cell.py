@@ -76,10 +76,25 @@ def build_parts(cell: Cell, options: RunOptions, scenario: Scenario, threads: in
     )
 
 
-def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder: PartsBuilder = build_parts) -> dict[str, Any]:
+def run_cell(
+    cell: Cell,
+    options: RunOptions,
+    root: Path,
+    threads: int,
+    builder: PartsBuilder = build_parts,
+    load: Callable[[ScenarioRef], Scenario] | None = None,
+) -> dict[str, Any]:
     """Run and score one cell and return its manifest. The manifest is written last: a folder without one is unfinished.
 
     A failure is a result too: the manifest then has ``status: failed``, the error and the traceback.
+
+    Args:
+        cell: The rollout.
+        options: Of the run.
+        root: The run folder.
+        threads: Of the rollout.
+        builder: Makes the parts.
+        load: Gives the scenario; None reads it from its file.
     """
     folder = root / cell.folder
     began = time.perf_counter()
@@ -97,7 +112,7 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MANIFEST, *DRIVEN, *DERIVED):  # the manifest first: without it nothing is trusted
             (folder / name).unlink(missing_ok=True)
-        scenario = replace(_scenario(cell.ref), stop_at_path_end=cell.stops_at_path_end)
+        scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):
             parts = builder(cell, options, scenario, threads)
             recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
@@ -129,6 +144,19 @@ def run_cell(cell: Cell, options: RunOptions, root: Path, threads: int, builder:
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_manifest(folder, manifest)
     return manifest
+
+
+def failed_manifest(cell: Cell, error: SimrunError) -> dict[str, Any]:
+    """Return the manifest of a rollout that was never driven to its end."""
+    return {
+        **cell.names,
+        "path": cell.folder.as_posix(),
+        "rollout_key": cell.rollout_key,
+        "score_key": cell.score_key,
+        "status": "failed",
+        "error": error.as_dict(),
+        "wall_s": None,
+    }
 
 
 def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Run the cells of a plan: in this process for one worker, in spawned processes for more.
+"""Run the cells of a plan: in this process for one worker, in spawned processes for more, or on the nodes of a cluster.
 
 A cell's result does not depend on where or when it runs: every random stream is keyed by (scene, seed, component, step) and the
 rasteriser is bit-equal for any number of threads. Workers may therefore run cells in any order.
@@ -7,18 +7,25 @@ rasteriser is bit-equal for any number of threads. Workers may therefore run cel
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.errors import InfrastructureError
-from alpasim_plugin.runtime.cell import find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool
+from alpasim_plugin.runtime.executors.dispatch import dispatch
+from alpasim_plugin.runtime.executors.identity import targets_of
+from alpasim_plugin.runtime.executors.local import run_local
+from alpasim_plugin.runtime.executors.parcel import Parcel, unpack
 from alpasim_plugin.runtime.kernels import compile_for
 from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runtime.workers import Lost, in_workers
+from alpasim_plugin.runtime.stores.commits import Commits
+from alpasim_plugin.runtime.stores.stored import commit_key, opened, run_stored_cell
+from alpasim_plugin.runtime.workers import Lost
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
 
@@ -31,13 +38,16 @@ class Threads:
     per_worker: int
 
 
-def thread_budget(workers: int | None, n_cells: int) -> Threads:
-    """Divide the cores that this process may use among the workers.
+def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL) -> Threads:
+    """Divide the cores that this process may use among the workers; those of other nodes have the cores that the executor asks for.
 
     Args:
-        workers: Number of workers; None is one per core. Never more than cells.
+        workers: Number of workers; None is one per core. Never more than cells. On other nodes it is the most, and None is no bound.
         n_cells: Number of cells to run.
+        executor: Where rollouts run.
     """
+    if not executor.is_local:
+        return Threads(max(1, min(workers or n_cells, n_cells)), executor.resources.cores)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     chosen = max(1, min(workers or cores, max(n_cells, 1)))
     return Threads(chosen, max(1, cores // chosen))
@@ -53,6 +63,8 @@ class HowToRun:
         full: Read every file of a finished rollout before it is reused, even if size and time are as written.
         retry: Drive again also what failed by the policy's own fault.
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
+        executor: Where rollouts run.
+        store: URL of a store in which rollouts are looked up and committed; None: the run folder alone.
     """
 
     threads: Threads
@@ -60,6 +72,8 @@ class HowToRun:
     full: bool = False
     limit_s: float | None = None
     retry: bool = False
+    executor: Executor = LOCAL
+    store: str | None = None
 
 
 def execute(
@@ -80,6 +94,7 @@ def execute(
     """
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
+    shelf = None if how.store is None else Shelf(opened(how.store), plan.options, how.reuse_undigested)
     for cell in plan.cells:
         folder = cell.folder.as_posix()
         remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
@@ -87,62 +102,98 @@ def execute(
             doing = "driving again" if remedy == "drive" else "scoring again"
             noticed(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
         if remedy == "drive" or state.manifest is None:
-            todo.append(cell)
-            continue
-        manifest = state.manifest if remedy == "none" else rescore_cell(cell, plan.options, root, state.manifest)
+            stored = shelf and shelf.find(cell)
+            if not stored:
+                todo.append(cell)
+                continue
+            manifest = _scored(cell, plan.options, root, unpack(stored, root))
+        else:
+            manifest = state.manifest if remedy == "none" else rescore_cell(cell, plan.options, root, state.manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
-    here = how.threads.workers == 1 and how.limit_s is None
-    if not here:
-        compile_for(todo, plan.scenarios, how.threads.workers)
-    runner = _run_here if here else _run_in_workers
-    for cell, manifest in runner(todo, plan.options, root, how):
+    runner = _run_local if how.executor.is_local else _run_elsewhere
+    for cell, manifest in runner(todo, plan, root, how, shelf, noticed):
+        manifest = _scored(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, False)
+        if shelf is not None:
+            shelf.add(cell, manifest)
+    if shelf is not None:
+        shelf.commits.index.flush()
     return [manifests[cell.folder] for cell in plan.cells]
 
 
-def _run_here(todo: Sequence[Cell], options: RunOptions, root: Path, how: HowToRun) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    for cell in todo:
-        yield cell, run_cell(cell, options, root, how.threads.per_worker)
+class Shelf:
+    """The driver's view of a store: what it knows to be committed.
+
+    Args:
+        commits: The store.
+        options: Of the run.
+        reuse_undigested: Also reuse rollouts with parts that have no digest.
+    """
+
+    def __init__(self, commits: Commits, options: RunOptions, reuse_undigested: bool) -> None:
+        self.commits, self._options = commits, options
+        self.fresh = "" if reuse_undigested else os.urandom(8).hex()
+        commits.index.load()
+
+    def find(self, cell: Cell) -> Parcel | None:
+        """Return a rollout that the index names."""
+        key = commit_key(cell, self._options, self.fresh)
+        return self.commits.find(key) if key in self.commits.index.keys else None
+
+    def add(self, cell: Cell, manifest: Mapping[str, Any]) -> None:
+        """Take in a rollout that a worker has committed."""
+        if manifest["status"] == "ok":
+            self.commits.index.add([commit_key(cell, self._options, self.fresh)])
 
 
-def _run_in_workers(todo: Sequence[Cell], options: RunOptions, root: Path, how: HowToRun) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Run cells in workers. A cell whose worker died runs again at the end, alone: it may have been the victim of another's memory."""
-    work = partial(run_cell, options=options, root=root, threads=how.threads.per_worker)
-    victims: list[Cell] = []
-    for cell, got in in_workers(work, todo, how.threads.workers, how.threads.per_worker, how.limit_s):
-        if not isinstance(got, Lost):
-            yield cell, got
-        elif got.hung:
-            yield cell, _lost(cell, root, got)
-        else:
-            victims.append(cell)
-    for cell in victims:
-        remedy, state = find_rollout_state(cell, root, reuse_undigested=True)  # the worker may have died after writing it
-        if remedy == "none" and state.manifest is not None:
-            yield cell, state.manifest
-            continue
-        for _, got in in_workers(work, [cell], 1, how.threads.per_worker, how.limit_s):
-            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
+def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    """Score a rollout that comes from a store, or from an earlier driver, again if its scores are another preset's."""
+    if manifest["status"] != "ok" or manifest["score_key"] == cell.score_key:
+        return manifest
+    return rescore_cell(cell, options, root, manifest)
+
+
+Done = Iterator[tuple[Cell, dict[str, Any]]]
+Noticed = Callable[[str], None]
+
+
+def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, shelf: Shelf | None, noticed: Noticed) -> Done:
+    """Run cells in this process, or in workers that write the run folder themselves."""
+    if how.threads.workers > 1 or how.limit_s is not None:
+        compile_for(todo, plan.scenarios, how.threads.workers)
+    threads = how.threads.per_worker
+    work: Callable[[Cell], dict[str, Any]] = partial(run_cell, options=plan.options, root=root, threads=threads)
+    if how.store is not None and shelf is not None:
+        work = partial(run_stored_cell, options=plan.options, root=root, threads=threads, store=how.store, fresh=shelf.fresh)
+
+    def recall(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
+        remedy, state = find_rollout_state(cell, root, reuse_undigested=True)
+        return state.manifest if remedy == "none" else None
+
+    for cell, got in run_local(work, todo, how.threads.workers, how.threads.per_worker, how.limit_s, recall):
+        yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
+
+
+def _run_elsewhere(
+    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, shelf: Shelf | None, noticed: Callable[[str], None]
+) -> Done:
+    """Run cells on other nodes; only this process writes the run folder."""
+    if not todo:
+        return
+    from alpasim_plugin.runtime.executors.mission import mission_of  # a run on this machine needs none of it
+
+    mission, contents = mission_of(plan, todo, how.threads.per_worker, how.store, shelf.fresh if shelf else "")
+    most = min(how.threads.workers, len(todo))
+    with opened_pool(how.executor, mission, contents, targets_of(plan.parts), most, root, noticed) as pool:
+        for cell, got in dispatch(pool, todo, noticed, how.limit_s):
+            yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
 
 
 def _lost(cell: Cell, root: Path, lost: Lost) -> dict[str, Any]:
-    """Write the manifest of a rollout whose worker died twice, or was killed since it took too long."""
-    if lost.hung:
-        found, do_this = lost.found, "look at what hangs with --workers 1, or raise --time-limit"
-    else:
-        found = f"{lost.found}, twice, without an error message"
-        do_this = "look for the out-of-memory killer in the system log, or use --workers 1"
-    error = InfrastructureError("running a rollout in a worker process", cell.folder.as_posix(), found, do_this)
-    manifest = {
-        **cell.names,
-        "path": cell.folder.as_posix(),
-        "rollout_key": cell.rollout_key,
-        "score_key": cell.score_key,
-        "status": "failed",
-        "error": error.as_dict(),
-        "wall_s": None,
-    }
+    """Write the manifest of a rollout whose workers died, or that was ended since it took too long."""
+    error = InfrastructureError("running a rollout in a worker process", cell.folder.as_posix(), lost.found, lost.do_this)
+    manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

@@ -19,6 +19,7 @@ from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.contents import (
     CONTENTS,
+    REPORTS,
     RUN_INFO,
     SCENES,
     SUMMARY,
@@ -26,11 +27,13 @@ from alpasim_plugin.runtime.contents import (
     Contents,
     damaged_files,
     find_contents,
+    read_contents,
     read_run_json,
     write_contents,
     write_run_json,
 )
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
 from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan, slug
 from alpasim_plugin.runtime.project import project
@@ -38,6 +41,7 @@ from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.runtime.stores.stored import opened
 from alpasim_plugin.runtime.tables import pool_of, write_tables
 from alpasim_plugin.runtime.writing import writing
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
@@ -103,6 +107,8 @@ def execute_run(
     full: bool = False,
     limit_s: float | None = None,
     retry: bool = False,
+    executor: Executor = LOCAL,
+    store: str | None = None,
 ) -> RunResult:
     """Run a plan into a folder, and repeat one of its rollouts as the certificate says.
 
@@ -119,12 +125,14 @@ def execute_run(
         full: Read every file of a finished rollout before it is reused, even if size and time are as written.
         limit_s: Seconds that one rollout may take.
         retry: Drive again also what failed by the policy's own fault.
+        executor: Where rollouts run; the results do not depend on it.
+        store: URL of a store in which rollouts are looked up and committed, and to which the tables go.
 
     Raises:
         InputError: The folder holds the run of another command and ``resume`` is not set.
         InfrastructureError: Another process writes the folder, or it is read-only and the run is not finished.
     """
-    threads = thread_budget(workers, len(plan.cells))
+    threads = thread_budget(workers, len(plan.cells), executor)
     if root.exists() and not os.access(root, os.W_OK):
         return _finished_already(plan, root)
     with writing(root, wait, progress.noticed):
@@ -137,14 +145,18 @@ def execute_run(
             manifest["reused"] = reused
             progress.rollout_done(manifest, reused)
 
-        how = HowToRun(threads, resume, full, limit_s, retry)
+        how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
+        repeating = threads if executor.is_local else thread_budget(1, 1)
         try:
             manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
-            pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
-            determinism = certify(plan, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+            pool = dict(pool_of(manifests, threads, time.perf_counter() - began, held.get("pool")))
+            pool |= {} if executor.is_local and store is None else {"executor": str(executor), "store": store}
+            determinism = certify(plan, root, manifests, repeating.workers * repeating.per_worker, certificate, held.get("determinism"))
         finally:
             end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
+        if store is not None:
+            opened(store).publish(root, published_files(root))
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 
@@ -164,6 +176,13 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
+
+
+def published_files(root: Path) -> list[str]:
+    """Return the files of a finished run folder that go to a store beside the rollouts: its description, tables and reports."""
+    contents = read_contents(root)
+    pages = [name for name in REPORTS if (root / name).exists()]
+    return [*contents.files, RUN_INFO, *pages, CONTENTS]
 
 
 def _finished_already(plan: RunPlan, root: Path) -> RunResult:

@@ -36,10 +36,12 @@ class Lost:
     Attributes:
         found: What became of its worker.
         hung: It was ended because it exceeded the time limit.
+        do_this: One action that would help; empty where the caller knows better.
     """
 
     found: str
     hung: bool = False
+    do_this: str = ""
 
 
 @dataclass

@@ -1,0 +1,115 @@
+"""Which executor a run uses, by the text of ``--executor``, and its pool of workers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.executors.base import Resources, Work
+from alpasim_plugin.runtime.executors.dispatch import Pool
+from alpasim_plugin.runtime.executors.placing import Contents
+
+DOING = "choosing an executor"
+
+
+@dataclass(frozen=True)
+class Executor:
+    """Where rollouts run.
+
+    Attributes:
+        kind: ``local``: processes of this machine. ``ray``: a Ray cluster. ``slurm``: jobs of Slurm.
+        where: Address of the cluster's head, or Slurm's partition; empty: the one at hand. ``@local`` for Slurm: processes of this machine.
+        resources: Of each worker; not for ``local``.
+    """
+
+    kind: Literal["local", "ray", "slurm"] = "local"
+    where: str = ""
+    resources: Resources = Resources()
+
+    @property
+    def is_local(self) -> bool:
+        """Tell whether workers are processes of this machine that write the run folder themselves."""
+        return self.kind == "local"
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.where}" if self.where else self.kind
+
+
+LOCAL = Executor()
+
+
+def parse_executor(text: str, cores: int | None = None, gpus: float | None = None, memory_gib: float | None = None) -> Executor:
+    """Parse ``--executor`` and what a worker needs.
+
+    Example:
+        >>> parse_executor("ray:10.0.0.1:6379").where, parse_executor("slurm", cores=4).resources.cores
+        ('10.0.0.1:6379', 4)
+
+    Raises:
+        InputError: There is no such executor, or ``local`` is given resources.
+    """
+    kind, _, where = text.partition(":")
+    given = {"--cores": cores, "--gpus": gpus, "--memory": memory_gib}
+    if kind == "local" and not where:
+        named = [name for name, value in given.items() if value is not None]
+        if named:
+            found = "local divides this machine's cores among --workers"
+            raise InputError(DOING, f"{named[0]} with --executor local", found, "use --workers, or another executor")
+        return LOCAL
+    resources = Resources(cores or 1, gpus or 0.0, memory_gib)
+    if kind == "ray":
+        return Executor("ray", where, resources)
+    if kind == "slurm":
+        return Executor("slurm", where, resources)
+    raise InputError(DOING, f"--executor {text}", "no such executor", "write local, ray, ray:HOST:PORT, slurm, or slurm:PARTITION")
+
+
+@contextmanager
+def opened_pool(
+    executor: Executor,
+    work: Work[Any, Any],
+    contents: Contents,
+    targets: Sequence[str],
+    most: int,
+    folder: Path,
+    noticed: Callable[[str], None],
+) -> Iterator[Pool[Any]]:
+    """Open the pool of an executor that is not ``local`` for the block; at its end, however it ends, no worker is left.
+
+    Args:
+        executor: Which.
+        work: What its workers do.
+        contents: What the work may fetch.
+        targets: Modules of parts that are not simrun's (`alpasim_plugin.runtime.executors.identity.targets_of`).
+        most: Most workers.
+        folder: A folder that Slurm's nodes see.
+        noticed: Called with a line for whatever a person should know.
+
+    Raises:
+        InputError: Its library is not installed.
+        InfrastructureError: There is no cluster.
+    """
+    from alpasim_plugin.runtime.executors.identity import identity_of
+
+    expected = identity_of(targets)
+    if executor.kind == "ray":
+        from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
+
+        with connected(executor.where or None):
+            pool: RayPool[Any] = RayPool(work, contents, expected, targets, executor.resources, most, noticed)
+            try:
+                yield pool
+            finally:
+                pool.close()
+        return
+    from alpasim_plugin.runtime.executors.slurm_pool import SlurmPool
+
+    jobs: SlurmPool[Any] = SlurmPool(work, contents, expected, targets, executor.resources, most, executor.where, folder, noticed)
+    try:
+        yield jobs
+    finally:
+        jobs.close()

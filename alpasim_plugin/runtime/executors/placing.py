@@ -1,0 +1,135 @@
+"""Put scenes, weights and other files on a node once, by content: whatever path they have on the driver, their SHA-256 is their name.
+
+$SIMRUN_CACHE/placed/SHA256/NAME on the node; the first worker that needs a content fetches it, the others of the node wait for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
+
+from alpasim_plugin.atomic import write_bytes
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.parts.source import OWN_ROOT
+from alpasim_plugin.renderers.cache import cached
+from alpasim_plugin.runtime.executors.base import Node
+from alpasim_plugin.vouched import sha256_of
+
+KIND = "placed"
+M = TypeVar("M", bound=BaseModel)
+
+
+class Contents:
+    """What the driver has to give, by SHA-256."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, bytes | Path] = {}
+
+    def add_bytes(self, data: bytes) -> str:
+        """Take bytes in; return their SHA-256."""
+        sha256 = hashlib.sha256(data).hexdigest()
+        self._held[sha256] = data
+        return sha256
+
+    def add_file(self, path: Path) -> str:
+        """Take a file in, which is read when it is asked for; return its SHA-256."""
+        sha256 = sha256_of(path)
+        self._held[sha256] = path
+        return sha256
+
+    def __contains__(self, sha256: str) -> bool:
+        return sha256 in self._held
+
+    def names(self) -> tuple[str, ...]:
+        """Return the SHA-256 of all contents."""
+        return tuple(self._held)
+
+    def read(self, sha256: str) -> bytes:
+        """Return a content."""
+        held = self._held[sha256]
+        return held if isinstance(held, bytes) else held.read_bytes()
+
+
+def place(sha256: str, name: str, node: Node) -> Path:
+    """Return the path of a content on this node, fetched if it is not there.
+
+    Raises:
+        InfrastructureError: It cannot be fetched, is not what was asked for, or cannot be written.
+    """
+
+    def make(folder: Path) -> None:
+        data = node.fetch(sha256)
+        found = hashlib.sha256(data).hexdigest()
+        if found != sha256:
+            raise InfrastructureError("placing a file on a node", f"{name} on {node.name}", f"SHA-256 {found}, not {sha256}", "try again")
+        write_bytes(folder / name, data)
+
+    def read(folder: Path) -> Path:
+        if sha_of_unchanged(folder / name) != sha256:
+            raise InputError("reading a placed file", str(folder / name), "not the content of its name", "it is fetched again")
+        return folder / name
+
+    return cached(KIND, sha256, make, read, f"{name} for {node.name}")
+
+
+def placed_path(path: str, sha256: str, node: Node) -> str:
+    """Return where this node has a file of the driver's: at the same path, in its own installation of simrun, or placed by content."""
+    here = is_here(path, sha256)
+    return here or str(place(sha256, Path(path).name, node))
+
+
+def is_here(path: str, sha256: str) -> str:
+    """Return where this machine has a file of the driver's, at the same path or in its own installation of simrun; empty if nowhere."""
+    found = (there for there in (Path(path), in_own_installation(path)) if sha_of_unchanged(there) == sha256)
+    return str(next(found, ""))
+
+
+def in_own_installation(path: str) -> Path:
+    """Return the place of a driver's file in this machine's installation of simrun; the path itself where it is none of simrun's."""
+    for mark in ("/configs/", "/policies/", "/alpasim_plugin/"):
+        _, found, rest = path.rpartition(mark)
+        if found:
+            return Path(OWN_ROOT + mark + rest)
+    return Path(path)
+
+
+def sha_of_unchanged(path: Path) -> str:
+    """Return a file's SHA-256, read again only if its size or time has changed; empty where it cannot be read."""
+    try:
+        state = path.stat()
+        return _sha(str(path), state.st_size, state.st_mtime_ns)
+    except OSError:
+        return ""
+
+
+@lru_cache(maxsize=1024)
+def _sha(path: str, size: int, mtime_ns: int) -> str:
+    return sha256_of(Path(path))
+
+
+def paths_in(settings: BaseModel | None) -> set[str]:
+    """Return every text and path among settings, nested ones too."""
+    found: set[str] = set()
+    for name in type(settings).model_fields if settings is not None else ():
+        value = getattr(settings, name)
+        found |= paths_in(value) if isinstance(value, BaseModel) else {str(value)} if isinstance(value, str | Path) else set()
+    return found
+
+
+def with_paths(settings: M, moved: dict[str, str]) -> M:
+    """Return settings with paths replaced, in nested settings too."""
+    changed: dict[str, Any] = {}
+    for name in type(settings).model_fields:
+        value = getattr(settings, name)
+        if isinstance(value, BaseModel):
+            new: Any = with_paths(value, moved)
+        elif isinstance(value, str | Path) and str(value) in moved:
+            new = type(value)(moved[str(value)])
+        else:
+            continue
+        changed[name] = new
+    return settings.model_copy(update=changed)

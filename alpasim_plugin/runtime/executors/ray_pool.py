@@ -1,0 +1,306 @@
+"""Workers on the nodes of a Ray cluster: one actor each, placed by us, so that a node that was refused or set aside stays unused."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import signal
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.optional import require_library
+from alpasim_plugin.runtime.executors.base import Resources, Work
+from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
+from alpasim_plugin.runtime.executors.placing import Contents
+from alpasim_plugin.runtime.executors.scratch import sweep
+from alpasim_plugin.runtime.executors.serving import Serving
+
+A = TypeVar("A")
+
+DOING = "working on a Ray cluster"
+LOOK_S = 1.0  # between looks at the nodes
+BARREN_S = 60.0  # without any node before giving up
+FAILED_STARTS = 3  # of workers on a node that never had one
+AGAIN_S = 2.0  # after a failed start
+HELD_CONTENTS = 256  # references that the driver keeps, so that a scene is sent once for all its rollouts
+SWEEP_S = 20.0  # that nodes may take to remove what killed workers left
+GIB = 2**30
+
+
+@dataclass
+class _Worker:
+    actor: Any
+    node: str
+    ref: Any  # what it is asked: to accept the work, or to do items; None: idle
+    pid: int = 0
+    ready: bool = False
+
+
+@contextmanager
+def connected(address: str | None) -> Iterator[None]:
+    """Be connected to a Ray cluster during the block.
+
+    Args:
+        address: HOST:PORT of its head. None: the one that ``RAY_ADDRESS`` names or that runs on this machine; where there is none, one of
+            this machine's cores is started for the block.
+
+    Raises:
+        InputError: Ray is not installed, or the address is that of a Ray client server.
+        InfrastructureError: There is no cluster at the address, or it has another version of Ray or Python.
+    """
+    ray = require_library("ray", "choosing an executor", "--executor ray", "pip install 'alpasim-onefixer[ray]'")
+    if address is not None and address.startswith("ray://"):
+        do_this = "start simrun on a node of the cluster, with --executor ray"
+        raise InputError("choosing an executor", f"--executor ray:{address}", "a Ray client cannot place workers on nodes", do_this)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    held = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    try:
+        try:
+            ray.init(address=address or "auto", **quiet)
+        except ConnectionError:
+            if address is not None:
+                raise
+            ray.init(address="local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **quiet)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        do_this = "start the cluster (ray start --head), or correct the address"
+        raise InfrastructureError("connecting to a Ray cluster", address or "this machine", str(error), do_this) from error
+    finally:
+        for number, handler in held.items():  # Ray puts its own in place, which would end the run without a word
+            signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+class RayPool(Generic[A]):
+    """Workers on a Ray cluster; see `alpasim_plugin.runtime.executors.dispatch.Pool`.
+
+    Args:
+        work: The work.
+        contents: What it may fetch.
+        expected: `alpasim_plugin.runtime.executors.identity.identity_of` of the driver.
+        targets: As that function takes them.
+        resources: Of each worker.
+        most: Most workers.
+        noticed: Called with a line for whatever a person should know.
+    """
+
+    chunk_s = 1.0
+
+    def __init__(
+        self,
+        work: Work[A, Any],
+        contents: Contents,
+        expected: Mapping[str, str],
+        targets: Sequence[str],
+        resources: Resources,
+        most: int,
+        noticed: Callable[[str], None],
+    ) -> None:
+        import ray
+
+        self._ray, self._work, self._contents = ray, work, contents
+        self._expected, self._targets, self._resources, self._most, self._noticed = dict(expected), targets, resources, most, noticed
+        self._blob = ray.put(pickle.dumps(work))
+        self._refs: OrderedDict[str, Any] = OrderedDict()
+        self._workers: dict[int, _Worker] = {}
+        self._next = 0
+        self._events: list[Event] = []
+        self._refused: dict[str, str] = {}  # node -> why
+        self._accepted: set[str] = set()
+        self._failed: dict[str, tuple[int, float]] = {}  # node -> failed starts, time of the last
+        self._ended: dict[str, list[int]] = {}  # node -> processes that were killed
+        self._ids: dict[str, str] = {}  # name -> Ray's id of living nodes
+        self._usable: frozenset[str] = frozenset()  # living nodes with room for a worker
+        self._looked_s = -LOOK_S
+        self._alive_s = time.monotonic()
+
+    def inherited(self, items: Sequence[A]) -> Iterable[tuple[int, Any]]:
+        """Yield nothing: actors end with their driver."""
+        return ()
+
+    def free(self) -> list[Place]:
+        """Start workers where there is room and return those without work.
+
+        Raises:
+            InfrastructureError: Every node was refused, none has the resources, or none has been there for a minute.
+        """
+        if time.monotonic() - self._looked_s >= LOOK_S:
+            self._look()
+        return [Place(number, one.node) for number, one in self._workers.items() if one.ready and one.ref is None]
+
+    def start(self, worker: int, items: Sequence[A]) -> None:
+        """Hand items to a free worker."""
+        needed = dict.fromkeys(sha256 for item in items for sha256 in self._work.needs(item))
+        refs = {sha256: self._reference(sha256) for sha256 in needed}
+        one = self._workers[worker]
+        one.ref = one.actor.do.remote(pickle.dumps(list(items)), refs)
+
+    def wait(self, timeout_s: float) -> list[Event]:
+        """Wait until workers answer or end."""
+        asked = {one.ref: number for number, one in self._workers.items() if one.ref is not None}
+        if not self._events:
+            if not asked:
+                time.sleep(min(timeout_s, 0.1))
+            else:
+                self._ray.wait(list(asked), num_returns=1, timeout=timeout_s)
+        if asked:
+            for ref in self._ray.wait(list(asked), num_returns=len(asked), timeout=0)[0]:
+                self._hear(asked[ref])
+        events, self._events = self._events, []
+        return events
+
+    def end(self, worker: int) -> None:
+        """End a worker and what it does."""
+        one = self._workers.pop(worker)
+        self._ended.setdefault(one.node, []).append(one.pid)
+        self._ray.kill(one.actor)
+
+    def nodes(self) -> frozenset[str]:
+        """Return the nodes that are in use."""
+        return self._usable - self._refused.keys()
+
+    def set_aside(self, node: str, why: str) -> None:
+        """Use a node no more."""
+        if node in self._refused:
+            return
+        self._refused[node] = why
+        self._noticed(f"node {node} is set aside: {why}")
+        for number in [n for n, one in self._workers.items() if one.node == node]:
+            if self._workers[number].ready and self._workers[number].ref is not None:
+                self._events.append(Died(number, node, "its node was set aside", of_node=True))
+            self.end(number)
+
+    def close(self) -> None:
+        """End all workers, and remove what those that were at work have left on their nodes."""
+        for number in list(self._workers):
+            busy = self._workers[number].ready and self._workers[number].ref is not None
+            node = self._workers[number].node
+            self.end(number)
+            if not busy:
+                self._ended[node].pop()
+        sweeps = [self._sweep(node, pids) for node, pids in self._ended.items() if pids and node in self._ids]
+        if sweeps:
+            self._ray.wait(sweeps, num_returns=len(sweeps), timeout=SWEEP_S)
+
+    def _sweep(self, node: str, pids: list[int]) -> Any:
+        return self._ray.remote(sweep).options(num_cpus=0, max_retries=0, scheduling_strategy=self._on(node)).remote(pids)
+
+    def _on(self, node: str) -> Any:
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        return NodeAffinitySchedulingStrategy(self._ids[node], soft=False)
+
+    def _reference(self, sha256: str) -> Any:
+        """Return Ray's reference to a content; Ray copies it to a node once, for all workers there."""
+        if sha256 not in self._refs:
+            self._refs[sha256] = self._ray.put(self._contents.read(sha256))
+            while len(self._refs) > HELD_CONTENTS:
+                self._refs.popitem(last=False)
+        self._refs.move_to_end(sha256)
+        return self._refs[sha256]
+
+    def _look(self) -> None:
+        """Look at the nodes and start workers where there is room, evenly."""
+        self._looked_s = now = time.monotonic()
+        alive = {f"{node['NodeManagerHostname']}/{node['NodeID'][:8]}": node for node in self._ray.nodes() if node["Alive"]}
+        self._ids = {name: node["NodeID"] for name, node in alive.items()}
+        room = {name: self._room(node["Resources"]) for name, node in alive.items() if name not in self._refused}
+        self._usable = frozenset(name for name, workers in room.items() if workers)
+        if alive:
+            self._alive_s = now
+        if alive and not room:
+            found = "; ".join(f"{name}: {why}" for name, why in self._refused.items())
+            raise InfrastructureError(
+                DOING, "all of its nodes", f"no node takes the work: {found}", "install the same versions on the nodes"
+            )
+        if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
+            found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
+            raise InfrastructureError(DOING, str(self._resources), found, "ask for less (--cores, --gpus, --memory), or add nodes")
+        on = {name: sum(one.node == name for one in self._workers.values()) for name in room}
+        while len(self._workers) < self._most:
+            open_ = [name for name in room if on[name] < room[name] and not self._rests(name, now)]
+            if not open_:
+                return
+            chosen = min(open_, key=lambda name: on[name])
+            on[chosen] += 1
+            self._open(chosen)
+
+    def _room(self, held: Mapping[str, float]) -> int:
+        """Return how many workers fit on a node."""
+        fits = [held.get("CPU", 0.0) / self._resources.cores]
+        if self._resources.gpus:
+            fits.append(held.get("GPU", 0.0) / self._resources.gpus)
+        if self._resources.memory_gib:
+            fits.append(held.get("memory", 0.0) / (self._resources.memory_gib * GIB))
+        return int(min(fits) + 1e-9)
+
+    def _rests(self, node: str, now_s: float) -> bool:
+        times, last_s = self._failed.get(node, (0, 0.0))
+        return times > 0 and now_s - last_s < AGAIN_S
+
+    def _open(self, node: str) -> None:
+        memory = {"memory": int(self._resources.memory_gib * GIB)} if self._resources.memory_gib else {}
+        made = self._ray.remote(Serving).options(
+            num_cpus=self._resources.cores,
+            num_gpus=self._resources.gpus,
+            max_restarts=0,
+            max_task_retries=0,
+            scheduling_strategy=self._on(node),
+            **memory,
+        )
+        actor = made.remote(node, self._resources.cores, self._expected, self._targets)
+        self._workers[self._next] = _Worker(actor, node, actor.accept.remote(self._blob))
+        self._next += 1
+
+    def _hear(self, number: int) -> None:
+        """Take what a worker answers."""
+        one = self._workers[number]
+        errors = self._ray.exceptions
+        try:
+            answer = self._ray.get(one.ref)
+        except errors.RayTaskError as error:
+            self._gone(number, one, f"{type(error.cause or error).__name__}: {error.cause or error}", error)
+        except errors.RayError as error:
+            self._gone(number, one, reason_of(error), error)
+        else:
+            one.ref = None
+            if one.ready:
+                self._events.append(Done(number, one.node, pickle.loads(answer)))
+                return
+            one.pid, reasons = answer
+            if reasons:
+                self.set_aside(one.node, "; ".join(reasons))
+                return
+            one.ready = True
+            self._accepted.add(one.node)
+
+    def _gone(self, number: int, one: _Worker, found: str, error: Exception) -> None:
+        """Strike a worker that is gone off the list."""
+        was_ready = one.ready
+        self.end(number)
+        self._looked_s = -LOOK_S
+        alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
+        of_node = self._ids.get(one.node) not in alive or isinstance(error, self._ray.exceptions.NodeDiedError)
+        if was_ready:
+            self._events.append(Died(number, one.node, found, of_node))
+            return
+        times = self._failed.get(one.node, (0, 0.0))[0] + 1
+        self._failed[one.node] = times, time.monotonic()
+        if times >= FAILED_STARTS and one.node not in self._accepted and not of_node:
+            self.set_aside(one.node, f"no worker starts there: {found}")
+
+
+def reason_of(error: Exception) -> str:
+    """Return the first telling line of one of Ray's errors, which are pages long."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0] if lines else 'no reason given'}"[:200]

@@ -1,0 +1,32 @@
+"""The folder in which a node drives, and what killed workers have left there."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from alpasim_plugin.processes import is_running
+from alpasim_plugin.runtime.writing import remove_left_overs
+
+GONE_S = 5.0  # within which a killed process must be gone
+
+
+def scratch_root() -> Path:
+    """Return where this node drives: ``$SIMRUN_SCRATCH``, or a folder of the user's below the system's temporary one."""
+    named = os.environ.get("SIMRUN_SCRATCH")
+    return Path(named) if named else Path(tempfile.gettempdir(), f"simrun-{os.getuid()}")
+
+
+def sweep(pids: Sequence[int] = ()) -> None:
+    """Remove what killed workers have left on this node, once these processes are gone.
+
+    Only names that simrun gives are touched, and only those of processes that run no more.
+    """
+    until_s = time.monotonic() + GONE_S
+    while any(is_running(pid) for pid in pids) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    if scratch_root().is_dir():
+        remove_left_overs(scratch_root(), time.time_ns())

@@ -1,0 +1,242 @@
+"""Jobs of Slurm through submitit: each job is one chunk of items, and answers through a folder that all nodes see.
+
+RUN/.slurm/SESSION/jobs          one line per job: its number, and for a local one when its process started
+                  /placed/SHA    contents, by their SHA-256
+                  /N_*.pkl, .out what submitit writes; gone as soon as a result was taken
+A driver that was killed leaves its session. The next one takes over the results that lie there and cancels what still runs.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from alpasim_plugin.atomic import write_bytes
+from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.optional import require_library
+from alpasim_plugin.processes import is_running, started_of
+from alpasim_plugin.runtime.executors.base import Faulty, Resources, Work
+from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
+from alpasim_plugin.runtime.executors.placing import Contents
+from alpasim_plugin.runtime.executors.scratch import sweep
+from alpasim_plugin.runtime.executors.serving import JobAnswer, serve_job
+
+A = TypeVar("A")
+
+FOLDER = ".slurm"
+DOING = "working in jobs of Slurm"
+LOCAL = "@local"  # instead of a partition: submitit's local executor, to try everything but Slurm itself
+JOB_MIN = 240  # time limit of a job, minutes
+POLL_S, GRACE_S = 0.2, 3.0  # between looks; between the end of a job and its result on a slow file system
+UNSEEN = "another"  # stands for the nodes that no job has run on yet
+MOST_REFUSALS = 3  # of nodes, while none was accepted
+MOST_JOBS = 256  # at a time
+
+
+class SlurmPool(Generic[A]):
+    """Jobs as workers; see `alpasim_plugin.runtime.executors.dispatch.Pool`. A worker is a slot for a job.
+
+    Args:
+        work: The work; ``work.key(item)`` names an item for a later driver.
+        contents: What it may fetch.
+        expected: `alpasim_plugin.runtime.executors.identity.identity_of` of the driver.
+        targets: As that function takes them.
+        resources: Of each job.
+        most: Most jobs at a time.
+        partition: Of Slurm; empty: its default. ``@local``: processes of this machine.
+        folder: A folder that all nodes see.
+        noticed: Called with a line for whatever a person should know.
+
+    Raises:
+        InputError: submitit is not installed.
+        InfrastructureError: There is no Slurm.
+    """
+
+    chunk_s = 600.0
+
+    def __init__(
+        self,
+        work: Work[A, Any],
+        contents: Contents,
+        expected: Mapping[str, str],
+        targets: Sequence[str],
+        resources: Resources,
+        most: int,
+        partition: str,
+        folder: Path,
+        noticed: Callable[[str], None],
+    ) -> None:
+        submitit = require_library("submitit", "choosing an executor", "--executor slurm", "pip install 'alpasim-onefixer[slurm]'")
+        self._work, self._contents, self._expected, self._targets = work, contents, dict(expected), tuple(targets)
+        self._resources, self._noticed = resources, noticed
+        self._is_local = partition == LOCAL
+        self._inherited = _take_over(folder / FOLDER, noticed)
+        self._session = folder / FOLDER / f"{os.getpid()}.{os.urandom(4).hex()}"
+        self._session.mkdir(parents=True)
+        self._blob = self._placed(contents.add_bytes(pickle.dumps(work)))
+        try:
+            self._executor = submitit.AutoExecutor(folder=str(self._session), cluster="local" if self._is_local else "slurm")
+        except RuntimeError as error:
+            do_this = f"start simrun where sbatch is, or try --executor slurm:{LOCAL}"
+            raise InfrastructureError(DOING, "submitit", str(error), do_this) from error
+        self._executor.update_parameters(**self._parameters("" if self._is_local else partition))
+        self._jobs: dict[int, Any] = {}  # slot -> job
+        self._ended_s: dict[int, float] = {}  # slot -> when its job was first seen to have ended without a result
+        self._slots = range(min(most, MOST_JOBS))
+        self._accepted: set[str] = set()
+        self._refused: dict[str, str] = {}
+
+    def inherited(self, items: Sequence[A]) -> Iterator[tuple[int, Any]]:
+        """Yield index and result of items that an earlier driver's jobs have done."""
+        for index, item in enumerate(items):
+            key = self._work.key(item)
+            if key in self._inherited:
+                yield index, self._inherited.pop(key)
+
+    def free(self) -> list[Place]:
+        """Return slots without a job. Nobody knows on which node Slurm will put the next one."""
+        return [Place(slot, "") for slot in self._slots if slot not in self._jobs]
+
+    def start(self, worker: int, items: Sequence[A]) -> None:
+        """Submit a job."""
+        for sha256 in dict.fromkeys(one for item in items for one in self._work.needs(item)):
+            self._placed(sha256)
+        keys = [self._work.key(item) for item in items]
+        job = self._executor.submit(
+            serve_job,
+            str(self._session),
+            self._blob.name,
+            pickle.dumps(list(items)),
+            keys,
+            self._expected,
+            self._targets,
+            self._resources.cores,
+        )
+        self._jobs[worker] = job
+        with (self._session / "jobs").open("a") as file:
+            file.write(f"{job.job_id} {started_of(int(job.job_id)) if self._is_local else ''}\n")
+
+    def wait(self, timeout_s: float) -> list[Event]:
+        """Wait until jobs answer or end."""
+        until_s = time.monotonic() + timeout_s
+        while True:
+            events = [event for slot in list(self._jobs) if (event := self._look(slot)) is not None]
+            if events or time.monotonic() >= until_s:
+                return events
+            time.sleep(min(POLL_S, max(0.0, until_s - time.monotonic())))
+
+    def end(self, worker: int) -> None:
+        """Cancel a job."""
+        job = self._jobs.pop(worker)
+        self._ended_s.pop(worker, None)
+        job.cancel(check=False)
+
+    def nodes(self) -> frozenset[str]:
+        """Return the nodes that are in use; on a cluster there may be another."""
+        return frozenset(self._accepted | (set() if self._is_local else {UNSEEN})) - self._refused.keys()
+
+    def set_aside(self, node: str, why: str) -> None:
+        """Keep later jobs off a node; what runs there may end."""
+        if node in self._refused:
+            return
+        self._refused[node] = why
+        self._noticed(f"node {node} is set aside: {why}")
+        if not self._is_local:
+            self._executor.update_parameters(slurm_exclude=",".join(sorted(self._refused)))
+        if not self._accepted - self._refused.keys() and (self._is_local or len(self._refused) >= MOST_REFUSALS):
+            found = "; ".join(f"{name}: {reason}" for name, reason in self._refused.items())
+            raise InfrastructureError(DOING, "its nodes", f"no node takes the work: {found}", "install the same versions on the nodes")
+
+    def close(self) -> None:
+        """Cancel all jobs and remove their files."""
+        processes = [int(job.job_id) for job in self._jobs.values()] if self._is_local else []
+        for slot in list(self._jobs):
+            self.end(slot)
+        if self._is_local:
+            sweep(processes)
+        shutil.rmtree(self._session, ignore_errors=True)  # a cancelled job may still write a line
+        if self._session.parent.is_dir() and not any(self._session.parent.iterdir()):
+            self._session.parent.rmdir()
+
+    def _parameters(self, partition: str) -> dict[str, Any]:
+        wanted: dict[str, Any] = {"timeout_min": JOB_MIN, "cpus_per_task": self._resources.cores, "name": "simrun"}
+        if self._resources.gpus:
+            wanted["gpus_per_node"] = max(1, round(self._resources.gpus))  # Slurm gives whole GPUs
+        if self._resources.memory_gib:
+            wanted["mem_gb"] = self._resources.memory_gib
+        if partition:
+            wanted["slurm_partition"] = partition
+        return wanted
+
+    def _placed(self, sha256: str) -> Path:
+        path = self._session / "placed" / sha256
+        if not path.exists():
+            write_bytes(path, self._contents.read(sha256), "placing a file for Slurm's nodes")
+        return path
+
+    def _look(self, slot: int) -> Event | None:
+        """Return what became of a job, if anything."""
+        job = self._jobs[slot]
+        if job.paths.result_pickle.exists():
+            outcome, answer = pickle.loads(job.paths.result_pickle.read_bytes())
+            del self._jobs[slot]
+            if outcome != "success":
+                return Died(slot, "", f"job {job.job_id}: {str(answer).strip().splitlines()[-1]}")
+            _forget(job.paths.folder, job.job_id)
+            return self._heard(slot, answer)
+        if not job.done():
+            return None
+        if time.monotonic() - self._ended_s.setdefault(slot, time.monotonic()) < GRACE_S:
+            return None
+        del self._jobs[slot], self._ended_s[slot]
+        return Died(slot, "", f"job {job.job_id} ended without a result ({job.state})", of_node=job.state == "NODE_FAIL")
+
+    def _heard(self, slot: int, answer: JobAnswer) -> Event:
+        if answer.reasons:
+            self.set_aside(answer.node, "; ".join(answer.reasons))
+            return Died(slot, answer.node, "its node was set aside", of_node=True)
+        self._accepted.add(answer.node)
+        return Done(slot, answer.node, pickle.loads(answer.answers))
+
+
+def _forget(folder: Path, job_id: str) -> None:
+    """Remove the files of a job whose result was taken."""
+    for path in folder.glob(f"{job_id}_*"):
+        path.unlink(missing_ok=True)
+
+
+def _take_over(folder: Path, noticed: Callable[[str], None]) -> dict[str, Any]:
+    """Return the results that killed drivers' jobs have left, cancel what runs, and remove the sessions. The run folder's lock is held."""
+    results: dict[str, Any] = {}
+    for session in sorted(folder.iterdir()) if folder.is_dir() else []:
+        jobs = session / "jobs"
+        lines = [line.split() for line in jobs.read_text().splitlines()] if jobs.exists() else []
+        waiting = [words for words in lines if not (session / f"{words[0]}_0_result.pkl").exists()]
+        running = [words for words in waiting if _cancel(words)]
+        for path in session.glob("*_result.pkl"):
+            outcome, answer = pickle.loads(path.read_bytes())
+            if outcome == "success" and not answer.reasons:
+                done = zip(answer.keys, pickle.loads(answer.answers), strict=True)
+                results |= {key: got for key, got in done if not isinstance(got, Exception | Faulty)}
+        noticed(f"an earlier run was cut off: {len(results)} of its results are taken over, {len(running)} of its jobs are cancelled")
+        shutil.rmtree(session)
+    return results
+
+
+def _cancel(words: Sequence[str]) -> bool:
+    """Cancel a job by its line; say whether there was anything to cancel."""
+    number = words[0]
+    if len(words) == 1:
+        return subprocess.run(["scancel", number], check=False, capture_output=True).returncode == 0
+    pid = int(number)
+    if not is_running(pid) or started_of(pid) != words[1]:  # the number may be another process's by now
+        return False
+    os.kill(pid, signal.SIGINT)
+    return True

@@ -1,0 +1,125 @@
+"""Finished rollouts in a store, each committed exactly once, whoever drives it and however often.
+
+    attempts/ROLLOUT/ATTEMPT/FILE   the files of one attempt; nobody else writes under its name
+    commits/KE/KEY.json             written last, and only once: the manifest, and which attempt's files it vouches for
+    index/000000.json               the keys that a driver has seen committed; parts are made in order, each once
+    tables/ATTEMPT/FILE, latest     tables and reports of a finished run; ``latest`` is written last and names the attempt
+
+An attempt that was cut off, or that came second, leaves files that no commit names; nobody reads them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.runtime.executors.parcel import Parcel
+from alpasim_plugin.runtime.stores.objects import Objects, open_objects
+
+DOING = "reading a rollout from a store"
+PART_KEYS, PART_S = 1000, 60.0  # a part of the index is written after so many keys or seconds
+
+
+class Commits:
+    """The rollouts of a store."""
+
+    def __init__(self, url: str, objects: Objects | None = None) -> None:
+        self.url = url
+        self._objects = objects or open_objects(url)
+        self.index = Index(self._objects)
+
+    def find(self, key: str) -> Parcel | None:
+        """Return a committed rollout; None where there is none.
+
+        Raises:
+            InfrastructureError: A file is missing or not what was committed, or the store does not answer.
+        """
+        stated = self._objects.read(_name(key))
+        return None if stated is None else self._parcel(key, json.loads(stated))
+
+    def commit(self, key: str, parcel: Parcel) -> Parcel:
+        """Commit a rollout and return what is committed: this one, or the one that came first."""
+        attempt = f"attempts/{parcel.manifest['path']}/{os.urandom(8).hex()}"
+        for name, data in parcel.files.items():
+            self._objects.write(f"{attempt}/{name}", data)
+        stated = {"attempt": attempt, "files": sorted(parcel.files), "manifest": parcel.manifest}
+        data = json.dumps(stated, allow_nan=False).encode()
+        if self._objects.create(_name(key), data):
+            return parcel
+        there = self._objects.read(_name(key))
+        if there == data:  # the answer to our own commit was lost
+            return parcel
+        if there is None:
+            raise InfrastructureError("committing a rollout", f"{self.url}/{_name(key)}", "it exists, and cannot be read", "try again")
+        return self._parcel(key, json.loads(there))
+
+    def publish(self, root: Path, names: Sequence[str]) -> None:
+        """Copy files of a finished run folder to the store; ``latest`` names them when all are there."""
+        attempt = f"tables/{os.urandom(8).hex()}"
+        for name in names:
+            self._objects.write(f"{attempt}/{name}", (root / name).read_bytes())
+        self._objects.write("latest", attempt.encode())
+
+    def _parcel(self, key: str, stated: dict[str, Any]) -> Parcel:
+        files = {}
+        for name in stated["files"]:
+            data = self._objects.read(f"{stated['attempt']}/{name}")
+            facts = stated["manifest"]["files"].get(name)
+            if data is None or (facts and hashlib.sha256(data).hexdigest() != facts["sha256"]):
+                found = f"{name} is {'missing' if data is None else 'not what was committed'}"
+                do_this = "remove that commit; the same command then drives the rollout again"
+                raise InfrastructureError(DOING, f"{self.url}/{_name(key)}", found, do_this)
+            files[name] = data
+        return Parcel(stated["manifest"], files)
+
+
+def _name(key: str) -> str:
+    return f"commits/{key[:2]}/{key}.json"
+
+
+@dataclass
+class Index:
+    """Which keys are committed, so that a restarted driver need not ask for each. Written by drivers, also by several at once.
+
+    A key that is committed but in no part is found by the worker that is about to drive it.
+    """
+
+    objects: Objects
+    keys: set[str] = field(default_factory=set)
+    _new: list[str] = field(default_factory=list)
+    _parts: int = 0
+    _written_s: float = field(default_factory=time.monotonic)
+
+    def load(self) -> None:
+        """Read the parts that are there and were not read yet: one question a part, and one more."""
+        while (part := self.objects.read(_part(self._parts))) is not None:
+            self.keys |= set(json.loads(part))
+            self._parts += 1
+
+    def add(self, keys: Iterable[str]) -> None:
+        """Take in committed keys, and write a part when it is due."""
+        self._new += [key for key in keys if key not in self.keys]
+        self.keys |= set(self._new)
+        if len(self._new) >= PART_KEYS or (self._new and time.monotonic() - self._written_s >= PART_S):
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is new as a part; a number that another driver took is read instead."""
+        while self._new:
+            if self.objects.create(_part(self._parts), json.dumps(self._new).encode()):
+                self._new = []
+                self._parts += 1
+            else:
+                self.load()
+        self._written_s = time.monotonic()
+
+
+def _part(number: int) -> str:
+    return f"index/{number:06d}.json"
