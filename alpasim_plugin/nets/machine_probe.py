@@ -1,7 +1,8 @@
 """What this machine computes quickly, asked of the machine: a convolution as the generators have them, timed in a few milliseconds.
 
-Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor multiplies matrices of it, about as fast
-where it only converts, and several times slower where it is emulated; and a second thread that shares a core may cost more than it brings.
+Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor multiplies matrices of it, about as
+fast where it only converts, and several times slower where it is emulated; and a second thread that shares a core may cost more than it
+brings.
 """
 
 from __future__ import annotations

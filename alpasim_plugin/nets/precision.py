@@ -45,8 +45,8 @@ class Choice:
 def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu") -> Choice:
     """Return the precision of convolutions that pays on this machine; the machine is asked once per process.
 
-    ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at most two thirds of the time that it takes in
-    float32 (`alpasim_plugin.nets.machine_probe`). Where bfloat16 is emulated it takes several times as long.
+    ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at most two thirds of the time that it takes
+    in float32 (`alpasim_plugin.nets.machine_probe`). Where bfloat16 is emulated it takes several times as long.
 
     Example:
         >>> choose_precision("fp32")

@@ -55,7 +55,9 @@ def test_a_seam_of_any_width_between_two_lanes(gap_m, turn):
 
 
 def test_a_wedge_that_opens_between_two_lanes():
-    upper = Lane("upper", np.array([[-30, 1.0, 0], [30, 1.2, 0]]), np.array([[-30, 2.0, 0], [30, 2.0, 0]]), np.array([[-30, 0, 0], [30, 0.4, 0]]))
+    upper = Lane(
+        "upper", np.array([[-30, 1.0, 0], [30, 1.2, 0]]), np.array([[-30, 2.0, 0], [30, 2.0, 0]]), np.array([[-30, 0, 0], [30, 0.4, 0]])
+    )
     lanes = road_map(strip("lower", -2.0, 0.0), upper)
     checked(lanes, rollout(track(np.linspace(-29, 29, 12), 0.1)))
     checked(lanes, rollout(track(np.linspace(-29, 29, 12), -1.0)))
@@ -64,7 +66,10 @@ def test_a_wedge_that_opens_between_two_lanes():
 @pytest.mark.parametrize("nudge_m", [0.0, 1e-12, -1e-12, 4e-7, -4e-7, 6e-7, -6e-7, 1e-5, -1e-5, 1e-3, -1e-3])
 def test_corners_and_sides_exactly_on_the_border(nudge_m):
     lanes = road_map(strip("right", -1.0, 0.0, vertices=3), strip("left", 0.0, 1.0, vertices=5))
-    checked(lanes, rollout(track([0.0, 30.0 - LENGTH_M / 2 + nudge_m, -30.0 + LENGTH_M / 2], [1.0 - HALF_W + nudge_m, 0.0, HALF_W - 1.0 + nudge_m])))
+    checked(
+        lanes,
+        rollout(track([0.0, 30.0 - LENGTH_M / 2 + nudge_m, -30.0 + LENGTH_M / 2], [1.0 - HALF_W + nudge_m, 0.0, HALF_W - 1.0 + nudge_m])),
+    )
     # A corner on the outer border, the body turned.
     yaw = 0.4
     up = LENGTH_M / 2 * np.sin(yaw) + HALF_W * np.cos(yaw)
@@ -105,7 +110,7 @@ def test_random_arrangements_far_from_neat():
         lanes = [
             strip(
                 f"l{k}",
-                *np.sort(np.round(rng.uniform(-4, 4, 2), int(rng.integers(0, 3))) + [0, 1e-9 * rng.integers(0, 2)]),
+                *np.sort(np.round(rng.uniform(-4, 4, 2), int(rng.integers(0, 3))) + np.array([0.0, 1e-9 * rng.integers(0, 2)])),
                 *(-float(rng.integers(5, 20)), float(rng.integers(5, 20))),
                 int(rng.integers(2, 6)),
                 float(rng.choice([0.0, 0.0, 1e-7, 0.02, 1.0, np.pi / 2, np.pi])),
