@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 
 from alpasim_plugin.geometry import arc_lengths, resample
@@ -29,6 +32,23 @@ def lane_polygon(lane: Lane, half_width_m: float = HALF_WIDTH_M) -> Any:
         line = shapely.linestrings(xy) if len(xy) > 1 else shapely.points(xy[0])
         return shapely.buffer(line, half_width_m, quad_segs=16)
     return ring_area(np.concatenate([lane.left[:, :2], lane.right[::-1, :2]]))
+
+
+def lane_polygons(lanes: Sequence[Lane], origin: F64, half_width_m: float = HALF_WIDTH_M) -> npt.NDArray[Any]:
+    """Return the areas ``(L,)`` of lanes, as `lane_polygon` gives them for lanes moved to an origin ``(3,)``, all in a few calls."""
+    out = np.full(len(lanes), None, dtype=object)
+    edged = [(k, one.left[:, :2], one.right[::-1, :2]) for k, one in enumerate(lanes) if one.left is not None and one.right is not None]
+    rings = {k: np.concatenate([left, right]) for k, left, right in edged if len(left) + len(right) > 2}
+    if rings:
+        ringed = np.array(list(rings))
+        owner = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings.values()])
+        out[ringed] = shapely.polygons(shapely.linearrings(np.concatenate(list(rings.values())) - origin[:2], indices=owner))
+        for k in ringed[~shapely.is_valid(out[ringed])]:
+            out[k] = areal_parts(shapely.make_valid(out[k]))
+    for k in [k for k, area in enumerate(out) if area is None]:
+        left, right = (None if edge is None else edge - origin for edge in (lanes[k].left, lanes[k].right))
+        out[k] = lane_polygon(replace(lanes[k], centre=lanes[k].centre - origin, left=left, right=right), half_width_m)
+    return out
 
 
 def ring_area(ring: F64) -> Any:

@@ -56,7 +56,7 @@ class Footprints:
     @property
     def inner_radius_m(self) -> F64:
         """Radius ``(N,)`` of a circle around the centre inside each footprint."""
-        return np.asarray(self.size.min(axis=1) / 2)
+        return np.asarray(np.minimum(self.size[:, 0], self.size[:, 1]) / 2)
 
     def take(self, index: I64) -> Footprints:
         """Return the boxes at some rows."""

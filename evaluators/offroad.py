@@ -18,10 +18,11 @@ import shapely
 
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.geometry import wrap_angle, yaw_from_quat
-from alpasim_plugin.types import F64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.base import series, with_preset
-from evaluators.footprint import Geometries, ego_footprints, origin_of
+from evaluators.footprint import Footprints, ego_footprints, origin_of
 from evaluators.presets import Preset
+from evaluators.ragged import pairs_of
 from evaluators.road import Road, road_of
 from evaluators.surface import MARGIN_M
 
@@ -42,26 +43,52 @@ class Containment:
     boundary_gap_m: F64  # (T,) distance to the union's border where it contains the footprint, else 0
 
 
-def containment(road: Road, footprints: Geometries, xyz: F64) -> Containment:
+def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
     """Test footprints ``(T,)`` with box centres ``(T, 3)`` against single lanes and against the union of nearby lanes."""
     near = road.lanes_near(xyz)
-    in_one = np.zeros(len(footprints), dtype=np.bool_)
-    step, lane = np.nonzero(near)
-    in_one[step[shapely.contains(road.areas[lane], footprints[step])]] = True
-    in_union = np.zeros_like(in_one)
-    gap_m = np.zeros(len(footprints))
-    # Steps with the same nearby lanes share one union.
-    _, first, group = np.unique(np.packbits(near, axis=1), axis=0, return_index=True, return_inverse=True)
-    group = group.reshape(-1)
-    for g, representative in enumerate(first):
-        if not near[representative].any():
-            continue
-        rows = np.flatnonzero(group == g)
-        union = road.union(near[representative])
-        inside = rows[shapely.contains(union, footprints[rows])]
+    shapes = ego.shapes()
+    step, lane = pairs_of(near)
+    areas = road.areas(lane)
+    vertices, owner = shapely.get_coordinates(shapes, return_index=True)
+    vertex = vertices[np.searchsorted(owner, np.arange(len(shapes)))]  # one of each footprint: a lane without it cannot contain the rest
+    holds_vertex = shapely.intersects_xy(areas, *vertex[step].T)
+    in_one = np.zeros(len(near), dtype=np.bool_)
+    in_one[step[holds_vertex][shapely.contains(areas[holds_vertex], shapes[step[holds_vertex]])]] = True
+    sets, group = _distinct(near)
+    in_union, gap_m = np.zeros_like(in_one), np.zeros(len(near))
+    rows = np.flatnonzero(near.any(axis=1))
+    borders = road.borders(sets) if ego.roundness == 0 and not ego.float32 else None
+    if borders is not None:
+        vertex_held = np.zeros_like(in_one)
+        vertex_held[step[holds_vertex]] = True
+        touched = vertex_held.copy()
+        open_ = np.flatnonzero(~vertex_held[step])
+        touched[step[open_][shapely.intersects(areas[open_], shapes[step[open_]])]] = True
+        single = near[rows].sum(axis=1) == 1
+        held = borders.held(sets, group[rows], ego.take(rows))
+        # Where the border stays clear of a footprint, all of it is in the union or nothing, as its one vertex is.
+        inside = np.where(single, in_one[rows], vertex_held[rows] & ~held.crossed)
+        sure = held.sure & (single | held.crossed | (vertex_held == touched)[rows])
+        in_union[rows[sure & inside]] = True
+        gap_m[rows[sure & inside]] = held.gap_m[sure & inside]
+        rows = rows[~sure]
+    for g in np.unique(group[rows]):
+        mine = rows[group[rows] == g]
+        union = road.union(sets[g])
+        inside = mine[shapely.contains(union, shapes[mine])]
         in_union[inside] = True
-        gap_m[inside] = shapely.distance(shapely.boundary(union), footprints[inside])
+        gap_m[inside] = shapely.distance(shapely.boundary(union), shapes[inside])
     return Containment(near, in_one, in_union, gap_m)
+
+
+def _distinct(near: Bool) -> tuple[Bool, I64]:
+    """Return the distinct rows ``(G, L)`` of ``(T, L)``, and which of them each row is ``(T,)``; most rows are as the one before."""
+    packed = np.packbits(near, axis=1)
+    fresh = np.concatenate([[True], (packed[1:] != packed[:-1]).any(axis=1)])
+    number: dict[bytes, int] = {}
+    of_run = np.array([number.setdefault(row.tobytes(), len(number)) for row in packed[fresh]])
+    first = np.unique(of_run, return_index=True)[1]
+    return near[fresh][first], of_run[np.cumsum(fresh) - 1]
 
 
 def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Bool:
@@ -72,7 +99,7 @@ def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Boo
     lanes under the ego oppose; AlpaSim calls it wrong if any does.
     """
     step, lane = np.nonzero(near)
-    inside = shapely.contains(road.areas[lane], shapely.points(xy[step]))
+    inside = shapely.contains(road.areas(lane), shapely.points(xy[step]))
     step, lane = step[inside], lane[inside]
     delta = road.heading_at(lane, xy[step]) - yaw[step]
     opposes = np.abs(wrap_angle(delta) if preset.wrap_heading else delta) > WRONG_HEADING_RAD
@@ -96,12 +123,11 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     origin = origin_of(scene.ego_log, preset)
     road = road_of(lane_map, origin, preset)
     ego = ego_footprints(rollout, preset, origin)
-    shapes = ego.shapes()
     xyz = rollout.ego.xyz - origin
     if preset.offroad_rule == "margin":
         if preset.missing_road == "error" and road.surface.is_empty:
             raise _no_map(rollout, preset, "no lane of the map has an area")
-        margin_m = road.surface.margin_m(shapes, xyz)
+        margin_m = road.surface.margin_m(ego.shapes(), xyz)
         against = wrong_lane(road, road.lanes_near(xyz), ego.centres(), ego.yaw, preset)
         return [
             series("offroad", t_us, margin_m < -MARGIN_M),
@@ -109,12 +135,12 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
             series("wrong_lane", t_us, against),
             series("min_distance_to_lane_boundary_m", t_us, np.maximum(margin_m, 0.0)),
         ]
-    held = containment(road, shapes, xyz)
+    held = containment(road, ego, xyz)
     off = np.zeros(len(t_us), dtype=np.bool_)
     known = held.in_one | held.in_union
     undecided = np.flatnonzero(~known)
     if len(road.edges) and len(undecided):
-        off[undecided] = road.touches_edge(shapes[undecided], xyz[undecided])
+        off[undecided] = road.touches_edge(ego.take(undecided).shapes(), xyz[undecided])
         known[undecided] = True
     if preset.missing_road == "absent" and not known.all():
         return []

@@ -209,8 +209,10 @@ def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:
 
 def segment_distance(start: F64, end: F64, points: F64) -> F64:
     """Return distances ``(M,)`` between points ``(M, D)`` and segments ``(M, D)``, ``(M, D)``."""
-    along, offset = end - start, points - start
-    length2 = np.einsum("ij,ij->i", along, along)
-    f = np.einsum("ij,ij->i", along, offset)
-    f = np.clip(np.divide(f, length2, out=np.zeros_like(f), where=length2 > 0), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(offset - f[:, None] * along, axis=1))
+    # One coordinate after the other: numpy is slow at rows of two or three numbers.
+    along = [end[:, d] - start[:, d] for d in range(start.shape[1])]
+    offset = [points[:, d] - start[:, d] for d in range(start.shape[1])]
+    length2 = sum(a * a for a in along)
+    f = sum(a * o for a, o in zip(along, offset, strict=True))
+    f = np.clip(np.divide(f, length2, out=np.zeros(len(start)), where=length2 > 0), 0.0, 1.0)
+    return np.asarray(np.sqrt(sum((o - f * a) ** 2 for a, o in zip(along, offset, strict=True))))

@@ -31,7 +31,8 @@ class ChunkRenderer(Renderer):
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the counts so far."""
         fixer = self.fixer
-        return {"label": fixer.label, "trained": fixer.trained, "mode": "chunk", "frames": self.frames, "blocks": self.blocks}
+        counts = {"frames": self.frames, "blocks": self.blocks}
+        return {"label": fixer.label, "trained": fixer.trained, "mode": "chunk"} | counts | {"chosen": dict(fixer.chosen)}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render a block of one frame; see `render_batch`."""

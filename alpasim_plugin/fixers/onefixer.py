@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -21,6 +22,7 @@ from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import DOING, SIDE, Views, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE as LATENT_SIDE
 from alpasim_plugin.nets.clips import crop_clip
+from alpasim_plugin.nets.machine_probe import choose_threads
 from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
@@ -53,7 +55,7 @@ class OneFixer(Fixer):
         settings: Sizes, weights, window, steps, precision.
         scene_id, seed: Key of the noise, with the camera and the latent's index.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads of this process; None leaves their number.
+        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -63,8 +65,12 @@ class OneFixer(Fixer):
         if not isinstance(settings, OneFixerSettings):
             found = f"settings of type {type(settings).__name__}"
             raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
+        self.chosen: dict[str, Any] = {}
         if threads is not None:
-            torch.set_num_threads(threads)
+            number = choose_threads(threads)
+            torch.set_num_threads(number.number)
+            self.chosen["threads"] = number.as_dict()
+        self.chosen["precision"] = {"name": settings.precision, "codec": settings.codec_precision, "why": "as set"}
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)
         # On an accelerator timing a stage waits for the device and prevents recordings; there the block is timed as a whole.

@@ -28,7 +28,8 @@ class PerFrameRenderer(Renderer):
 
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the number of frames so far."""
-        return {"label": self.fixer.label, "trained": self.fixer.trained, "mode": "frame", "frames": self.frames}
+        fixer = self.fixer
+        return {"label": fixer.label, "trained": fixer.trained, "mode": "frame", "frames": self.frames, "chosen": dict(fixer.chosen)}
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; see `render_batch`."""

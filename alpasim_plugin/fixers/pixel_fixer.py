@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from alpasim_plugin.fixers.pixel_pipeline import PixelInputs, fix_frame, load_ge
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import DOING, HALF, Views, group_views
+from alpasim_plugin.nets.machine_probe import choose_threads
 from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
 from alpasim_plugin.nets.pixel_source import sparse_source
 from alpasim_plugin.types import F32, I64, U8, BlockRule, Fixer, Frame
@@ -39,7 +41,7 @@ class PixelFixer(Fixer):
         settings: Weights, steps, precision, guard.
         scene_id, seed: Key of the noise, with camera, frame (its index or its content, see `PixelFixerSettings.noise`) and pixel.
         device: ``cpu`` or ``cuda``.
-        threads: Torch threads of this process; None leaves their number.
+        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -51,10 +53,14 @@ class PixelFixer(Fixer):
         if not isinstance(settings, PixelFixerSettings):
             found = f"settings of type {type(settings).__name__}"
             raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
+        self.chosen: dict[str, Any] = {}
         if threads is not None:
-            torch.set_num_threads(threads)
+            number = choose_threads(threads)
+            torch.set_num_threads(number.number)
+            self.chosen["threads"] = number.as_dict()
         self.settings, self.scene_id = settings, scene_id
         self.generator = load_generator(settings, device)
+        self.chosen["precision"] = self.generator.precision.as_dict()
         self.trained = self.generator.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
         self.label = f"{settings.name}{at}, {self.generator.note}, {self.generator.precision.name}"

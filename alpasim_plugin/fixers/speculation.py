@@ -59,6 +59,7 @@ class SpeculativeRenderer(Renderer):
         self._make = make_fixer
         self._spare: Fixer | None = first or make_fixer()
         self.label, self.trained, blocks = self._spare.label, self._spare.trained, self._spare.blocks
+        self.chosen = dict(self._spare.chosen)
         self.lookahead = max(1, max(blocks.first, blocks.then) - 1)  # at least the next frame, which tells cameras of other rates apart
         self._groups: dict[tuple[int, ...], _CameraGroup] = {}
         self._group_of: dict[str, _CameraGroup] = {}
@@ -71,7 +72,7 @@ class SpeculativeRenderer(Renderer):
 
     def facts(self) -> dict[str, Any]:
         """Return the fixer's label and the counts so far."""
-        return {"label": self.label, "trained": self.trained, "mode": "speculative"} | self.stats.as_dict()
+        return {"label": self.label, "trained": self.trained, "mode": "speculative", "chosen": self.chosen} | self.stats.as_dict()
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame; see `render_batch`."""

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from alpasim_plugin.nets import checkpoints
 from alpasim_plugin.nets.dit import FLOAT32_KEYS, CosmosCausalDiT, TextContext
+from alpasim_plugin.nets.machine_probe import WORTH, Probe, probe_precision
 
 Precision = Literal["fp32", "bf16", "fp16"]
 DTYPES: Mapping[Precision, torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -30,28 +31,34 @@ class Choice:
 
     name: Literal["fp32", "bf16"]
     why: str
+    probe: Probe | None = None  # what was measured; None where nothing had to be
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a record, with the measured error of one convolution at this precision."""
+        out: dict[str, Any] = {"name": self.name, "why": self.why}
+        if self.probe is not None:
+            out |= {"error": self.probe.bf16_error if self.name == "bf16" else self.probe.fp32_error, "probe": asdict(self.probe)}
+        return out
 
 
 @cache
 def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu") -> Choice:
     """Return the precision of convolutions that pays on this machine; the machine is asked once per process.
 
-    ``auto`` is bfloat16 on a GPU and on a processor with matrix or dot-product instructions for it (AMX, AVX-512 BF16). Anywhere else
-    bfloat16 is emulated and takes several times as long as float32.
+    ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at most two thirds of the time that it takes
+    in float32 (`alpasim_plugin.nets.machine_probe`). Where bfloat16 is emulated it takes several times as long.
 
     Example:
         >>> choose_precision("fp32")
-        Choice(name='fp32', why='as set')
+        Choice(name='fp32', why='as set', probe=None)
     """
     if wanted != "auto":
         return Choice(wanted, "as set")
     if device.split(":")[0] == "cuda":
         return Choice("bf16", "a GPU")
-    probes = {"AMX": torch.cpu._is_amx_tile_supported, "AVX-512 BF16": torch.cpu._is_avx512_bf16_supported}
-    found = [label for label, probe in probes.items() if probe()]
-    if found:
-        return Choice("bf16", f"the processor has {found[0]}")
-    return Choice("fp32", "the processor has no instructions for bfloat16")
+    probe = probe_precision()
+    gain = probe.fp32_ms / probe.bf16_ms
+    return Choice("bf16" if gain >= WORTH else "fp32", f"bfloat16 is {gain:.2g} times as fast as float32 on this processor", probe)
 
 
 def at_precision(net: CosmosCausalDiT, precision: Precision) -> CosmosCausalDiT:

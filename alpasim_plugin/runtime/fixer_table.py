@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
@@ -31,6 +31,30 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
             entry |= {key: _largest(one[key] for one in facts) for key in ("forecast_error", "shown_error")}
         out[name] = entry
     return out
+
+
+def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return for each renderer with a fixer what its workers chose by measuring their machine, for ``run.json``.
+
+    Workers measure by themselves. Equal choices are one entry, with the measurements of the first worker and the number of rollouts; more
+    than one entry says that workers computed differently.
+    """
+    out: dict[str, list[dict[str, Any]]] = {}
+    for manifest in manifests:
+        facts = (manifest.get("fixer") or {}).get("chosen")
+        if not facts:
+            continue
+        entries = out.setdefault(manifest["renderer"], [])
+        same = [entry for entry in entries if _picked(entry) == _picked(facts)]
+        if same:
+            same[0]["rollouts"] += 1
+        else:
+            entries.append({**facts, "rollouts": 1})
+    return out
+
+
+def _picked(facts: Mapping[str, Any]) -> tuple[Any, Any]:
+    return facts["precision"]["name"] if "precision" in facts else None, facts["threads"]["number"] if "threads" in facts else None
 
 
 def _largest(spreads: Iterable[dict[str, dict[str, float] | None]]) -> dict[str, float | None]:

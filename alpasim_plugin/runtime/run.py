@@ -34,6 +34,7 @@ from alpasim_plugin.runtime.contents import (
 )
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
+from alpasim_plugin.runtime.fixer_table import chosen
 from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan, slug
 from alpasim_plugin.runtime.project import project
@@ -171,7 +172,7 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     """
     info = read_run_json(root)
     outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
-    write_run_json(root, info | dict(more) | {"outcome": outcome})
+    write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
     summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})

@@ -1,0 +1,35 @@
+"""Precision and threads are measured: what is faster is taken, and the measurements are kept."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from alpasim_plugin.nets import machine_probe, precision
+from alpasim_plugin.nets.machine_probe import Probe, choose_threads, probe_precision
+
+
+def test_the_probe_measures_time_and_error_of_both_precisions():
+    probe = probe_precision()
+    assert min(probe.fp32_ms, probe.bf16_ms) > 0
+    assert 1e-9 < probe.fp32_error < 1e-5
+    assert 5e-4 < probe.bf16_error < 1e-2  # a mantissa of 8 bits
+
+
+@pytest.mark.parametrize(("bf16_ms", "name"), [(1.0, "bf16"), (6.0, "bf16"), (6.2, "fp32"), (9.0, "fp32"), (80.0, "fp32")])
+def test_the_faster_precision_is_taken_and_its_error_recorded(monkeypatch, bf16_ms, name):
+    monkeypatch.setattr(precision, "probe_precision", lambda: Probe(9.0, bf16_ms, 1e-7, 3e-3))
+    choice = precision.choose_precision.__wrapped__("auto")
+    assert choice.name == name
+    assert choice.as_dict()["error"] == (3e-3 if name == "bf16" else 1e-7)
+    assert choice.as_dict()["probe"]["bf16_ms"] == bf16_ms
+
+
+@pytest.mark.parametrize(("slowdown", "number"), [({1: 4.0, 2: 2.5}, 2), ({1: 4.0, 2: 3.8}, 1), ({1: 4.0, 2: 300.0}, 1)])
+def test_threads_that_do_not_pay_are_left_unused(monkeypatch, slowdown, number):
+    monkeypatch.setattr(machine_probe, "_ms", lambda *pair: slowdown[torch.get_num_threads()])
+    before = torch.get_num_threads()
+    found = choose_threads.__wrapped__(2)
+    assert (found.number, found.ms) == (number, slowdown)
+    assert torch.get_num_threads() == before
+    assert choose_threads.__wrapped__(1).ms == {}
