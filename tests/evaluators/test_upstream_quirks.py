@@ -138,7 +138,7 @@ def test_d08_a_seam_between_lanes_breaks_alpasims_union():
 
 def test_d09_alpasim_compares_headings_without_wrapping():
     west = lane("west", 0.0)
-    west = replace(west, centre=[*west.centre[::-1], [0, 0, 0], [0, 0.0001, 0]], left=west.right[::-1], right=west.left[::-1])
+    west = replace(west, centre=np.array([*west.centre[::-1], [0, 0, 0], [0, 0.0001, 0]]), left=west.right[::-1], right=west.left[::-1])
     log = rollout(track(-np.arange(4.0), 0.0, yaw=-np.pi + 1e-3))
     alpasim, strict = both(log, road_map(west, edges=TWO_LANES.road_edges))
     assert alpasim["wrong_lane"].value.all()
