@@ -24,6 +24,11 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
     (r"--rrd", "needs rerun-sdk, half a gigabyte; tests/recordings/test_rrd.py reads what it writes"),
     (r"view .*--serve", "goes on until it is stopped; tests/viewer/test_view_server.py asks it"),
+    (
+        r"^serve|127\.0\.0\.1:|can://|scene\.usdz",
+        "needs a service, a bus or a scene of the reader's, or goes on until it is stopped; tests/alpasim and tests/control run each",
+    ),
+    (r"--executor |s3://|/nfs/", "needs a cluster or a store of the reader's; tests/runtime/test_ray.py and its siblings run them"),
     (r"exec:docker|driver\.py", "needs a container or a driver of the reader's"),
     (r"--images folder/", "needs the reader's own pictures"),
     (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
