@@ -34,6 +34,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"gate runs/|compare runs/main|my_policy:Mine", "a record of six runs; tests/cli/test_gate_and_compare.py runs each of its cases"),
 )
 SHORT = ("--set", "timing.duration_us=1200000", "--certify", "none", "--workers", "2")
+LONGER = ("--set", "timing.duration_us=3000000", *SHORT[2:])  # for AlpaSim's time line, which drives by the log for 1.7 s
 NOTHING_FITTED = ("--set", "degradation.kind=surrogate")  # for scenes that say nothing about their reconstruction
 
 

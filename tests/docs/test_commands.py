@@ -23,7 +23,7 @@ import typer
 
 from alpasim_plugin.cli.main import VERBS, make_app, with_verb
 from alpasim_plugin.log import write_mp4
-from tests.docs.commands import NO_COMMAND, NOTHING_FITTED, OTHER, SHORT, SIMRUN, Command, commands, lines_of, pages
+from tests.docs.commands import LONGER, NO_COMMAND, NOTHING_FITTED, OTHER, SHORT, SIMRUN, Command, commands, lines_of, pages
 
 REPO = Path(__file__).resolve().parents[2]
 COMMANDS = commands(REPO)
@@ -146,7 +146,8 @@ def shortened(words: tuple[str, ...]) -> list[str]:
     args = ["scenario.yaml" if word == "SCENARIO" else word.replace("suites/urban", "suites/smoke") for word in words]
     if args[0] not in VERBS or args[0] == "run":
         fitting = [] if "suites/first" in args else NOTHING_FITTED
-        more = () if any("drive.csv" in word for word in args) else (*SHORT, *fitting)
+        short = LONGER if "--timeline" in args else SHORT
+        more = () if any("drive.csv" in word for word in args) else (*short, *fitting)
         return [*args, *more, "--seeds", "1"]
     return args
 
