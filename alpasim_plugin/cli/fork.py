@@ -24,9 +24,9 @@ from alpasim_plugin.runtime.store import read_json
 FORK_EPILOG = """
 Examples:
 
-- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 4.2 --renderer clean`
+- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 2.2 --renderer clean`
 
-- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 4.2` continues unchanged and checks that the result equals the log
+- `simrun fork runs/us101 --cell 3dgs/lane-camera/us101/0 --at 2.2` continues unchanged and checks that the result equals the log
 """
 PROBE_EPILOG = "Example: `simrun probe runs/us101 --cell clean/lane-camera/us101/0 --renderers clean,3dgs`"
 
