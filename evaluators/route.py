@@ -20,7 +20,7 @@ from evaluators.footprint import ego_footprints, held, origin_of
 from evaluators.presets import Preset
 
 DIRECTION_M = 1.0
-_MAX_CELLS = 2_000_000  # points x segments handled at once
+_ROWS = 32  # points handled at once, so that what is computed of them stays in the processor's cache
 
 
 def recorded_path(rollout: RolloutLog, preset: Preset) -> Trajectory:
@@ -120,18 +120,19 @@ def progress_so_far(path: F64, points: F64) -> F64:
     s = arc_lengths(path)
     if n == 1:
         return np.ones(1)
-    start, along = path[:-1], np.diff(path, axis=0)
-    length2 = np.einsum("ij,ij->i", along, along)
+    (x, y), (along_x, along_y) = path[:-1].T, np.diff(path, axis=0).T
+    length2 = along_x**2 + along_y**2
+    over = np.where(length2 > 0, length2, np.inf)  # a segment without length is its start
     out = np.ones(n)
-    rows_at_once = max(1, _MAX_CELLS // n)
-    for low in range(0, n, rows_at_once):
-        rows = np.arange(low, min(low + rows_at_once, n))
-        offset = points[rows, None] - start[None]  # (R, N-1, 2)
-        f = np.einsum("rnj,nj->rn", offset, along)
-        f = np.clip(np.divide(f, length2[None], out=np.zeros_like(f), where=length2[None] > 0), 0.0, 1.0)
-        away = offset - f[..., None] * along[None]
-        distance2 = np.einsum("rnj,rnj->rn", away, away)
-        distance2[np.arange(n - 1)[None] >= rows[:, None]] = np.inf  # segments that start at or after vertex k do not exist yet
+    for low in range(1, n, _ROWS):
+        rows = np.arange(low, min(low + _ROWS, n))
+        there = slice(0, int(rows[-1]))  # segments that start at or after vertex k do not exist yet for point k
+        to_x, to_y = points[rows, :1] - x[there], points[rows, 1:] - y[there]  # (R, S)
+        f = np.clip((to_x * along_x[there] + to_y * along_y[there]) / over[there], 0.0, 1.0)
+        to_x -= f * along_x[there]
+        to_y -= f * along_y[there]
+        distance2 = to_x**2 + to_y**2
+        distance2[np.arange(rows[-1])[None] >= rows[:, None]] = np.inf
         best = np.argmin(distance2, axis=1)
         reached = s[best] + f[np.arange(len(rows)), best] * np.sqrt(length2[best])
         total = s[rows]

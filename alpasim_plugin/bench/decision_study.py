@@ -9,15 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy import special
 
 from alpasim_plugin.bench.interval_study import RATES, SHARED_NOISE, Design, pairs
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
 from evaluators.aggregate.power import scenes_needed
-from evaluators.sequential import asymptotic, betting
+from evaluators.sequential import asymptotic, betting, line
+from evaluators.sequential.asymptotic import FIRST_LOOK
 from evaluators.sequential.control import predictions
 from evaluators.sequential.differences import SceneDifferences
 from evaluators.sequential.draws import Draws, independent, without_replacement
@@ -31,6 +34,9 @@ LOOK_EVERY = 5
 BLOCK = 250  # runs at a time, so that memory stays small
 NEVER = 1 << 40
 
+FAMILIES = 5
+
+Way = Literal["random", "control", "stratified"]
 Draw = Callable[[int, int, np.random.Generator], F64]  # (runs, scenes, generator) -> differences (runs, scenes)
 
 
@@ -140,6 +146,18 @@ def fixed_scenes(distance: float, spread: float, power: float, tail: float) -> i
     return found
 
 
+def ceiling_for(case: Case, runs: int, fixed: int, power: float) -> tuple[int, Ends]:
+    """Return the least ceiling at which decisions have the power, in steps of 5 % of the fixed design, and the runs that it gives."""
+    ratio = 1.0
+    while True:
+        ceiling = round(ratio * fixed)
+        done = ends(case, runs, ceiling)
+        reached = done.share(done.good, ceiling)
+        if reached >= power:
+            return ceiling, done
+        ratio += 0.05 if reached > power - 0.06 else 0.15
+
+
 def spread_of(draw: Draw, name: str, scenes: int = 200_000) -> float:
     """Return the standard deviation of scene differences."""
     return float(draw(1, scenes, stream(name, 0, "decide/spread")).std())
@@ -162,7 +180,7 @@ def overall(runs: int, k: int, correlation: float, truths: str, scenes: int = 30
         truths: ``all on the threshold``, or ``one on the threshold`` and the others far on the good side.
         scenes: At most.
     """
-    plan, bar = Plan(0.3, scenes, ALPHA), -math.log(ALPHA)
+    plan, shared, bar = Plan(0.3, scenes, ALPHA), Plan(0.3, scenes, ALPHA / k), -math.log(ALPHA)
     good_runs, bad_runs = [], []
     for block, start in enumerate(range(0, runs, BLOCK)):
         generator = stream(f"overall {k} {correlation} {truths}", 0, "decide/study", block)
@@ -173,9 +191,9 @@ def overall(runs: int, k: int, correlation: float, truths: str, scenes: int = 30
             x = math.sqrt(correlation) * common + math.sqrt(1.0 - correlation) * generator.standard_normal((n, scenes))
             far = 0.0 if i == 0 or truths == "all on the threshold" else -0.6
             one = Case("", shape("normal", 0.0), 0.0, 0.3, False)
-            mine = logs(one, independent(x + far, -math.inf, math.inf), plan)
-            good.append(np.maximum.accumulate(mine[0], axis=1))
-            bad.append(mine[1])
+            draws = independent(x + far, -math.inf, math.inf)
+            good.append(np.maximum.accumulate(logs(one, draws, plan)[0], axis=1))
+            bad.append(logs(one, draws, shared)[1])
         all_good = np.all(np.array(good) >= bar, axis=0).any(axis=1)
         any_bad = np.any(closed(np.array(bad)) >= bar, axis=0).any(axis=1)
         good_runs.append(all_good)
@@ -211,6 +229,60 @@ def suite_ends(runs: int, size: int, explained: float | None, on_threshold: bool
         good, bad = logs(case, draws, plan)
         times.append((_when(good[None], plan.log_bar, LOOK_EVERY), _when(bad[None], plan.log_bar, LOOK_EVERY)))
     return Ends(*(np.concatenate(side) for side in zip(*times, strict=True)))
+
+
+def family_ends(runs: int, size: int, between: float, way: Way, on_threshold: bool) -> Ends:
+    """Return when decisions about finite suites of five families of scenes end; `NEVER` before all scenes are driven.
+
+    Args:
+        runs: Simulated runs, each with a suite of its own.
+        size: Scenes of the suite, a multiple of five, with normal differences of variance 1.
+        between: Share of the variance that is between families.
+        way: ``random`` order; ``control``: random order with the families as control; ``stratified``: one scene of every family, in random
+            order within families, then the next of every family, and so on.
+        on_threshold: The suite's mean is the threshold; otherwise the planned 0.4 below it.
+    """
+    distance = 0.4
+    plan = Plan(distance, size, ALPHA)
+    case = Case("", shape("normal", 0.0), 0.0, distance, False)
+    family = np.tile(np.arange(FAMILIES), size // FAMILIES)  # in blocks of one scene each
+    times: list[tuple[I64, I64]] = []
+    for run in range(runs):
+        generator = stream(f"families {size} {between} {way} {on_threshold}", run, "decide/study")
+        effect = generator.standard_normal(FAMILIES)
+        x = math.sqrt(between) * ((effect - effect.mean()) / effect.std())[family] + math.sqrt(1.0 - between) * generator.standard_normal(
+            size
+        )
+        x = x - x.mean() + (0.0 if on_threshold else -distance)
+        if way == "stratified":
+            good, bad = stratified_log_evidence(-x, family, plan), stratified_log_evidence(x, family, plan)
+        else:
+            order = generator.permutation(size)
+            known = predictions(x[order], np.eye(FAMILIES)[family[order]]) if way == "control" else (None, None)
+            good, bad = logs(case, without_replacement(x[order], -math.inf, math.inf, size, *known), plan)
+        times.append((_when(good[None], plan.log_bar, LOOK_EVERY), _when(bad[None], plan.log_bar, LOOK_EVERY)))
+    return Ends(*(np.concatenate(side) for side in zip(*times, strict=True)))
+
+
+def stratified_log_evidence(x: F64, family: I64, plan: Plan) -> F64:
+    """Return the log e-process ``(size,)`` against "the suite's mean is at most 0", of scenes drawn in blocks of one of every family.
+
+    Given the blocks before, the mean of a block is expected to be that of all scenes left, since every family has equally many left. The
+    spread is that within families, with a degree of freedom less for each. Something is said at the ends of blocks only.
+    """
+    size, n = len(x), np.arange(1, len(x) + 1)
+    begin = n - 1 - (n - 1) % FAMILIES  # scenes before the block
+    drawn = np.concatenate([[0.0], np.cumsum(x)])
+    total = np.cumsum(x + drawn[begin] / (size - begin))
+    members = np.cumsum(np.eye(FAMILIES)[family], axis=0)
+    sums = np.cumsum(np.eye(FAMILIES)[family] * x[:, None], axis=0)
+    square = np.cumsum(x * x) - np.sum(sums**2 / np.maximum(members, 1), axis=1)
+    spread = np.sqrt(np.maximum(square, 1e-12) / np.maximum(n - FAMILIES, 1))
+    is_look = (n % FAMILIES == 0) & (n >= FIRST_LOOK)
+    t = total / (spread * np.sqrt(n))
+    z = special.ndtri(special.stdtr(np.maximum(n - FAMILIES, 1), t))
+    w = np.where(is_look, z * np.sqrt(n / plan.horizon), -np.inf)
+    return line.log_evidence(w, n / plan.horizon, plan.slope(spread[FIRST_LOOK - 1 : FIRST_LOOK]), plan.alpha)
 
 
 def hidden_suites(runs: int, share: float, bounded: bool, scenes: int = 300) -> float:

@@ -9,17 +9,25 @@ from functools import partial
 
 import numpy as np
 
+from alpasim_plugin.bench.raster_roofline import RasterWork, measure_core
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.raster.prepared import prepare
+from alpasim_plugin.gaussians.raster.prepared import Node, prepare
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64
 
-Size = tuple[int, int, int]  # Gaussians, width, height
-SIZES: tuple[Size, ...] = ((30_000, 256, 144), (100_000, 256, 144), (100_000, 480, 272), (100_000, 960, 544), (500_000, 960, 544))
+Size = tuple[int, int, int, int]  # Gaussians, cameras, width, height
+SIZES: tuple[Size, ...] = (
+    (30_000, 1, 256, 144),
+    (100_000, 1, 256, 144),
+    (100_000, 1, 480, 272),
+    (100_000, 6, 480, 272),
+    (100_000, 1, 960, 540),
+    (500_000, 1, 960, 540),
+)
 SKY = (0.5, 0.6, 0.8)
 _LSB = 1.0 / 255.0
 _TORCH_LIMIT = 100_000 * 256 * 144  # Gaussians x pixels up to which the torch backend is timed too
@@ -31,15 +39,19 @@ class BenchRow:
 
     Attributes:
         n: Gaussians in the scene.
+        cameras: Images of a frame, around the same place.
         width: Pixels.
         height: Pixels.
         threads: Threads used.
-        visible: Gaussians that reach the image.
+        visible: Gaussians that reach an image, summed over the images.
         pairs: (Gaussian, 16-pixel tile) pairs.
-        ms_best: Fastest frame of the prepared scene.
+        blends: Splats blended into a pixel, over all pixels; counted on the reference.
+        ms_best: Fastest frame of the prepared scene, all its images one after the other.
         ms_p50: Median time of a frame.
         ms_p95: 95th percentile of it.
         cpu_ms: Processor time of a frame, all threads together: comparable on a busy machine too.
+        floor_ms: Least time of one core for the work (`raster_roofline`).
+        of_floor: Share of ``cpu_ms`` that the floor is.
         first_ms: Preparing the scene and drawing the first frame, including compiling or loading kernels.
         max_error: Largest difference of a colour from the float64 reference, full scale 1.
         share_above_lsb: Share of the pixels that differ by more than 1/255.
@@ -47,15 +59,19 @@ class BenchRow:
     """
 
     n: int
+    cameras: int
     width: int
     height: int
     threads: int
     visible: int
     pairs: int
+    blends: int
     ms_best: float
     ms_p50: float
     ms_p95: float
     cpu_ms: float
+    floor_ms: float
+    of_floor: float
     first_ms: float
     max_error: float
     share_above_lsb: float
@@ -66,7 +82,7 @@ def bench_raster(sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequ
     """Time the CPU rasteriser and compare its images with the float64 reference, which takes about 75 us per visible Gaussian.
 
     Args:
-        sizes: ``(Gaussians, width, height)`` of each scene.
+        sizes: ``(Gaussians, cameras, width, height)`` of each scene.
         repeats: Frames timed per row.
         threads: Thread counts to time.
         seed: Seed of the scene.
@@ -74,28 +90,37 @@ def bench_raster(sizes: Sequence[Size] = SIZES, repeats: int = 20, threads: Sequ
     Returns:
         One row per size and thread count, in that order.
     """
+    core = measure_core()
     rows = []
-    for n, width, height in sizes:
-        scene, camera = driving_like_scene(n, seed), driving_camera(width, height)
-        reference = rasterize_reference(scene, camera, SKY)
-        torch_ms = _torch_ms(scene, camera) if n * width * height <= _TORCH_LIMIT else None
-        for count in threads:
+    for n, count, width, height in sizes:
+        scene = driving_like_scene(n, seed)
+        cameras = [driving_camera(width, height, 2.0 * np.pi * k / count) for k in range(count)]
+        references = [rasterize_reference(scene, camera, SKY) for camera in cameras]
+        blends = sum(one.stats["blends"] for one in references)
+        torch_ms = _torch_ms(scene, cameras[0]) if count * n * width * height <= _TORCH_LIMIT else None
+        for used in threads:
             begin = time.perf_counter()
             nodes = [(prepare(scene), None)]
-            out = rasterize_prepared(nodes, camera, SKY, threads=count)
+            out = _frame(nodes, cameras, used)
             first_ms = (time.perf_counter() - begin) * 1e3
-            used = time.process_time()
-            times = _times_ms(partial(rasterize_prepared, nodes, camera, SKY, threads=count), repeats)
-            cpu_ms = (time.process_time() - used) / repeats * 1e3
-            error = np.abs(out.rgb - reference.rgb).max(axis=2)
+            began = time.process_time()
+            times = _times_ms(partial(_frame, nodes, cameras, used), repeats)
+            cpu_ms = (time.process_time() - began) / repeats * 1e3
+            visible = sum(one.stats["visible"] for one in out)
+            floor_ms = RasterWork(visible, blends, count * width * height, scene.sh.shape[1]).floor_ms(core)
+            error = np.array([np.abs(mine.rgb - theirs.rgb).max(axis=2) for mine, theirs in zip(out, references, strict=True)])
             rows.append(
                 BenchRow(
-                    n, width, height, count, out.stats["visible"], out.stats["pairs"],
-                    min(times), float(np.median(times)), float(np.percentile(times, 95)), cpu_ms, first_ms,
+                    n, count, width, height, used, visible, sum(one.stats["pairs"] for one in out), blends,
+                    min(times), float(np.median(times)), float(np.percentile(times, 95)), cpu_ms, floor_ms, floor_ms / cpu_ms, first_ms,
                     float(error.max()), float(np.mean(error > _LSB)), torch_ms,
                 )
             )  # fmt: skip
     return rows
+
+
+def _frame(nodes: Sequence[Node], cameras: Sequence[PinholeCamera], threads: int) -> list[RasterOutput]:
+    return [rasterize_prepared(nodes, camera, SKY, threads=threads) for camera in cameras]
 
 
 def _times_ms(call: Callable[[], object], repeats: int) -> list[float]:
@@ -181,9 +206,10 @@ def driving_like_scene(n: int, seed: int = 0, sh_degree: int = 3) -> GaussianClo
     )
 
 
-def driving_camera(width: int, height: int) -> PinholeCamera:
-    """Return the camera of the bench: at (0, 0, 1.6), looking along +x, horizontal field of view 65 degrees."""
+def driving_camera(width: int, height: int, yaw_rad: float = 0.0) -> PinholeCamera:
+    """Return the camera of the bench: at (0, 0, 1.6), looking along +x turned left by the yaw, horizontal field of view 65 degrees."""
     T_world_camera = np.eye(4)
-    T_world_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    T_world_camera[:3, :3] = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T_world_camera[:3, 3] = [0, 0, 1.6]
     return PinholeCamera.from_hfov(width, height, np.deg2rad(65), T_world_camera)

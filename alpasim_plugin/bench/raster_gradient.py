@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.bench.raster import SKY, Size, driving_camera, driving_like_scene
+from alpasim_plugin.bench.raster import SKY, driving_camera, driving_like_scene
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 
+Size = tuple[int, int, int]  # Gaussians, width, height
 SIZES: tuple[Size, ...] = ((10_000, 256, 144), (30_000, 256, 144), (100_000, 480, 272))
 FIELDS = ("means", "log_scales", "quaternions", "logit_opacities", "sh")
 _REFERENCE_LIMIT = 10_000 * 256 * 144  # Gaussians x pixels up to which the float64 reference fits into memory

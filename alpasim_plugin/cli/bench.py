@@ -8,7 +8,15 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.bench.raster import bench_raster
-from alpasim_plugin.cli import bench_evaluators, bench_fixer, bench_presets, bench_roofline, bench_serve
+from alpasim_plugin.cli import (
+    bench_evaluators,
+    bench_executors,
+    bench_fixer,
+    bench_presets,
+    bench_profile,
+    bench_roofline,
+    bench_serve,
+)
 from alpasim_plugin.cli.bench_rows import print_rows
 from alpasim_plugin.cli.quality import EPILOG as QUALITY_EXAMPLES
 from alpasim_plugin.cli.quality import quality
@@ -22,8 +30,10 @@ def bench() -> None:
 
 
 app.command("evaluators", epilog=bench_evaluators.EPILOG)(bench_evaluators.evaluators)
+app.command("executors", epilog=bench_executors.EPILOG)(bench_executors.executors)
 app.command("presets", epilog=bench_presets.EPILOG)(bench_presets.presets)
 app.command("fixer", epilog=bench_fixer.EPILOG)(bench_fixer.fixer)
+app.command("profile", epilog=bench_profile.EPILOG)(bench_profile.profiles)
 app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
 app.command("serve", epilog=bench_serve.EPILOG)(bench_serve.serve)
 app.command("quality", epilog=QUALITY_EXAMPLES)(quality)

@@ -20,11 +20,13 @@ from alpasim_plugin.cli.deciding import (
     questions_of,
     questions_of_gate,
 )
+from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.cli.run import check_preset, parse_seeds, split_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.decide import Design
+from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions
 from evaluators.gate import load_gate
 from evaluators.sequential.asymptotic import FIRST_LOOK
@@ -40,6 +42,8 @@ Examples:
 - `simrun decide --renderer 3dgs,onefixer --ask better --metric lateral_distance_m=0.05 suites/all`: at least 5 cm better?
 
 - `simrun decide --renderer clean,3dgs --population suite --control family --control runs/last-week suites/all`
+
+- `simrun decide --renderer clean,3dgs --executor ray --look-every 50 --store s3://bucket/night suites/all`: 100 rollouts at a time
 
 Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or a broken policy, 3 undecided at the ceiling,
 4 rollouts could not be run, 5 could not be scored. docs/sequential.md says what is guaranteed.
@@ -91,6 +95,11 @@ def decide(
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on them.")] = None,
+    executor: ExecutorText = "local",
+    cores: Cores = None,
+    gpus: Gpus = None,
+    memory: MemoryGib = None,
+    store: StoreUrl = None,
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
@@ -107,6 +116,7 @@ def decide(
     An interrupted decision continues when the same command is given again, and decides the same.
     """
     del debug
+    where = parse_executor(executor, cores, gpus, memory)
     check_preset(preset)
     spec = None if metric else load_gate(gate)[0]
     if spec is not None and (ask != "non-inferior" or expect is not None):
@@ -123,7 +133,7 @@ def decide(
     plan = plan_of(What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene))
     decided = decide_into(
         plan, question, design, controls_of(control or (), plan, question), out, quiet or as_json,
-        workers=workers, certificate=certify, report=report, wait=wait, limit_s=time_limit,
+        workers=workers, certificate=certify, report=report, wait=wait, limit_s=time_limit, executor=where, store=store,
     )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(decided.run.root), "exit_code": decided.outcome.exit_code, "decision": decided.record}))

@@ -13,14 +13,15 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.decide import Decided, Design, execute_decision, key_of
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug
 from alpasim_plugin.stopping import Stopped
-from evaluators.gate import GateSpec, rows_of_run
+from evaluators.gate import GateSpec, check_made_alike, read_baseline, rows_of_run
+from evaluators.gate.stored import StoredSide, stored_side
 from evaluators.report.decision import metric_lines, verdict_line
 from evaluators.report.run_folder import read_run
 from evaluators.sequential import control
 from evaluators.sequential.control import Control
 from evaluators.sequential.decision import State
 from evaluators.sequential.question import Method, MetricQuestion, Population, Question, metric_question
-from scenarios.suite import expand
+from scenarios.suite import ScenarioRef, expand
 
 DOING = "planning a decision"
 AUTO = "auto:"
@@ -67,21 +68,47 @@ def _end(value: float | None) -> str:
     return "unbounded" if value is None else f"{value:+.4g}"
 
 
-def plan_of(what: What) -> RunPlan:
+def plan_of(what: What, stored: bool = False) -> RunPlan:
     """Plan all cells that may be driven.
 
+    Args:
+        what: Scenes, renderers, policy.
+        stored: The baseline was driven earlier: one renderer is driven.
+
     Raises:
-        InputError: Not two renderers and one policy, or a scenario or part is invalid.
+        InputError: Not two renderers (one, if stored) and one policy, or a scenario or part is invalid.
     """
     names = [name.strip() for name in what.renderers.split(",") if name.strip()]
+    if stored:
+        if len(names) != 1:
+            found = f"{len(names)} renderers beside a stored baseline"
+            raise InputError(DOING, f"--renderer {what.renderers}", found, "name the one in question; the baseline is not driven again")
+        plan = make_plan(_refs(what), names, [what.policy], what.seeds, replace(what.options, baseline=None))
+        return replace(plan, asked=tuple(what.scenarios))
     if len(names) != 2:
         raise InputError(DOING, f"--renderer {what.renderers}", f"{len(names)} renderers", "name two: the baseline and the one in question")
     baseline = what.options.baseline or names[0]
     if baseline not in names:
         raise InputError(DOING, f"--baseline {baseline}", f"the renderers are {', '.join(names)}", "name one of them")
-    refs = [ref for item in what.scenarios for ref in expand(item, what.overrides)]
-    plan = make_plan(refs, names, [what.policy], what.seeds, replace(what.options, baseline=baseline))
+    plan = make_plan(_refs(what), names, [what.policy], what.seeds, replace(what.options, baseline=baseline))
     return replace(plan, asked=tuple(what.scenarios))
+
+
+def _refs(what: What) -> list[ScenarioRef]:
+    return [ref for item in what.scenarios for ref in expand(item, what.overrides)]
+
+
+def side_of_baseline(path: Path, plan: RunPlan, spec: GateSpec) -> StoredSide:
+    """Read a stored baseline, or an earlier run's folder, and check it against what is about to be driven.
+
+    Raises:
+        InputError: It was made with another preset, other weights or other scenes, or lacks rollouts that may be driven.
+    """
+    stored = read_baseline(path)
+    weights = {file: sha for part in plan.parts for file, sha in part.files.items()}
+    check_made_alike(stored, plan.options.preset, {name: one.content_hash for name, one in plan.scenarios.items()}, weights, path)
+    planned = {(cell.scene, cell.seed) for cell in plan.cells}
+    return stored_side(stored.rows, spec.baseline or plan.renderers[0].name, plan.policies[0].name, planned, spec.max_missing, path)
 
 
 def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None) -> tuple[MetricQuestion, ...]:
@@ -156,6 +183,7 @@ def decide_into(
     controls: Mapping[str, Control],
     root: Path | None,
     quiet: bool,
+    stored: StoredSide | None = None,
     **how: Any,
 ) -> Decided:
     """Drive until decided; an interruption says how to go on.
@@ -167,14 +195,15 @@ def decide_into(
         controls: From `controls_of`.
         root: Run folder; None: named after the command.
         quiet: No progress.
+        stored: The baseline's side, where it was driven earlier.
         how: Further arguments of `execute_decision`.
     """
-    plan = replace(plan, question=key_of(question, design, controls))
+    plan = replace(plan, question=key_of(question, design, controls, stored))
     folder = root or default_folder(plan)
     progress = SilentLooks() if quiet else LookLines()
     try:
         return execute_decision(
-            plan, question, design, folder, command=["simrun", *sys.argv[1:]], progress=progress, controls=controls, **how
+            plan, question, design, folder, command=["simrun", *sys.argv[1:]], progress=progress, controls=controls, stored=stored, **how
         )
     except Stopped as stop:
         stop.kept = f"finished rollouts are kept in {folder}; the same command continues and decides the same"

@@ -7,15 +7,17 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from alpasim_plugin.cli.deciding import What, decide_into, plan_of, print_end, questions_of_gate
+from alpasim_plugin.cli.deciding import What, decide_into, plan_of, print_end, questions_of_gate, side_of_baseline
+from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.progress import make_progress, warn
 from alpasim_plugin.cli.run import parse_seeds
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.runtime.decide import Design
+from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
@@ -34,6 +36,8 @@ Examples:
 
 - `simrun gate runs/change --until-decided --scenes suites/all --renderer clean,onefixer`: drives only as many scenes as the margins need
 
+- `simrun gate runs/change --until-decided --scenes suites/all --renderer onefixer --baseline-file runs/old`: drives the change alone
+
 - `simrun gate --self-test`
 
 Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken policy, 3 undecided, 4 rollouts could not be run,
@@ -44,12 +48,16 @@ Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken poli
 def gate(
     run: Annotated[Path | None, typer.Argument(help="A run folder; with --until-decided it is written.")] = None,
     gate_file: Annotated[str, typer.Option("--gate", help="A gate file, or the name of a shipped gate.")] = "default",
-    baseline_file: Annotated[Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline.")] = None,
+    baseline_file: Annotated[
+        Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline, or this earlier run.")
+    ] = None,
     approve: Annotated[Path | None, typer.Option("--write-baseline", help="Store the run as a baseline and stop.")] = None,
     self_test: Annotated[bool, typer.Option("--self-test", help="Drive broken renderers; fail unless the gate catches each.")] = False,
     until_decided: Annotated[bool, typer.Option("--until-decided", help="Drive --scenes until every binding margin is decided.")] = False,
     scenes: Annotated[list[str] | None, typer.Option("--scenes", help="Until decided: a scenario, suite or folder. Repeatable.")] = None,
-    renderer: Annotated[str | None, typer.Option("--renderer", help="Until decided: baseline and renderer in question.")] = None,
+    renderer: Annotated[
+        str | None, typer.Option("--renderer", help="Until decided: baseline and renderer in question; with --baseline-file the latter.")
+    ] = None,
     policy: Annotated[str, typer.Option("--policy", help="Until decided: the policy.")] = "lane-camera",
     seeds: Annotated[str, typer.Option("--seeds", help="Until decided: seeds of every scene.")] = "1",
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Until decided: frames in rollout.asl.")] = "jpeg",
@@ -59,27 +67,46 @@ def gate(
     budget: Annotated[int | None, typer.Option("--budget", min=2, help="Until decided: most rollouts.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Where gate.md and gate.junit.xml go; by default the run folder.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Self-test, until decided: worker processes.")] = None,
+    executor: ExecutorText = "local",
+    cores: Cores = None,
+    gpus: Gpus = None,
+    memory: MemoryGib = None,
+    store: StoreUrl = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
     """Judge a run by a gate, or test the gate itself on deliberately broken renderers."""
     del debug
+    where = parse_executor(executor, cores, gpus, memory)
     if self_test:
         if run is not None or baseline_file is not None or approve is not None:
             raise InputError("testing a gate", "--self-test", "a run or baseline is named as well", "give --gate and --out only")
         raise typer.Exit(_self_test(gate_file, out, workers, as_json))
     if run is None:
         raise InputError("judging a run", "simrun gate", "no run folder is named", "name one, or use --self-test")
-    if not until_decided and (scenes or renderer is not None):
-        raise InputError("judging a run", "--scenes, --renderer", "nothing is driven without --until-decided", "add it, or leave them out")
+    driving = [
+        ("--scenes", bool(scenes)),
+        ("--renderer", renderer is not None),
+        ("--executor", not where.is_local),
+        ("--store", bool(store)),
+    ]
+    if not until_decided and (named := [name for name, is_given in driving if is_given]):
+        found_none = "nothing is driven without --until-decided"
+        raise InputError("judging a run", ", ".join(named), found_none, "add it, or leave them out")
     if until_decided:
-        if baseline_file is not None or approve is not None:
-            found_as_well = "a stored baseline is named as well"
-            raise InputError("judging a run", "--until-decided", found_as_well, "compare two renderers, or judge a run that is driven")
+        if approve is not None:
+            raise InputError("judging a run", "--until-decided", "a baseline is to be written as well", "write it of a run that is driven")
         if not scenes or renderer is None:
-            raise InputError("judging a run", "--until-decided", "no scenes or renderers", "name them: --scenes SUITE --renderer A,B")
+            raise InputError(
+                "judging a run",
+                "--until-decided",
+                "no scenes or renderers",
+                "name them: --scenes SUITE --renderer A,B (one, with --baseline-file)",
+            )
         what = What(scenes, renderer, policy, parse_seeds(seeds), RunOptions(images=images), tuple(overrides or ()))
-        raise typer.Exit(_until_decided(run, gate_file, what, alpha, Design(order_seed, budget=budget), out, workers, as_json))
+        how = {"workers": workers, "executor": where, "store": store}
+        design = Design(order_seed, budget=budget)
+        raise typer.Exit(_until_decided(run, gate_file, what, alpha, design, baseline_file, out, as_json, how))
     use_run(run, warn)
     found = read_run(run)
     if approve is not None:
@@ -107,17 +134,28 @@ def gate(
 
 
 def _until_decided(
-    run: Path, gate_file: str, what: What, alpha: float, design: Design, out: Path | None, workers: int | None, as_json: bool
+    run: Path,
+    gate_file: str,
+    what: What,
+    alpha: float,
+    design: Design,
+    baseline_file: Path | None,
+    out: Path | None,
+    as_json: bool,
+    how: dict[str, Any],
 ) -> int:
     """Drive until the gate's margins are decided, judge, write the gate's files, and return the exit code."""
     spec, source = load_gate(gate_file)
     options = replace(what.options, preset=spec.preset or what.options.preset, baseline=spec.baseline)
-    plan = plan_of(replace(what, options=options))
+    plan = plan_of(replace(what, options=options), stored=baseline_file is not None)
+    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec)
     question = Question(questions_of_gate(spec), alpha, min_scenes=spec.min_scenes)
     design = replace(design, max_failed=spec.max_failed, max_missing=spec.max_missing)
-    decided = decide_into(plan, question, design, {}, run, as_json, workers=workers)
+    decided = decide_into(plan, question, design, {}, run, as_json, stored, **how)
     found = read_run(run)
-    verdict = judge_decided(rows_of_run(found), spec, decided.record)
+    rows = rows_of_run(found)
+    driven = {(str(row["scene"]), int(row["seed"])) for row in rows}
+    verdict = judge_decided(rows, spec, decided.record, None if stored is None else stored.of_cells(driven))
     files = write_gate_files(verdict, source, found, out or run)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "decision": decided.record, "files": [str(path) for path in files]}))

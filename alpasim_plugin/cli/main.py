@@ -32,6 +32,10 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
         "compare", "compare", "EPILOG",
         "Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are listed.",
     ),
+    "aggregate": (
+        "aggregate", "aggregate", "EPILOG",
+        "Print means, intervals and verdicts over the rollouts of several runs; tables of millions of rows are streamed.",
+    ),
     "decide": ("decide", "decide", "EPILOG", "Drive scenes in random order until it is decided whether a renderer is worse than another."),
     "gate": ("gate", "gate", "EPILOG", "Judge a run by a gate, or test the gate itself on deliberately broken renderers."),
     "check": ("check", "check", "EPILOG", "Read every file of a run folder, compare it with its digest, and say what is damaged."),
@@ -83,6 +87,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     ),
     "bench": ("bench", "app", "", "Measure speed and error of parts."),
     "train": ("train", "app", "", "Make training data and train networks."),
+    "judge": ("judge", "app", "", "Check, freeze and describe the judges: networks that measure images (docs/judges.md)."),
 }  # fmt: skip
 OWN_OPTIONS = ("--help",)
 

@@ -14,6 +14,7 @@ from alpasim_plugin.runtime.plan import RunPlan
 from evaluators.report.numbers import plural
 
 SHOWN_CHANGES, SHOWN_SCENES = 4, 5
+MAX_LINES = 1000
 
 
 class Silent:
@@ -31,10 +32,10 @@ class Silent:
 
 
 class Lines:
-    """One line per finished rollout on stderr, for pipes and CI logs."""
+    """One line per finished rollout on stderr, for pipes and CI logs; of a large run some `MAX_LINES` in all, and one per failure."""
 
     def __init__(self) -> None:
-        self._done, self._total = 0, 0
+        self._done, self._total, self._failed = 0, 0, 0
 
     def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
         """Print the run's headline."""
@@ -44,7 +45,11 @@ class Lines:
     def rollout_done(self, manifest: dict[str, Any], reused: bool) -> None:
         """Print one rollout's result."""
         self._done += 1
-        print(f"[{self._done}/{self._total}] {describe(manifest, reused)}", file=sys.stderr, flush=True)
+        has_failed = manifest["status"] != "ok"
+        self._failed += has_failed
+        if has_failed or self._done == self._total or self._done % max(1, self._total // MAX_LINES) == 0:
+            failed = f", {self._failed} failed" if self._failed else ""
+            print(f"[{self._done}/{self._total}{failed}] {describe(manifest, reused)}", file=sys.stderr, flush=True)
 
     def noticed(self, text: str) -> None:
         """Print it."""

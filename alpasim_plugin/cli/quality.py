@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import cv2
 import numpy as np
@@ -16,23 +16,28 @@ import torch
 import typer
 from rich.console import Console
 
-from alpasim_plugin.atomic import write_bytes, write_json
+from alpasim_plugin.atomic import atomic_file, write_bytes, write_json
+from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row
 from alpasim_plugin.bench.quality import RAW, QualityClip, Variant, measure, row_key, run_variant
 from alpasim_plugin.cli.jobs import parallel_map
 from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.cli.training_options import whole_numbers
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.nets.checkpoints import file_sha256
-from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, ImageDistance, available, load_distance, weights_folder
+from alpasim_plugin.nets.dists import HEADS_SHA256 as DISTS_HEADS
+from alpasim_plugin.nets.image_distance import DISTS, FOLDER_VARIABLE, ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.nets.lpips import TRUNKS
 from alpasim_plugin.nets.perceptual import NAME, shipped_weights
 from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.reading import parsing
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.training.pair_store import CONTENT, PairDataset, PairSequence
 from alpasim_plugin.types import U8
+from evaluators.judges.table import judged_markdown
 from evaluators.video.charts import plot_by_frame, plot_speed
 from evaluators.video.sheet import sheet
 from evaluators.video.summary import TRUTH, summarise
@@ -67,11 +72,17 @@ class Work:
     weights: Path | None
     out: Path
     pictured: bool
+    judging: Judging | None = None
 
     @property
     def row_file(self) -> Path:
         """Where the row is kept."""
         return self.out / "clips" / self.variant.label / f"{self.folder.name}.json"
+
+    @property
+    def features_file(self) -> Path:
+        """Where the judges' features are kept."""
+        return self.row_file.with_suffix(".npz")
 
     def picture_file(self, at: int) -> Path:
         """Where a shown frame is kept."""
@@ -96,6 +107,14 @@ def quality(
     clips: Annotated[int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="[LABEL:]fixer.key=value, of one variant or of all fixers.")] = None,
     weights: Annotated[Path | None, typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}.")] = None,
+    judges: Annotated[
+        str | None, typer.Option("--judges", help="Also ask the judges of these training seeds, as 0,1 (docs/judges.md).")
+    ] = None,
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes: judges of lanes need the camera's mounting.")
+    ] = None,
+    judge_folder: Annotated[Path | None, typer.Option("--judge-folder", help="Folder of judges that you froze.")] = None,
+    detections: Annotated[Path | None, typer.Option("--detections", help="Folder of a detector's results, VARIANT/CLIP.json.")] = None,
     pictures: Annotated[int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")] = "cpu",
@@ -112,12 +131,13 @@ def quality(
     variants = parse_variants(fixers, overrides or [])
     if baseline not in {variant.label for variant in variants}:
         raise InputError(DOING, f"--baseline {baseline}", f"variants {', '.join(a.label for a in variants)}", "name one of the variants")
+    judging = None if judges is None else _judging(judges, scenes, detections, weights, judge_folder)
     networks = tuple((name, identity(name, weights)) for name in available(weights))
     sequences = evenly(PairDataset(data, split).sequences, clips)
     shown = {s.name for s in evenly(sequences, pictures)} if pictures else set()
     used = threads if jobs == 1 else 1
     todo = [
-        Work(s.folder, given, variant, frames, seed, device, used, networks, weights, out, s.name in shown)
+        Work(s.folder, given, variant, frames, seed, device, used, networks, weights, out, s.name in shown, judging)
         for s in sequences
         for variant in (*variants, Variant(TRUTH))
     ]
@@ -127,13 +147,31 @@ def quality(
             psnr = row["values"].get("psnr_db")
             console.print(f"{i}/{len(todo)} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
     summary = summarise([read_json(work.row_file)["row"] for work in todo], baseline)
+    if judging is not None:
+        summary |= judged(summary, todo, judging, baseline)
     summary["run"] = {
         "data": str(data), "split": split, "input": given, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
         "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in variants}, "networks": dict(networks),
         "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
     }  # fmt: skip
     write_results(summary, todo, out)
-    print(json.dumps(summary) if as_json else markdown(summary) + f"\nwrote {out / 'quality.json'}")
+    print(json.dumps(summary) if as_json else markdown(summary) + judged_markdown(summary) + f"\nwrote {out / 'quality.json'}")
+
+
+def _judging(seeds: str, scenes: Path | None, detections: Path | None, weights: Path | None, folder: Path | None) -> Judging:
+    return Judging(tuple(whole_numbers("--judges", seeds, 0)), scenes, detections, weights_folder(weights), folder)
+
+
+def judged(summary: dict[str, Any], todo: Sequence[Work], judging: Judging, baseline: str) -> dict[str, Any]:
+    """Return ``judges`` (the frozen digests), ``sets`` (metrics of whole sets) and ``paper`` (its names: null without the user's means)."""
+    features: dict[str, list[dict[str, Any]]] = {}
+    for work in todo:
+        do = "remove the clip's row and start the command again"
+        with parsing(DOING, work.features_file, do, "not whole features"), np.load(work.features_file) as stored:
+            features.setdefault(work.variant.label, []).append({key: stored[key] for key in stored.files})
+    sets = judge_sets(features, baseline)
+    cells = {name: paper_row(means, sets, name) for name, means in summary["arms"].items() if name != TRUTH}
+    return {"judges": judging.identity["judges"], "sets": sets, "paper": cells}
 
 
 def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
@@ -181,16 +219,18 @@ def identity(name: str, folder: Path | None) -> str:
     if name == NAME:
         return file_sha256(shipped_weights())
     plan = TRUNKS["alex" if name == "lpips_alex" else "vgg"]
-    return f"{plan.file} {plan.heads_sha256}"
+    return f"{plan.file} {DISTS_HEADS if name == DISTS else plan.heads_sha256}"
 
 
 def finish(work: Work) -> dict[str, Any]:
     """Return the row of one clip under one variant, from disk if it is up to date."""
     sequence = PairSequence(work.folder)
     clip = quality_clip(sequence, work.given).first(work.frames)
-    key = row_key(clip, work.variant, work.seed, work.device, dict(work.networks))
+    asked = {} if work.judging is None else {"judging": json.dumps(work.judging.identity)}
+    key = row_key(clip, work.variant, work.seed, work.device, {**dict(work.networks), **asked})
     at = shown_frames(len(clip.t_us)) if work.pictured else ()
-    if work.row_file.is_file() and all(work.picture_file(i).is_file() for i in at):
+    complete = work.judging is None or work.features_file.is_file()
+    if work.row_file.is_file() and complete and all(work.picture_file(i).is_file() for i in at):
         stored = read_json(work.row_file)
         if stored["key"] == key:
             return dict(stored["row"])
@@ -205,6 +245,13 @@ def finish(work: Work) -> dict[str, Any]:
     for i in at:
         _write_png(work.picture_file(i), result.video[i])
     row = measure(clip, work.variant, result, work.seed, {name: _network(name, work.weights) for name, _ in work.networks})
+    if work.judging is not None:
+        truth = None if work.variant.label == TRUTH else np.array(clip.truth)
+        camera = camera_of(sequence, work.judging.scenes)
+        values, features = judge_clip(sequence.name, work.variant.label, result.video, truth, camera, work.judging)
+        row["values"] |= values
+        with atomic_file(work.features_file) as partial, partial.open("wb") as file:
+            np.savez(file, **cast("dict[str, Any]", features))
     write_json(work.row_file, {"key": key, "row": row})
     return row
 
@@ -237,7 +284,7 @@ def shown_frames(frames: int) -> tuple[int, ...]:
 def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> None:
     """Write the summary, the table, the charts and the pictures."""
     write_json(out / "quality.json", summary)
-    write_bytes(out / "quality.md", markdown(summary).encode())
+    write_bytes(out / "quality.md", (markdown(summary) + judged_markdown(summary)).encode())
     plot_by_frame(summary, out / "by-frame.png")
     plot_speed(summary, out / "speed.png")
     shown: dict[Path, list[Work]] = {}

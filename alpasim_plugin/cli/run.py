@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.bounds import SEED, SEEDS
+from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_progress, varied_lines
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.errors import InputError
@@ -60,15 +61,11 @@ def run(
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; by default one per core.")] = None,
-    executor: Annotated[
-        str, typer.Option("--executor", help="Where rollouts run: `local`, `ray`, `ray:HOST:PORT`, `slurm` or `slurm:PARTITION`.")
-    ] = "local",
-    cores: Annotated[int | None, typer.Option("--cores", min=1, help="Cores of each worker on a cluster; by default 1.")] = None,
-    gpus: Annotated[float | None, typer.Option("--gpus", min=0.0, help="Share of a GPU of each worker on a cluster.")] = None,
-    memory: Annotated[float | None, typer.Option("--memory", min=0.001, help="Memory of each worker on a cluster, in GiB.")] = None,
-    store: Annotated[
-        str | None, typer.Option("--store", metavar="URL", help="Also keep every rollout in a store: a folder, or `s3://BUCKET/PREFIX`.")
-    ] = None,
+    executor: ExecutorText = "local",
+    cores: Cores = None,
+    gpus: Gpus = None,
+    memory: MemoryGib = None,
+    store: StoreUrl = None,
     video: Annotated[Literal["none", "failures", "all"], typer.Option("--video", help="Write front.mp4.")] = "none",
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
     overrides: Annotated[

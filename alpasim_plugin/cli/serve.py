@@ -89,9 +89,9 @@ def serve(
         logging.getLogger("simrun.serve").warning(warning, host.address)
     what = {"serving": list(made.services), "at": host.address, "renderer": renderer, "upstream": upstream}
     text = f"serving {', '.join(made.services)} at {host.address}: {made.spec.name}" + (f" in front of {upstream}" if upstream else "")
-    print(json.dumps(what) if as_json else text, flush=True)
-    host.start()
     try:
+        host.start()
+        print(json.dumps(what) if as_json else text, flush=True)
         host.wait()
     except Stopped:
         host.stop(drain_s)

@@ -51,9 +51,9 @@ def serve_policy(
     service = DriverService(spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes or ()), sessions)
     host = Host({"EgodriverService": service}, listen, Security(tls_cert, tls_key))
     what = {"serving": "EgodriverService", "at": host.address, "policy": policy}
-    print(json.dumps(what) if as_json else f"serving EgodriverService at {host.address}: {policy}", flush=True)
-    host.start()
     try:
+        host.start()
+        print(json.dumps(what) if as_json else f"serving EgodriverService at {host.address}: {policy}", flush=True)
         host.wait()
     except Stopped:
         host.stop(drain_s)

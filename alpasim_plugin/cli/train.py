@@ -15,6 +15,8 @@ from alpasim_plugin.cli import train_pairs, train_scenes
 from alpasim_plugin.cli.train_decoder import EPILOG as DECODER_EXAMPLE
 from alpasim_plugin.cli.train_decoder import decoder
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
+from alpasim_plugin.cli.train_judge import EPILOG as JUDGE_EXAMPLES
+from alpasim_plugin.cli.train_judge import judge
 from alpasim_plugin.cli.train_per_frame import EPILOG as PER_FRAME_EXAMPLES
 from alpasim_plugin.cli.train_per_frame import per_frame
 from alpasim_plugin.cli.train_perceptual import EPILOG as PERCEPTUAL_EXAMPLE
@@ -48,6 +50,7 @@ app.command("policy-data", epilog=POLICY_DATA_EPILOG)(policy_data)
 app.command("policy", epilog=POLICY_EPILOG)(policy)
 app.command("perceptual", epilog=PERCEPTUAL_EXAMPLE)(perceptual)
 app.command("perceptual-check", epilog=CHECK_EPILOG)(perceptual_check)
+app.command("judge", epilog=JUDGE_EXAMPLES)(judge)
 app.command("splat", epilog=SPLAT_EXAMPLE)(splat)
 app.command("scenes", epilog=train_scenes.SCENES_EPILOG)(train_scenes.scenes)
 app.command("check-scenes", epilog=train_scenes.CHECK_EPILOG)(train_scenes.check_frozen)

@@ -1,4 +1,4 @@
-"""Perceptual image distances by name: `perceptual-syn`, shipped with the package, and LPIPS, with weights from the user."""
+"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS and DISTS, with weights from the user."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Literal, Protocol, get_args
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets import dists
 from alpasim_plugin.nets.lpips import Kind, load_lpips, missing_files
 from alpasim_plugin.nets.perceptual import NAME, load_perceptual
 
-DistanceName = Literal["perceptual-syn", "lpips_alex", "lpips_vgg"]
+DistanceName = Literal["perceptual-syn", "lpips_alex", "lpips_vgg", "dists"]
 FOLDER_VARIABLE = "SIMRUN_METRIC_WEIGHTS"
+DISTS = "dists"
 _KINDS: dict[str, Kind] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 
 
@@ -35,7 +37,11 @@ def available(folder: str | Path | None = None) -> tuple[DistanceName, ...]:
     """Return the names of the distances whose weights are on disk."""
     found = weights_folder(folder)
     names: tuple[DistanceName, ...] = get_args(DistanceName)
-    return tuple(name for name in names if name == NAME or (found is not None and not missing_files(_KINDS[name], found)))
+    return tuple(name for name in names if name == NAME or (found is not None and not _missing(name, found)))
+
+
+def _missing(name: str, folder: Path) -> list[str]:
+    return dists.missing_files(folder) if name == DISTS else missing_files(_KINDS[name], folder)
 
 
 def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
@@ -46,13 +52,13 @@ def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
     """
     if name == NAME:
         return load_perceptual()
-    if name not in _KINDS:
+    if name not in (*_KINDS, DISTS):
         raise InputError("choosing a perceptual distance", f"name {name!r}", "no such distance", f"choose one of {get_args(DistanceName)}")
     found = weights_folder(folder)
     if found is None:
         do = f"set {FOLDER_VARIABLE} to the folder that holds the files named in docs/video-metrics.md, or use {NAME}"
-        raise InputError("loading LPIPS", name, "no folder of weights is set", do)
-    return load_lpips(_KINDS[name], found)
+        raise InputError("loading a perceptual distance", name, "no folder of weights is set", do)
+    return dists.load_dists(found) if name == DISTS else load_lpips(_KINDS[name], found)
 
 
 def distance_for_training(folder: str | Path | None = None) -> tuple[DistanceName, ImageDistance]:

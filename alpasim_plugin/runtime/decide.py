@@ -18,14 +18,16 @@ from alpasim_plugin.parts import digest
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.contents import find_contents, read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, kept_open
 from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
-from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, write_run_info
+from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, publish, write_run_info
 from alpasim_plugin.runtime.tables import pool_of, rollout_rows
 from alpasim_plugin.runtime.writing import writing
 from alpasim_plugin.seeding import stream
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
-from evaluators.aggregate.rows import by_renderer
+from evaluators.aggregate.rows import RendererRows, by_renderer
 from evaluators.gate.judge import failures_of
+from evaluators.gate.stored import StoredSide
 from evaluators.sequential.control import Control, adjusted_draws
 from evaluators.sequential.decision import State, outcome_of, state_after
 from evaluators.sequential.differences import SceneDifferences, scene_differences
@@ -77,9 +79,10 @@ class Decided:
     outcome: Outcome
 
 
-def key_of(question: Question, design: Design, controls: Mapping[str, Control]) -> str:
+def key_of(question: Question, design: Design, controls: Mapping[str, Control], stored: StoredSide | None = None) -> str:
     """Return the digest of what decides which rollouts are driven, besides the plan."""
-    return digest([asdict(question), asdict(design), {name: one.digest for name, one in controls.items()}])
+    asked = [asdict(question), asdict(design), {name: one.digest for name, one in controls.items()}]
+    return digest(asked if stored is None else [*asked, stored.digest])
 
 
 def drawing_order(scenes: Sequence[str], order_seed: int) -> list[str]:
@@ -97,17 +100,20 @@ def execute_decision(
     command: Sequence[str],
     progress: DecisionProgress,
     controls: Mapping[str, Control],
+    stored: StoredSide | None = None,
     *,
     certificate: Certify = "one",
     report: bool = True,
     wait: bool = False,
     limit_s: float | None = None,
+    executor: Executor = LOCAL,
+    store: str | None = None,
 ) -> Decided:
     """Drive scenes of a plan until the question is decided or the ceiling is reached.
 
     Args:
-        plan: All cells that may be driven: two renderers, the baseline of ``plan.options`` and another, and one policy. Its ``question`` is
-            `key_of` the question.
+        plan: All cells that may be driven: two renderers, the baseline of ``plan.options`` and another (or one, with ``stored``), and one
+            policy. Its ``question`` is `key_of` the question.
         question: What is to be decided.
         design: How scenes are drawn.
         root: The run folder; one process writes it at a time.
@@ -115,18 +121,21 @@ def execute_decision(
         command: For ``run.json``.
         progress: Shows rollouts and looks.
         controls: METRIC -> what takes out variance; for the population ``suite`` only.
+        stored: The baseline's rollouts where they were driven earlier; the plan then has the renderer in question alone.
         certificate: Whether to repeat a rollout.
         report: Write ``report.html``.
         wait: Wait for a process that writes the folder; otherwise refuse.
         limit_s: Seconds that one rollout may take.
+        executor, store: As for a run; the decision does not depend on them.
 
     Raises:
         InputError: The folder holds another run.
         InfrastructureError: Another process writes the folder.
     """
-    drawing = _Drawing(plan, question, design, controls)
-    threads = thread_budget(workers, design.look_every * drawing.per_seed * len(plan.seeds))
-    with writing(root, wait, progress.noticed):
+    drawing = _Drawing(plan, question, design, controls, stored)
+    threads = thread_budget(workers, design.look_every * drawing.per_seed * len(plan.seeds), executor)
+    how = HowToRun(threads, limit_s=limit_s, executor=executor, store=store)
+    with writing(root, wait, progress.noticed), kept_open(executor):
         contents = find_contents(root)
         held = claim(root, plan, command, threads, False, contents, progress.noticed)
         write_run_json(root, read_run_json(root) | {"kind": KIND})  # so that nothing takes all scenes of the plan for wanted
@@ -137,7 +146,7 @@ def execute_decision(
             manifest["reused"] = reused
             progress.rollout_done(manifest, reused)
 
-        how, known = HowToRun(threads, limit_s=limit_s), contents.rollouts if contents else ()
+        known = contents.rollouts if contents else ()
         try:
             while cells := drawing.next_cells():
                 drawing.add(cells, execute(part_of(plan, cells), root, how, on_done, progress.noticed, known))
@@ -145,12 +154,13 @@ def execute_decision(
                 write_decision(root, drawing.record())
             driven = part_of(plan, drawing.cells)
             manifests = [drawing.manifests[cell.folder.as_posix()] for cell in driven.cells]
-            pool = pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))
-            repeat = certify(driven, root, manifests, threads.workers * threads.per_worker, certificate, held.get("determinism"))
+            pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
+            repeat = certify(driven, root, manifests, how.cores_here, certificate, held.get("determinism"))
         finally:
             end_children()
         _describe(root, driven, command, threads, held)
         summary = finish_run(root, manifests, {"pool": pool, "determinism": repeat}, report)
+        publish(root, store)
     result = RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
     return Decided(result, drawing.record(), drawing.state, drawing.outcome)
 
@@ -165,11 +175,13 @@ def _describe(root: Path, driven: RunPlan, command: Sequence[str], threads: Thre
 class _Drawing:
     """The scenes driven so far, what follows from them, and which come next."""
 
-    def __init__(self, plan: RunPlan, question: Question, design: Design, controls: Mapping[str, Control]) -> None:
-        self.plan, self.question, self.design, self.controls = plan, question, design, controls
-        first, second = (spec.name for spec in plan.renderers)
-        self.baseline = plan.options.baseline or first
-        self.candidate = second if self.baseline == first else first
+    def __init__(
+        self, plan: RunPlan, question: Question, design: Design, controls: Mapping[str, Control], stored: StoredSide | None
+    ) -> None:
+        self.plan, self.question, self.design, self.controls, self.stored = plan, question, design, controls, stored
+        names = [spec.name for spec in plan.renderers]
+        self.baseline = stored.name if stored is not None else plan.options.baseline or names[0]
+        (self.candidate,) = (name for name in names if stored is not None or name != self.baseline)
         self.order = drawing_order(list(plan.scenarios), design.order_seed)
         self.per_seed = len(plan.renderers)
         self.ceiling = min(design.budget or len(plan.cells), len(plan.cells))
@@ -222,16 +234,21 @@ class _Drawing:
         rows = rollout_rows(list(self.manifests.values()))
         sides = by_renderer(rows)
         self.failed = outcome_of_failures(failures_of(rows), self.design.max_failed)
+        base = sides[self.baseline] if self.stored is None else RendererRows.of(self.stored.of_cells(self._driven))
         values, adjusted = {}, {}
         for one in self.question.metrics:
-            found = scene_differences(sides[self.candidate], sides[self.baseline], one.metric, self.scenes)
+            found = scene_differences(sides[self.candidate], base, one.metric, self.scenes)
             self.differences[one.metric] = found
             values[one.metric] = found.harm(one.metric)
             if self.question.population == "suite":
                 adjusted[one.metric] = adjusted_draws(values[one.metric], one, self.order, self.controls.get(one.metric))
-        self.state = state_after(self.question, values, self._horizon(), adjusted)
+        self.state = state_after(self.question, values, self._horizon(), adjusted, len(self.order))
         self.looks.append(look_as_dict(self.state, self.rollouts, self._chosen[self.scenes[-1]]))
         self.stopped = self._reason_to_stop()
+
+    @property
+    def _driven(self) -> set[tuple[str, int]]:
+        return {(cell.scene, cell.seed) for cell in self.cells}
 
     @property
     def lacking(self) -> list[str]:
@@ -285,10 +302,9 @@ class _Drawing:
         return ""
 
     def _horizon(self) -> int:
-        """Return the most scenes that can be driven: the size of the suite where that is the population."""
-        if self.question.population == "suite":
-            return len(self.order)
-        return max(1, min(len(self.order), self.ceiling // self.per_seed))
+        """Return the most scenes that can be driven; where seeds are chosen, with one each."""
+        seeds = 1 if self.design.auto_seeds else len(self.plan.seeds)
+        return max(1, min(len(self.order), self.ceiling // (self.per_seed * seeds)))
 
     def _seeds_by(self) -> str:
         return "cost against variance of earlier scenes" if self.design.auto_seeds else "all that were asked for"

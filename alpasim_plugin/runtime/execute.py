@@ -15,6 +15,7 @@ from typing import Any
 
 from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
+from alpasim_plugin.runtime.executors.assignment import assignment_as_here
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool
 from alpasim_plugin.runtime.executors.dispatch import dispatch
 from alpasim_plugin.runtime.executors.identity import targets_of
@@ -74,6 +75,17 @@ class HowToRun:
     retry: bool = False
     executor: Executor = LOCAL
     store: str | None = None
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """Give what ``run.json`` says of executor and store; nothing for a run on this machine alone."""
+        return {} if self.executor.is_local and self.store is None else {"executor": str(self.executor), "store": self.store}
+
+    @property
+    def cores_here(self) -> int:
+        """Give the cores of this machine that a rollout may use when the others are done."""
+        here = self.threads if self.executor.is_local else thread_budget(1, 1)
+        return here.workers * here.per_worker
 
 
 def execute(
@@ -186,7 +198,8 @@ def _run_elsewhere(
 
     mission, contents = mission_of(plan, todo, how.threads.per_worker, how.store, shelf.fresh if shelf else "")
     most = min(how.threads.workers, len(todo))
-    with opened_pool(how.executor, mission, contents, targets_of(plan.parts), most, root, noticed) as pool:
+    given = assignment_as_here(mission, contents, targets_of(plan.parts), how.executor.resources, most, noticed)
+    with opened_pool(how.executor, given, root) as pool:
         for cell, got in dispatch(pool, todo, noticed, how.limit_s):
             yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
 

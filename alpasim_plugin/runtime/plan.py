@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
@@ -155,8 +155,9 @@ def make_plan(
         note = background_note(scenario)
         scenario = replace(scenario, notes=(*scenario.notes, note)) if note else scenario
         scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
+    code = _Code.of(scenarios.values(), options.preset, scoring)
     cells = [
-        _cell(scenario, origin[scene_id], renderer, policy, moving[policy.name], seed, scoring, options)
+        _cell(scenario, origin[scene_id], renderer, policy, moving[policy.name], seed, scoring, options, code)
         for scene_id, scenario in scenarios.items()
         for renderer in rendering
         for policy in driving
@@ -190,6 +191,31 @@ def refuse_commands(policies: Sequence[str], doing: str, where: str) -> None:
             raise InputError(doing, where, f"its policy is a command, {name}; no command is run because a file names it", do_this)
 
 
+@dataclass(frozen=True)
+class _Code:
+    """What the keys of all cells of a plan share; to read it for each cell would cost milliseconds a rollout.
+
+    Attributes:
+        loop: Digest of the loop's code.
+        scoring: What `scoring_content` gives.
+        sources: Scene id -> digest of the code that made the scenario.
+    """
+
+    loop: str
+    scoring: tuple[Any, ...]
+    sources: Mapping[str, str | None]
+
+    @classmethod
+    def of(cls, scenarios: Iterable[Scenario], preset_name: str, evaluators: Sequence[PartSpec]) -> _Code:
+        by_source: dict[str | None, str | None] = {}
+        sources = {}
+        for scenario in scenarios:
+            if scenario.source_part not in by_source:
+                by_source[scenario.source_part] = code_digest_of(scenario)
+            sources[scenario.scene_id] = by_source[scenario.source_part]
+        return cls(own_code_digest(LOOP), scoring_content(preset_name, evaluators), sources)
+
+
 def _cell(
     scenario: Scenario,
     ref: ScenarioRef,
@@ -199,27 +225,31 @@ def _cell(
     seed: int,
     evaluators: tuple[PartSpec, ...],
     options: RunOptions,
+    code: _Code,
 ) -> Cell:
     content: dict[str, str | None] = {
         f"renderer {renderer.name}": renderer.digest,
         f"policy {policy.name}": policy.digest,
         f"controller {controller.name}": controller.digest,
-        f"source of {scenario.scene_id}": code_digest_of(scenario),
+        f"source of {scenario.scene_id}": code.sources[scenario.scene_id],
     }
     if options.traffic is not None:
         content[f"traffic service {options.traffic}"] = None
-    loop = own_code_digest(LOOP)
-    rollout_key = digest([loop, scenario.content_hash, content, seed, options.images, options.device])
+    rollout_key = digest([code.loop, scenario.content_hash, content, seed, options.images, options.device])
     undigested = tuple(what for what, known in content.items() if known is None)
     stops = scenario.stop_at_path_end and preset(options.preset).stop_at_path_end
-    cell = Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, "", stops, undigested)
-    return replace(cell, score_key=score_key(rollout_key, options.preset, evaluators))
+    scored = digest([rollout_key, *code.scoring])
+    return Cell(renderer, policy, controller, scenario.scene_id, seed, ref, evaluators, rollout_key, scored, stops, undigested)
 
 
 def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]) -> str:
     """Return the content key of a rollout's scores; it changes with the preset and the code of the evaluators and of the reduction."""
-    own = own_code_digest(SCORING)
-    return digest([rollout_key, preset(preset_name).as_dict(), own, [(spec.name, spec.digest) for spec in evaluators]])
+    return digest([rollout_key, *scoring_content(preset_name, evaluators)])
+
+
+def scoring_content(preset_name: str, evaluators: Sequence[PartSpec]) -> tuple[Any, ...]:
+    """Return what a `score_key` covers besides the rollout: the preset, the code of the scoring, the digest of every evaluator."""
+    return preset(preset_name).as_dict(), own_code_digest(SCORING), [(spec.name, spec.digest) for spec in evaluators]
 
 
 def rollout_folder(renderer: str, policy: str, scene: str, seed: int) -> Path:

@@ -32,7 +32,7 @@ from alpasim_plugin.types import (
     SensorSpec,
     Trajectory,
 )
-from alpasim_plugin.world.ego import ego_state_from_log
+from alpasim_plugin.world.ego import ego_states_from_log
 
 LOG_NAME, FRAMES_NAME, OUTPUT_NAME = "rollout.asl", "frames.jsonl", "output.log"
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
@@ -145,7 +145,7 @@ class Recorder:
         with self.stage("log"):
             log, history = self._scenario.ego_log, observation.history.t_us
             unlogged = history[(history > self._last_query_us) & (history < clock.start_us)]
-            context = [ego_state_from_log(log, int(t), self._scenario.vehicle) for t in unlogged]
+            context = ego_states_from_log(log, unlogged, self._scenario.vehicle) if len(unlogged) else []
             self._log.ego_trajectory([*context, observation.ego])
             self._last_query_us = observation.t_us
             self._log.route(observation.t_us, observation.route_rig)

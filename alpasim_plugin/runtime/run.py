@@ -147,17 +147,14 @@ def execute_run(
             progress.rollout_done(manifest, reused)
 
         how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
-        repeating = threads if executor.is_local else thread_budget(1, 1)
         try:
             manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
-            pool = dict(pool_of(manifests, threads, time.perf_counter() - began, held.get("pool")))
-            pool |= {} if executor.is_local and store is None else {"executor": str(executor), "store": store}
-            determinism = certify(plan, root, manifests, repeating.workers * repeating.per_worker, certificate, held.get("determinism"))
+            pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
+            determinism = certify(plan, root, manifests, how.cores_here, certificate, held.get("determinism"))
         finally:
             end_children()
         summary = finish_run(root, manifests, {"pool": pool, "determinism": determinism}, report)
-        if store is not None:
-            opened(store).publish(root, published_files(root))
+        publish(root, store)
     return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
 
 
@@ -179,11 +176,12 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     return summary
 
 
-def published_files(root: Path) -> list[str]:
-    """Return the files of a finished run folder that go to a store beside the rollouts: its description, tables and reports."""
-    contents = read_contents(root)
+def publish(root: Path, store: str | None) -> None:
+    """Copy the description, tables and reports of a finished run folder to its store, if it has one."""
+    if store is None:
+        return
     pages = [name for name in REPORTS if (root / name).exists()]
-    return [*contents.files, RUN_INFO, *pages, CONTENTS]
+    opened(store).publish(root, [*read_contents(root).files, RUN_INFO, *pages, CONTENTS])
 
 
 def _finished_already(plan: RunPlan, root: Path) -> RunResult:

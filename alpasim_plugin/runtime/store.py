@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin import reading
-from alpasim_plugin.atomic import write_bytes
+from alpasim_plugin.atomic import atomic_file, write_bytes
+
+GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
 
 
 def read_json(path: Path) -> Any:
@@ -33,6 +35,28 @@ def write_parquet(path: Path, table: pa.Table) -> None:
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd")
     write_bytes(path, sink.getvalue().to_pybytes())
+
+
+def write_parquet_parts(path: Path, schema: pa.Schema, parts: Iterable[Path]) -> None:
+    """Write the rows of many parquet files into one, atomically and in order, in the memory of one row group.
+
+    Args:
+        path: The file.
+        schema: Of all parts.
+        parts: The files.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as partial, pq.ParquetWriter(partial, schema, compression="zstd") as writer:
+        held: list[pa.Table] = []
+        rows = 0
+        for part in parts:
+            with pq.ParquetFile(part) as file:
+                held.append(file.read(use_threads=False))  # a few kilobytes each
+            rows += len(held[-1])
+            if rows >= GROUP_ROWS:
+                writer.write_table(pa.concat_tables(held))
+                held, rows = [], 0
+        writer.write_table(pa.concat_tables(held) if held else schema.empty_table())
 
 
 STEPS_SCHEMA = pa.schema(

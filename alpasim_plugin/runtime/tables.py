@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY
@@ -16,13 +15,14 @@ from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.fixer_table import fixers
 from alpasim_plugin.runtime.manifests import STEPS_NAME
 from alpasim_plugin.runtime.plan_motion import plan_table
-from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_table
+from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_parquet_parts
 from alpasim_plugin.types import F64
-from evaluators import aggregate, censoring, paired
-from evaluators.aggregate.paired import base_pairs
+from evaluators import censoring
+from evaluators.aggregate.columns import RolloutTable
+from evaluators.aggregate.overall import NO_BASES, by_policy, numbers
 from evaluators.aggregate.reduce import value_in_manifest
 
-NO_BASES: Mapping[str, str] = {}
+CHUNK_ROWS = 4096
 
 
 def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -45,6 +45,15 @@ def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
+def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
+    """Return the content of ``rollouts.parquet``, a row per manifest, made in chunks: rows as dictionaries take ten times the memory."""
+    metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
+    schema = rollouts_schema(metrics, any("rollout" in manifest for manifest in manifests))
+    starts = range(0, len(manifests), CHUNK_ROWS)
+    batches = [pa.RecordBatch.from_pylist(rollout_rows(manifests[start : start + CHUNK_ROWS]), schema) for start in starts]
+    return pa.Table.from_batches(batches, schema)
+
+
 def write_tables(
     root: Path,
     manifests: Sequence[dict[str, Any]],
@@ -64,49 +73,29 @@ def write_tables(
         bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
             baseline, the two are paired too.
     """
-    rows = rollout_rows(manifests)
-    metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
-    of_logs = any("rollout" in row for row in rows)
-    write_table(root / ROLLOUTS, rows, rollouts_schema(metrics, of_logs))
-    parts = [pq.read_table(root / m["path"] / STEPS_NAME) for m in manifests if m["status"] == "ok"]
-    write_parquet(root / STEPS, pa.concat_tables(parts) if parts else steps_schema(of_logs).empty_table())
+    rollouts = rollout_table(manifests)
+    write_parquet(root / ROLLOUTS, rollouts)
+    done = [m for m in manifests if m["status"] == "ok"]
+    write_parquet_parts(root / STEPS, steps_schema("rollout" in rollouts.column_names), (root / m["path"] / STEPS_NAME for m in done))
     summary = {
         "preset": preset,
-        "metrics": _by_policy(rows, aggregate),
-        "paired": _by_policy(rows, lambda some: _pairs(some, baseline)),
-        "paired_with_base": _by_policy(rows, lambda some: base_pairs(some, _baseline(some, baseline), bases)),
-        "censoring": _by_policy(manifests, censoring),
+        **numbers(RolloutTable.of_table(rollouts), baseline, bases),
+        "censoring": by_policy(_of_policies(manifests), censoring),
         "failures": _failures(manifests),
-        "fixers": _by_policy([m for m in manifests if m["status"] == "ok"], fixers),
-        "plans": _by_policy([m for m in manifests if m["status"] == "ok"], plan_table),
-        "speed": _by_policy([m for m in manifests if m["status"] == "ok" and m.get("stage_ms")], _speeds),
+        "fixers": by_policy(_of_policies(done), fixers),
+        "plans": by_policy(_of_policies(done), plan_table),
+        "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
         **more,
     }
     write_json(root / SUMMARY, summary)
     return summary
 
 
-def _by_policy(rows: Sequence[dict[str, Any]], table: Callable[[Sequence[dict[str, Any]]], dict[str, Any]]) -> dict[str, Any]:
-    """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY: policies are never averaged."""
-    policies = list(dict.fromkeys(row["policy"] for row in rows))
-    out: dict[str, Any] = {}
-    for policy in policies:
-        part = table([row for row in rows if row["policy"] == policy])
-        out |= part if len(policies) == 1 else {f"{renderer}/{policy}": entry for renderer, entry in part.items()}
-    return out
-
-
-def _pairs(rows: Sequence[dict[str, Any]], baseline: str | None) -> dict[str, Any]:
-    chosen = _baseline(rows, baseline)
-    return {} if chosen is None else dict(paired(rows, chosen))
-
-
-def _baseline(rows: Sequence[dict[str, Any]], baseline: str | None) -> str | None:
-    """Return the renderer that the others are compared with; None where there is nothing to compare."""
-    renderers = list(dict.fromkeys(row["renderer"] for row in rows))
-    if len(renderers) < 2:
-        return None
-    return baseline if baseline is not None and baseline in renderers else str(renderers[0])
+def _of_policies(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    found: dict[str, list[dict[str, Any]]] = {}
+    for manifest in manifests:
+        found.setdefault(manifest["policy"], []).append(manifest)
+    return found
 
 
 def _speeds(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -34,15 +34,15 @@ def writing(root: Path, wait: bool = False, waiting: Callable[[str], None] = pri
         yield
 
 
-def remove_left_overs(root: Path, before_ns: int) -> list[Path]:
+def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
     """Remove temporary files and folders of processes that are gone; return them.
 
-    Only names that simrun gives are touched, only those older than the lock, and only if no process has the number in the name. Run folders
-    inside this one (forks) have writers of their own and are left alone.
+    Only names that simrun gives are touched, only those older than the lock, and only if no process of this machine has the number in the
+    name. Run folders inside this one (forks) have writers of their own and are left alone.
 
     Args:
-        root: A run folder whose lock is held.
-        before_ns: When the lock was taken.
+        root: A run folder whose lock is held, or a folder that only this machine's processes write.
+        before_ns: When the lock was taken, by the clock of the file system; None: of any time.
     """
     removed = []
     for at, folders, files in os.walk(root):
@@ -55,7 +55,7 @@ def remove_left_overs(root: Path, before_ns: int) -> list[Path]:
             if matched is None or is_running(int(matched[1])):
                 continue
             path = here / name
-            if path.lstat().st_mtime_ns >= before_ns:
+            if before_ns is not None and path.lstat().st_mtime_ns >= before_ns:
                 continue
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)

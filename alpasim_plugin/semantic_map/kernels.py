@@ -126,8 +126,8 @@ def strokes(ends, style, spheres, pose, camera, table, view, out, count):
             if camera[0] == 0.0:
                 count = _add_stroke(out, count, au, av, az, bu, bv, bz, half, style[s], view)
                 continue
-            top = 0
-            _push(stack, 0, ax, ay, az, au, av, bx, by, bz, bu, bv, 0.0)
+            top = np.int64(0)  # typed, or numba compiles `_push` once more for the literal
+            _push(stack, top, ax, ay, az, au, av, bx, by, bz, bu, bv, 0.0)
             while top >= 0:
                 ax, ay, az, au, av = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3], stack[top, 4]
                 bx, by, bz, bu, bv = stack[top, 5], stack[top, 6], stack[top, 7], stack[top, 8], stack[top, 9]
@@ -171,10 +171,21 @@ def _add_shape(out, count, corner, style, view):
 
 
 @njit(cache=True, nogil=True)
+def _copy(source, target):
+    """Copy a triangle, value by value.
+
+    An assignment of slices costs five seconds of compilation, for the text of an error that cannot come.
+    """
+    for k in range(3):
+        for c in range(6):
+            target[k, c] = source[k, c]
+
+
+@njit(cache=True, nogil=True)
 def _shapes_of(piece, camera, table, style, view, stack, levels, out, count):
     """Project one triangle that lies before the near plane, halving it at edges that bend."""
     top = 0
-    stack[0] = piece
+    _copy(piece, stack[0])
     levels[0] = 0
     while top >= 0:
         one, level = stack[top], levels[top]
@@ -193,7 +204,7 @@ def _shapes_of(piece, camera, table, style, view, stack, levels, out, count):
             continue
         i, j = worst, (worst + 1) % 3
         other = stack[top + 1]
-        other[:] = one
+        _copy(one, other)
         for c in range(6):
             middle = 0.5 * (one[i, c] + one[j, c])
             other[i, c] = middle
@@ -248,6 +259,7 @@ def shapes(corners, closed, shade, style, pose, camera, table, view, out, count)
         for k in range(n):
             kept[k, 3], kept[k, 4] = project(camera, table, kept[k, 0], kept[k, 1], kept[k, 2])
         for k in range(1, n - 1):
-            piece[0], piece[1], piece[2] = kept[0], kept[k], kept[k + 1]
+            for c in range(6):
+                piece[0, c], piece[1, c], piece[2, c] = kept[0, c], kept[k, c], kept[k + 1, c]
             count = _shapes_of(piece, camera, table, style[s], view, stack, levels, out, count)
     return count

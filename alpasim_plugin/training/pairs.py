@@ -69,7 +69,7 @@ def make_sequence(scenario: Scenario, folder: Path, recipe: PairRecipe, seed: in
     camera = _camera(scenario, recipe.camera)
     times = range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
     moving = [a.actor_id for a in scenario.actors if np.ptp(a.track.xyz, axis=0).max() > MOVING_M]
-    lens = {"width": camera.width, "height": camera.height, "K": camera.K.tolist()}
+    lens = {"width": camera.width, "height": camera.height, "K": camera.K.tolist(), "T_rig_camera": camera.T_rig_camera.tolist()}
     facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
     write_sequence(folder, pair_frames(scenario, camera, recipe, seed, threads), len(times), facts)
     return True

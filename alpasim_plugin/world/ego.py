@@ -3,36 +3,47 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from alpasim_plugin.geometry import interpolate, wrap_angle, yaw_of
+from alpasim_plugin.geometry import interpolate, wrap_angle
 from alpasim_plugin.types import EgoState, Trajectory, Vehicle
 
 DIFFERENCE_US = 100_000  # half window of the differences: long enough to bridge the noise of 200 Hz poses
 
 
 def ego_state_from_log(ego_log: Trajectory, t_us: int, vehicle: Vehicle) -> EgoState:
-    """Return the recorded state at ``t_us``, motion by differences over at most +-0.1 s inside the log.
+    """Return the recorded state at ``t_us``; see `ego_states_from_log`."""
+    return ego_states_from_log(ego_log, [t_us], vehicle)[0]
+
+
+def ego_states_from_log(ego_log: Trajectory, t_us: npt.ArrayLike, vehicle: Vehicle) -> list[EgoState]:
+    """Return the recorded state at each of ``(N,)`` times, motion by differences over at most +-0.1 s inside the log.
 
     Speed is the component of velocity along the rig's x axis (negative in reverse). The steering angle is the one with which a
     kinematic bicycle makes the recorded yaw rate, limited to what the vehicle can do, so that the loop closes without a jump.
 
     Raises:
-        InputError: ``t_us`` lies outside the log.
+        InputError: A time lies outside the log.
     """
-    before = max(t_us - DIFFERENCE_US, int(ego_log.t_us[0]))
-    after = min(t_us + DIFFERENCE_US, int(ego_log.t_us[-1]))
-    pose = interpolate(ego_log, t_us)
-    if after == before:
-        return EgoState(t_us, pose, 0.0)
-    window = interpolate(ego_log, np.array([before, t_us, after]))
-    dt_s = (after - before) * 1e-6
-    forward = pose[:3, 0]
-    speed = float((window[2, :3, 3] - window[0, :3, 3]) @ forward) / dt_s
-    yaw_rate = float(wrap_angle(yaw_of(window[2]) - yaw_of(window[0]))) / dt_s
-    accel = 0.0
-    if before < t_us < after:
-        v0 = float((window[1, :3, 3] - window[0, :3, 3]) @ forward) / ((t_us - before) * 1e-6)
-        v1 = float((window[2, :3, 3] - window[1, :3, 3]) @ forward) / ((after - t_us) * 1e-6)
-        accel = 2.0 * (v1 - v0) / dt_s
-    steer = float(np.arctan(vehicle.wheelbase_m * yaw_rate / speed)) if abs(speed) > 0.5 else 0.0
-    return EgoState(t_us, pose, speed, accel, yaw_rate, float(np.clip(steer, -vehicle.max_steer_rad, vehicle.max_steer_rad)))
+    t = np.asarray(t_us, dtype=np.int64)
+    before = np.maximum(t - DIFFERENCE_US, ego_log.t_us[0])
+    after = np.minimum(t + DIFFERENCE_US, ego_log.t_us[-1])
+    poses = interpolate(ego_log, np.stack([before, t, after], axis=-1))  # (N, 3, 4, 4)
+    forward, xyz = poses[:, 1, :3, 0], poses[:, :, :3, 3]
+    # A window of no length, as in a log of one pose, has no motion; one that ends at t has no acceleration.
+    span_s, first_s, second_s = (np.where(us > 0, us, 1) * 1e-6 for us in (after - before, t - before, after - t))
+    speed = _along(xyz[:, 2] - xyz[:, 0], forward) / span_s
+    yaw = np.arctan2(poses[:, :, 1, 0], poses[:, :, 0, 0])
+    yaw_rate = wrap_angle(yaw[:, 2] - yaw[:, 0]) / span_s
+    v0, v1 = _along(xyz[:, 1] - xyz[:, 0], forward) / first_s, _along(xyz[:, 2] - xyz[:, 1], forward) / second_s
+    accel = np.where((before < t) & (t < after), 2.0 * (v1 - v0) / span_s, 0.0)
+    turns = np.abs(speed) > 0.5
+    steer = np.where(turns, np.arctan(vehicle.wheelbase_m * yaw_rate / np.where(turns, speed, 1.0)), 0.0)
+    steer = np.clip(steer, -vehicle.max_steer_rad, vehicle.max_steer_rad)
+    columns = (t.tolist(), poses[:, 1], speed.tolist(), accel.tolist(), yaw_rate.tolist(), steer.tolist())
+    return [EgoState(*row) for row in zip(*columns, strict=True)]
+
+
+def _along(move: npt.NDArray[np.float64], forward: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the component ``(N,)`` of moves ``(N, 3)`` along unit vectors ``(N, 3)``."""
+    return np.asarray(np.sum(move * forward, axis=-1))

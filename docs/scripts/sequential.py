@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from scipy import stats
@@ -22,7 +23,10 @@ from alpasim_plugin.bench.decision_study import (
     GAP,
     NEVER,
     Case,
+    Way,
+    ceiling_for,
     ends,
+    family_ends,
     fixed_scenes,
     hidden_suites,
     overall,
@@ -73,13 +77,11 @@ def efficiency(runs: int) -> str:
     rows = []
     for label, planned, twice in _planned():
         spread = spread_of(planned.draw, planned.name)
-        horizon = 3 * fixed_scenes(planned.distance, spread, POWERS[-1], ALPHA)
-        first, second = ends(planned, runs, horizon), ends(twice, runs, horizon)
         for power in POWERS:
-            ceiling = int(np.sort(np.minimum(first.good, horizon))[math.ceil(power * runs) - 1])
             fixed = fixed_scenes(planned.distance, spread, power, ALPHA)
             compared = fixed_scenes(planned.distance, spread, power, ALPHA / 2)
-            means = [done.mean_scenes(ceiling) for done in (first, second)]
+            ceiling, first = ceiling_for(planned, runs, fixed, power)
+            means = [done.mean_scenes(ceiling) for done in (first, ends(twice, runs, ceiling))]
             rows.append([
                 label if power == POWERS[0] else "", f"{100 * power:.0f} %", str(fixed), f"{ceiling / fixed:.2f}",
                 *(_judged(mean / fixed, aim) for mean, aim in zip(means, (0.6, 0.25), strict=True)),
@@ -100,9 +102,9 @@ def rollouts(runs: int) -> str:
             five = spread_of(rate_pairs(RATES[1], RATES[1], correlation, 5), f"five {correlation}")
             fixed = 2 * 5 * fixed_scenes(GAP, five, power, ALPHA / 2)
             single = 2 * fixed_scenes(GAP, spread_of(one, f"one {correlation}"), power, ALPHA / 2)
-            done = ends(case, runs, 1600)
-            ceiling = int(np.sort(np.minimum(done.good, 1600))[math.ceil(power * runs) - 1])
-            twice = ends(replace(case, name=f"twice {correlation}", draw=rate_pairs(RATES[1], RATES[0], correlation, 1)), runs, 1600)
+            ceiling, done = ceiling_for(case, runs, fixed_scenes(GAP, spread_of(one, f"one {correlation}"), power, ALPHA), power)
+            better = replace(case, name=f"twice {correlation}", draw=rate_pairs(RATES[1], RATES[0], correlation, 1))
+            twice = ends(better, runs, ceiling)
             means = [2 * d.mean_scenes(ceiling) for d in (done, twice)]
             cells += [str(fixed), str(single), *(f"{m:.0f} ({100 * m / fixed:.0f} %)" for m in means)]
         rows.append(cells)
@@ -146,6 +148,20 @@ def suites(runs: int) -> str:
             known = "" if share is None else " / ".join(map(_percent, err))
             rows.append([str(size), label, known, f"{far.mean_scenes(size):.0f}", _percent(far.share(far.good, size))])
     return _markdown(["scenes", "asked about", "errors on the threshold", "mean scenes", "decided"], rows)
+
+
+def families(runs: int) -> str:
+    """Return scenes and errors for suites of five families: random order, families as control, and stratified order."""
+    rows = []
+    for size in (60, 120):
+        for between in (0.0, 0.3, 0.6):
+            cells = [str(size), f"{100 * between:g} %"]
+            for way in get_args(Way):
+                edge, far = (family_ends(runs, size, between, way, on_threshold) for on_threshold in (True, False))
+                err = [float(np.mean(side <= size - 1)) for side in (edge.good, edge.bad)]
+                cells += [f"{far.mean_scenes(size):.1f}", " / ".join(map(_percent, err))]
+            rows.append(cells)
+    return _markdown(["scenes", "variance between families", *(name for way in get_args(Way) for name in (way, "errors"))], rows)
 
 
 def hidden(runs: int) -> str:
@@ -205,6 +221,7 @@ MAKERS: dict[str, Callable[[int], str]] = {
     "efficiency": efficiency,
     "rollouts": rollouts,
     "suites": suites,
+    "families": families,
     "seeds": seeds,
 }
 

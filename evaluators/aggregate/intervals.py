@@ -113,11 +113,24 @@ def logit_t_bounds(means: F64) -> tuple[F64, F64]:
 
 
 def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple[F64, I64]:
-    """Return the mean ``(G,)`` and size ``(G,)`` of each cluster, in the order of their names; the one partition every statistic uses."""
-    _, group = np.unique(np.asarray(clusters), return_inverse=True)
-    group = group.reshape(-1)
+    """Return the mean ``(G,)`` and size ``(G,)`` of each cluster; the one partition every statistic uses.
+
+    Args:
+        values: ``(N,)``.
+        clusters: Name of each value's cluster, or its number from 0 up; the result is in their order, without numbers that no value has.
+    """
+    group = np.asarray(clusters)
+    if not np.issubdtype(group.dtype, np.integer):  # names; numbers are not sorted, as a run may have millions of cells
+        group = np.unique(group, return_inverse=True)[1].reshape(-1)
     size = np.bincount(group)
-    return np.bincount(group, weights=np.asarray(values, dtype=np.float64)) / size, size
+    there = size > 0
+    total = np.bincount(group, weights=np.asarray(values, dtype=np.float64))
+    return total[there] / size[there], size[there]
+
+
+def n_clusters(clusters: I64) -> int:
+    """Return how many different clusters there are among the numbers ``(N,)`` of the values' clusters, from 0 up."""
+    return int(np.count_nonzero(np.bincount(clusters)))
 
 
 def clustered(values: npt.ArrayLike, clusters: Sequence[str] | I64, is_rate: bool = False) -> Interval:

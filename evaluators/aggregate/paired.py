@@ -13,9 +13,9 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, I64, Bool
-from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, t_bounds, t_interval, within
+from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, n_clusters, t_bounds, t_interval, within
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
-from evaluators.aggregate.rows import Cell, RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
+from evaluators.aggregate.rows import Cell, Row, Side, by_renderer, metric_names
 from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
 from evaluators.metrics import difference_range, info
 
@@ -45,14 +45,28 @@ def paired(
     Raises:
         InputError: No row has the baseline.
     """
-    split = by_renderer(rows)
-    if baseline not in split:
-        raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(split)}")
-    names = list(metrics) if metrics is not None else metric_names(rows)
-    chosen = {name: (margins or {}).get(name, default_margin(name)) for name in names}
+    return paired_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics, baseline, margins, listed)
+
+
+def paired_sides(
+    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str, margins: Mapping[str, float] | None = None, listed: int = LISTED
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Compare every renderer with a baseline; see `paired`.
+
+    Args:
+        sides: RENDERER -> its rollouts.
+        metrics: Which metrics.
+        baseline, margins, listed: As for `paired`.
+
+    Raises:
+        InputError: No side is the baseline.
+    """
+    if baseline not in sides:
+        raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(sides)}")
+    chosen = {name: (margins or {}).get(name, default_margin(name)) for name in metrics}
     return {
-        renderer: {name: compare(side, split[baseline], name, baseline, chosen[name], listed) for name in names}
-        for renderer, side in split.items()
+        renderer: {name: compare(side, sides[baseline], name, baseline, chosen[name], listed) for name in metrics}
+        for renderer, side in sides.items()
         if renderer != baseline
     }
 
@@ -68,15 +82,21 @@ def base_pairs(rows: Sequence[Row], baseline: str | None, bases: Mapping[str, st
     Returns:
         RENDERER -> METRIC -> what `compare` gives; without those whose base was not driven.
     """
-    split, names = by_renderer(rows), metric_names(rows)
-    chosen = {name: base for name, base in bases.items() if name in split and base in split and base != baseline and name != baseline}
+    return base_pairs_of_sides(by_renderer(rows), metric_names(rows), baseline, bases)
+
+
+def base_pairs_of_sides(
+    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str]
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Compare every renderer with a fixer with the renderer below it; see `base_pairs`."""
+    chosen = {name: base for name, base in bases.items() if name in sides and base in sides and base != baseline and name != baseline}
     return {
-        name: {metric: compare(split[name], split[base], metric, base, default_margin(metric)) for metric in names}
+        name: {metric: compare(sides[name], sides[base], metric, base, default_margin(metric)) for metric in metrics}
         for name, base in chosen.items()
     }
 
 
-def compare(here: RendererRows, there: RendererRows, metric: str, baseline: str, margin: float, listed: int = LISTED) -> dict[str, Any]:
+def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, listed: int = LISTED) -> dict[str, Any]:
     """Compare one metric of two renderers on their shared cells.
 
     Returns:
@@ -103,8 +123,8 @@ def compare(here: RendererRows, there: RendererRows, metric: str, baseline: str,
         "difference": "none shown",
         "more_scenes": None,
         "n_cells": len(pairs.mine),
-        "n_scenes": len(np.unique(pairs.scenes)),
-        "n_missing": len(pairs.lone),
+        "n_scenes": n_clusters(pairs.scenes),
+        "n_missing": pairs.n_missing,
         "missing": pairs.missing(metric, listed),
         "unit": facts.unit,
         "direction": facts.direction,
@@ -181,7 +201,7 @@ def flag_bounds(gained: F64, lost: F64) -> tuple[F64, F64]:
 class _Pairs:
     """Cells with a value on both sides, and those without."""
 
-    def __init__(self, here: RendererRows, there: RendererRows, metric: str) -> None:
+    def __init__(self, here: Side, there: Side, metric: str) -> None:
         self.sides = (here, here.values(metric)), (there, there.values(metric))
         mine, base = self.sides[0][1], self.sides[1][1]
         index = here.place_in(there)
@@ -189,15 +209,17 @@ class _Pairs:
         both: Bool = np.isfinite(mine) & np.isfinite(partner)
         self.mine, self.base, self.scenes = mine[both], partner[both], here.scene[both]
         only_there = np.flatnonzero(there.place_in(here) < 0)
-        self.lone = sorted([here.cells[i] for i in np.flatnonzero(~both)] + [there.cells[i] for i in only_there])
+        self._lone = (here, np.flatnonzero(~both)), (there, only_there)
+        self.n_missing = int(np.sum(~both)) + len(only_there)
 
     def missing(self, metric: str, listed: int) -> list[dict[str, Any]]:
-        """Name cells without a pair, with side and cause."""
-        return [_lost(cell, *self.sides, metric) for cell in self.lone[:listed]]
+        """Name the first cells without a pair, with side and cause."""
+        lone = sorted(side.cells[i] for side, places in self._lone for i in places[:listed].tolist())  # both are sorted already
+        return [_lost(cell, *self.sides, metric) for cell in lone[:listed]]
 
 
-def _lost(cell: Cell, here: tuple[RendererRows, F64], there: tuple[RendererRows, F64], metric: str) -> dict[str, Any]:
-    why = {"here": _why(cell, *here, metric), "baseline": _why(cell, *there, metric)}
+def _lost(cell: Cell, here: tuple[Side, F64], there: tuple[Side, F64], metric: str) -> dict[str, Any]:
+    why = {"here": here[0].why_missing(cell, metric, here[1]), "baseline": there[0].why_missing(cell, metric, there[1])}
     gone = {side: text for side, text in why.items() if text}
     policy, scene, seed = cell
     return {
@@ -207,14 +229,3 @@ def _lost(cell: Cell, here: tuple[RendererRows, F64], there: tuple[RendererRows,
         "missing": "both" if len(gone) == 2 else next(iter(gone)),
         "why": f"both: {why['here']}" if len(set(why.values())) == 1 else "; ".join(f"{side}: {text}" for side, text in gone.items()),
     }
-
-
-def _why(cell: Cell, side: RendererRows, values: F64, metric: str) -> str:
-    """Return why a side has no value for a cell, or ""."""
-    found = side.rows_of.get(cell)
-    if found is None:
-        return "not planned"
-    if np.isfinite(values[side.cell[found[0]]]):
-        return ""
-    row = side.rows[found[0]]
-    return f"not valid ({reason_of(row, metric)})" if side.ok[found[0]] else f"failed ({failure_of(row)})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -76,15 +77,68 @@ def cell_of(row: Row) -> Cell:
     return str(row["policy"]), str(row["scene"]), int(row["seed"])
 
 
+class Side(ABC):
+    """The rollouts of one renderer, laid out by cell: what every statistic over rollouts reads.
+
+    Attributes:
+        ok: ``(R,)`` the rollout ran to its end.
+        cells: ``(C,)`` of all rollouts, sorted.
+        cell: ``(R,)`` index into ``cells``.
+        scene: ``(C,)`` number of the cell's scene, in the order of names.
+    """
+
+    ok: Bool
+    cells: Sequence[Cell]
+    cell: I64
+    scene: I64
+
+    @abstractmethod
+    def raw(self, metric: str) -> F64:
+        """Return the metric of every rollout ``(R,)``, NaN where it failed or the value is not valid or not finite."""
+
+    @abstractmethod
+    def place_in(self, other: Side) -> I64:
+        """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
+
+    @abstractmethod
+    def first_row(self, cell: Cell) -> int | None:
+        """Return the first rollout of a cell; None where none was planned."""
+
+    @abstractmethod
+    def reason(self, row: int, metric: str) -> str:
+        """Return why a metric of a rollout is not valid, as far as it is known."""
+
+    @abstractmethod
+    def failure(self, row: int) -> str:
+        """Return the failure class of a rollout that did not run to its end."""
+
+    def values(self, metric: str) -> F64:
+        """Return the metric of every cell ``(C,)``, NaN where missing; repeats of a cell are averaged first, as the paper does."""
+        found = self.raw(metric)
+        known = np.isfinite(found)
+        count = np.bincount(self.cell[known], minlength=len(self.cells))
+        total = np.bincount(self.cell[known], weights=found[known], minlength=len(self.cells))
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+    def why_missing(self, cell: Cell, metric: str, values: F64) -> str:
+        """Return why there is no value for a cell, or "" where there is one; ``values`` as `Side.values` gives them."""
+        row = self.first_row(cell)
+        if row is None:
+            return "not planned"
+        if np.isfinite(values[self.cell[row]]):
+            return ""
+        return f"not valid ({self.reason(row, metric)})" if self.ok[row] else f"failed ({self.failure(row)})"
+
+
 @dataclass(frozen=True)
-class RendererRows:
-    """The rollouts of one renderer, sorted into cells."""
+class RendererRows(Side):
+    """A side made of rows in memory: for small tables, and the reference of `evaluators.aggregate.columns`."""
 
     rows: tuple[Row, ...]
-    ok: Bool  # (R,) the rollout ran to its end
-    cells: tuple[Cell, ...]  # (C,) sorted, of all rows
-    cell: I64  # (R,) index into cells
-    scene: I64  # (C,) number of the cell's scene, in the order of names
+    ok: Bool
+    cells: tuple[Cell, ...]
+    cell: I64
+    scene: I64
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> RendererRows:
@@ -102,7 +156,7 @@ class RendererRows:
         )
 
     def raw(self, metric: str) -> F64:
-        """Return the metric of every row ``(R,)``, NaN where the rollout failed or the value is not valid."""
+        """Return the metric of every row; see `Side.raw`."""
         if self._flat:
             key = f"{metric}_valid"
             found = np.array([row.get(metric) if row.get(key, True) else None for row in self.rows], dtype=np.float64)
@@ -110,31 +164,34 @@ class RendererRows:
             found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)
         return np.where(self.ok & np.isfinite(found), found, np.nan)
 
-    def values(self, metric: str) -> F64:
-        """Return the metric of every cell ``(C,)``, NaN where missing; repeats of a cell are averaged first, as the paper does."""
-        found = self.raw(metric)
-        known = np.isfinite(found)
-        count = np.bincount(self.cell[known], minlength=len(self.cells))
-        total = np.bincount(self.cell[known], weights=found[known], minlength=len(self.cells))
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-    def place_in(self, other: RendererRows) -> I64:
-        """Return the index ``(C,)`` of each cell among another side's cells, -1 where it has no such cell."""
+    def place_in(self, other: Side) -> I64:
+        """Return each cell's index in the other side; see `Side.place_in`."""
         if id(other) not in self._places:
             place = {cell: i for i, cell in enumerate(other.cells)}
             self._places[id(other)] = np.array([place.get(cell, -1) for cell in self.cells], dtype=np.int64)
         return self._places[id(other)]
+
+    def first_row(self, cell: Cell) -> int | None:
+        """Return the first row of a cell."""
+        return self._first_rows.get(cell)
+
+    def reason(self, row: int, metric: str) -> str:
+        """Return why a metric of a row is not valid."""
+        return reason_of(self.rows[row], metric)
+
+    def failure(self, row: int) -> str:
+        """Return the failure class of a row."""
+        return failure_of(self.rows[row])
 
     @cached_property
     def _places(self) -> dict[int, I64]:
         return {}
 
     @cached_property
-    def rows_of(self) -> Mapping[Cell, Sequence[int]]:
-        """Which rows belong to each cell."""
-        found: dict[Cell, list[int]] = {}
+    def _first_rows(self) -> Mapping[Cell, int]:
+        found: dict[Cell, int] = {}
         for i, c in enumerate(self.cell.tolist()):
-            found.setdefault(self.cells[c], []).append(i)
+            found.setdefault(self.cells[c], i)
         return found
 
     @cached_property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,8 @@ import numpy as np
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
 from evaluators.aggregate.bootstrap import cluster_bootstrap
-from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, normal_half_width, wilson_rate, within
-from evaluators.aggregate.rows import RendererRows, Row, by_renderer, metric_names
+from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, n_clusters, normal_half_width, wilson_rate, within
+from evaluators.aggregate.rows import Row, Side, by_renderer, metric_names
 from evaluators.metrics import info, value_range
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
@@ -32,11 +32,20 @@ def aggregate(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> dict
         independent). What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
         ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
     """
-    names = list(metrics) if metrics is not None else metric_names(rows)
-    return {renderer: {name: _entry(side, name) for name in names} for renderer, side in by_renderer(rows).items()}
+    return aggregate_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics)
 
 
-def _entry(side: RendererRows, metric: str) -> dict[str, Any]:
+def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Average rollouts per renderer and metric; see `aggregate`.
+
+    Args:
+        sides: RENDERER -> its rollouts.
+        metrics: Which metrics.
+    """
+    return {renderer: {name: _entry(side, name) for name in metrics} for renderer, side in sides.items()}
+
+
+def _entry(side: Side, metric: str) -> dict[str, Any]:
     facts = info(metric)
     by_cell = side.values(metric)
     known = np.isfinite(by_cell)
@@ -50,7 +59,7 @@ def _entry(side: RendererRows, metric: str) -> dict[str, Any]:
         "ci95_bootstrap": None,
         "design_effect": None,
         "n_rollouts": n,
-        "n_scenes": len(np.unique(scenes)),
+        "n_scenes": n_clusters(scenes),
         "n_invalid": max(n_ran - n, 0),
         "unit": facts.unit,
         "direction": facts.direction,

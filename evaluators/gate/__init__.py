@@ -1,6 +1,6 @@
 """The gate: criteria, baseline and verdict of a run."""
 
-from evaluators.gate.baseline import Baseline, baseline_of, check_matches, read_baseline, write_baseline
+from evaluators.gate.baseline import Baseline, baseline_of, check_made_alike, check_matches, read_baseline, write_baseline
 from evaluators.gate.decided import judge_decided
 from evaluators.gate.judge import Check, GateVerdict, judge
 from evaluators.gate.rows import rows_of_run
@@ -13,6 +13,7 @@ __all__ = [
     "GateVerdict",
     "MetricRule",
     "baseline_of",
+    "check_made_alike",
     "check_matches",
     "judge",
     "judge_decided",

@@ -13,7 +13,7 @@ from alpasim_plugin.reading import read_json_object
 from alpasim_plugin.reading.json_files import as_shape, kind_of
 from evaluators.aggregate.rows import Row
 from evaluators.gate.rows import rows_of_run
-from evaluators.report.run_folder import Run
+from evaluators.report.run_folder import Run, read_run
 from evaluators.report.shapes import BaselineRow, StoredBaseline
 
 SCHEMA_VERSION = 1
@@ -55,11 +55,13 @@ def write_baseline(run: Run, path: Path) -> None:
 
 
 def read_baseline(path: Path) -> Baseline:
-    """Read a baseline file.
+    """Read a baseline file, or take the results of a run folder as they are.
 
     Raises:
         InputError: Missing, not JSON, or not a baseline of this version.
     """
+    if path.is_dir():
+        return baseline_of(read_run(path))
     content = read_json_object(path, DOING, do_this="write one with simrun gate RUN --write-baseline FILE")
     names = set(Baseline.__dataclass_fields__)
     if set(content) != names or content["schema_version"] != SCHEMA_VERSION:
@@ -82,7 +84,22 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
     Raises:
         InputError: Other preset, other weights, a scene with another content, or no scene in common.
     """
-    preset, hashes, weights = _preset(run), scene_hashes(run), dict(run.info.get("weights") or {})
+    check_made_alike(baseline, _preset(run), scene_hashes(run), dict(run.info.get("weights") or {}), path)
+
+
+def check_made_alike(baseline: Baseline, preset: str, hashes: Mapping[str, str], weights: Mapping[str, Any], path: Path) -> None:
+    """Refuse a baseline that was made with something else than a run, which need not have been driven yet.
+
+    Args:
+        baseline: The baseline.
+        preset: Of the run.
+        hashes: SCENE -> hash of its content, of the run.
+        weights: FILE -> digest, of the run's parts.
+        path: The baseline's file or folder, for errors.
+
+    Raises:
+        InputError: As `check_matches`.
+    """
     if baseline.preset != preset:
         raise InputError(DOING, str(path), f"preset {baseline.preset!r}, the run has {preset!r}", APPROVE)
     if dict(baseline.weights) != weights:

@@ -15,7 +15,7 @@ from evaluators.sequential.record import Decision
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
 
 
-def judge_decided(rows: Sequence[Row], spec: GateSpec, decision: Decision) -> GateVerdict:
+def judge_decided(rows: Sequence[Row], spec: GateSpec, decision: Decision, stored: Sequence[Row] | None = None) -> GateVerdict:
     """Judge rollout rows whose number was decided while they were driven.
 
     The intervals of `judge` are those of a fixed number of scenes, so its margins are replaced by the decision's verdicts; limits and
@@ -25,8 +25,9 @@ def judge_decided(rows: Sequence[Row], spec: GateSpec, decision: Decision) -> Ga
         rows: Every rollout that was driven.
         spec: The gate whose margins were asked about.
         decision: What was decided.
+        stored: Rows of a stored baseline, of the scenes and seeds that were driven; without it the baseline was driven, too.
     """
-    plain = judge(rows, spec)
+    plain = judge(rows, spec, stored, decision["baseline"])
     found = {row.metric: row for row in metric_rows(decision)}
     checks = tuple(_decided(check, found[check.metric], spec, decision) if check.kind == "margin" else check for check in plain.checks)
     outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]

@@ -85,8 +85,8 @@ def comparisons(run: Run, scenes: Sequence[str], limit: int, budget_bytes: int) 
 
 def _best_cell(run: Run, scene: str) -> tuple[str, int, list[Rollout]] | None:
     cells: dict[tuple[str, int], list[Rollout]] = {}
-    for rollout in run.rollouts:
-        if rollout.scene == scene and run.file_of(rollout, "strip.jpg") is not None:
+    for rollout in run.by_scene.get(scene, ()):
+        if run.file_of(rollout, "strip.jpg") is not None:
             cells.setdefault((rollout.policy, rollout.seed), []).append(rollout)
     if not cells:
         return None

@@ -20,7 +20,8 @@ from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.certificate import certificate
 from evaluators.report.charts import drift_charts
 from evaluators.report.decision import section
-from evaluators.report.events import events_of, read_series
+from evaluators.report.events import COLLISION, read_series
+from evaluators.report.every_rollout import rollout_block
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
 from evaluators.report.figures import forest, speed_against_error, strata_chart
 from evaluators.report.fixers import COLUMNS, fixer_rows
@@ -37,6 +38,7 @@ from evaluators.report.strata import heads, strata, stratum_rows
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
 MAX_STRIP_SCENES = 8
+SERIES_ROLLOUTS = 4000  # whose steps are read at once
 LEDGER_RATES = ("collision_at_fault", "offroad")
 PLOT_BUDGET_BYTES = 1_500_000
 STRIP_BUDGET_BYTES = 1_500_000
@@ -68,7 +70,8 @@ def write_report(run_dir: Path | str, replays: Mapping[tuple[str, str, str, int]
 def render_report(run: Run, replays: Mapping[tuple[str, str, str, int], str] = NO_REPLAYS) -> str:
     """Render the report as a string; ``replays`` as in `write_report`."""
     environment = _environment()
-    style, script = ("\n".join(asset(environment, f"{name}.{kind}") for name in ("theme", "report")) for kind in ("css", "js"))
+    assets = {"css": ("theme", "report"), "js": ("theme", "report", "rollouts")}
+    style, script = ("\n".join(asset(environment, f"{name}.{kind}") for name in names) for kind, names in assets.items())
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return environment.get_template("report.html.j2").render(
         style=Markup(style), script=Markup(script), script_hash=digest, dash=DASH, plural=plural, replays=replays, **context(run)
@@ -84,19 +87,22 @@ def _environment() -> Environment:
 
 def context(run: Run) -> dict[str, Any]:
     """Collect everything that the template prints."""
-    series = read_series(run)
-    interesting = by_interest(run, series)
+    sample = sampled_scenes(run)
+    series = read_series(run, sample)
+    interesting = by_interest(run)
     variant_of = {(r, p): (i, j) for i, r in enumerate(run.renderers) for j, p in enumerate(run.policies)}
-    views, no_view = scene_views(run, series, interesting, variant_of)
+    looked_at = None if sample is None else interesting[: 2 * MAX_SCENE_PLOTS]
+    views, no_view = scene_views(run, series if looked_at is None else read_series(run, looked_at), looked_at or interesting, variant_of)
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     pairs = tables.pair_rows(run.summary)
-    by_scene, more_scene_rows = scene_rows(run)
+    by_scene, more_scene_rows = scene_rows(run, interesting)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows
     colours = _variant_colours(run)
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
-    split = strata(run)
+    split = strata(run, sample)
+    of_sample = "" if sample is None else f"From {plural(len(sample), 'scene')} of {len(run.scenes)}, evenly chosen from their list."
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
@@ -134,6 +140,8 @@ def context(run: Run) -> dict[str, Any]:
         "scene_rows": by_scene,
         "more_scene_rows": more_scene_rows,
         "scene_metrics": SCENE_METRICS,
+        "every_rollout": rollout_block(run),
+        "of_sample": of_sample,
         "failures": failures,
         "more_failures": more_failures,
         "ledger": ledger(run, LEDGER_RATES),
@@ -143,12 +151,20 @@ def context(run: Run) -> dict[str, Any]:
     }
 
 
-def by_interest(run: Run, series: Series) -> list[str]:
+def sampled_scenes(run: Run) -> list[str] | None:
+    """Return the scenes whose steps are read for charts of the whole run; None where all are: `SERIES_ROLLOUTS` fit into memory."""
+    if len(run.rollouts) <= SERIES_ROLLOUTS:
+        return None
+    scenes, wanted = run.scenes, max(1, SERIES_ROLLOUTS * len(run.scenes) // len(run.rollouts))
+    return [scenes[i * len(scenes) // wanted] for i in range(wanted)]
+
+
+def by_interest(run: Run) -> list[str]:
     """Sort scenes by how much there is to see: events and failures first, then the largest distance from the logged path."""
 
     def interest(scene: str) -> tuple[int, float]:
-        rollouts = [r for r in run.rollouts if r.scene == scene]
-        events = sum(len(events_of(r, series)) for r in rollouts if r.ok) + sum(not r.ok for r in rollouts)
+        rollouts = run.by_scene.get(scene, ())
+        events = sum(r.flag(*COLLISION) + r.flag("offroad") if r.ok else 1 for r in rollouts)
         far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
         return events, max(far, default=0.0)
 
@@ -166,9 +182,11 @@ def scene_views(
     drawn: dict[str, SceneView] = {}
     spent = 0
     for scene in interesting:
+        rollouts = run.by_scene.get(scene, ())
+        if not rollouts or len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
+            continue
         content = run.scene_data(scene)
-        rollouts = [r for r in run.rollouts if r.scene == scene]
-        if content is None or not rollouts or len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
+        if content is None:
             continue
         with parsing(DOING, run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
             view = scene_view(scene, content, rollouts, series, variant_of)

@@ -12,6 +12,8 @@ from alpasim_plugin.atomic import write_text
 from alpasim_plugin.escape import xml as clean
 from evaluators.report.run_folder import Rollout, Run, read_run, reporting
 
+MAX_WITH_VALUES = 2000  # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
+
 
 def write_junit(run_dir: Path | str) -> Path:
     """Write ``junit.xml`` into a run folder and return its path.
@@ -49,8 +51,9 @@ def junit(run: Run) -> ET.Element:
         "command": " ".join(str(word) for word in run.info.get("command") or []),
     }
     _properties(suite, {k: str(v) for k, v in facts.items() if v})
+    with_values = len(run.rollouts) <= MAX_WITH_VALUES
     for rollout in run.rollouts:
-        _case(suite, rollout)
+        _case(suite, rollout, with_values)
     return root
 
 
@@ -60,12 +63,12 @@ def _suite_name(run: Run) -> str:
     return str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
 
 
-def _case(suite: ET.Element, rollout: Rollout) -> None:
+def _case(suite: ET.Element, rollout: Rollout, with_values: bool) -> None:
     name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
     case = ET.SubElement(
         suite, "testcase", {"classname": clean(rollout.scene), "name": clean(name), "time": f"{rollout.wall_s or 0.0:.3f}"}
     )
-    values = {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()} if rollout.ok else {}
+    values = {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()} if rollout.ok and with_values else {}
     _properties(case, {"path": rollout.path, **values} if rollout.path else values)
     if not rollout.ok:
         first = next((line for line in rollout.failure.splitlines() if line.strip()), "no message was recorded")

@@ -10,6 +10,8 @@ from typing import Any
 
 from evaluators.report.run_folder import Run
 
+MAX_SCENES = 1000
+
 
 @dataclass(frozen=True)
 class SceneSource:
@@ -32,6 +34,7 @@ class Provenance:
     versions: tuple[tuple[str, str], ...]
     weights: tuple[tuple[str, str], ...]
     scenes: tuple[SceneSource, ...]
+    more_scenes: int  # that are not among them
     left_out: tuple[str, ...]
     config: str
 
@@ -48,8 +51,8 @@ def provenance(run: Run) -> Provenance:
         "seeds": ", ".join(str(s) for s in info.get("seeds") or []),
         "schema": info.get("schema_version"),
     }
-    scenes = []
-    for name, entry in (info.get("scenes") or {}).items():
+    scenes, of_run = [], info.get("scenes") or {}
+    for name, entry in list(of_run.items())[:MAX_SCENES]:
         path = run.scene_path(name)
         notes = tuple(str(n) for n in entry.get("notes") or ())
         href = path.relative_to(run.folder).as_posix() if path else None
@@ -62,6 +65,7 @@ def provenance(run: Run) -> Provenance:
         _pairs(info.get("versions")),
         _pairs(info.get("weights")),
         tuple(scenes),
+        len(of_run) - len(scenes),
         tuple(str(note) for note in info.get("left_out") or ()),
         json.dumps(info.get("config") or {}, indent=2),
     )

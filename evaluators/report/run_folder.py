@@ -125,6 +125,14 @@ class Run:
         return exact or [r for r in self.rollouts if r.renderer == variant]
 
     @cached_property
+    def by_scene(self) -> Mapping[str, Sequence[Rollout]]:
+        """Give the rollouts of each scene."""
+        found: dict[str, list[Rollout]] = {}
+        for rollout in self.rollouts:
+            found.setdefault(rollout.scene, []).append(rollout)
+        return found
+
+    @cached_property
     def _scene_files(self) -> dict[str, Path]:
         found: dict[str, Path] = {}
         for path in sorted((self.folder / "scenes").rglob("*.json")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,8 @@ from evaluators.report.metric_info import in_percent
 from evaluators.report.numbers import Cell, duration, fixed, missing, short
 from evaluators.report.run_folder import Rollout, Run
 
-MAX_SCENE_ROWS = 1200
+MAX_SCENE_ROWS = 600  # more are a page that loads and scrolls slowly
+TELLING_ROWS = 200  # shown of a larger run
 SCENE_METRICS = ("lateral_distance_m", "progress")
 
 
@@ -40,8 +42,12 @@ class SceneRow:
     values: tuple[Cell, ...]
 
 
-def scene_rows(run: Run) -> tuple[list[SceneRow], int]:
-    """Lay out scenes x variants.
+def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow], int]:
+    """Lay out scenes x variants, in the order of the run; where there is no room for all, the most telling scenes first.
+
+    Args:
+        run: The run.
+        interesting: Its scenes, the most telling first.
 
     Returns:
         The rows, and how many more there are than are shown.
@@ -50,9 +56,10 @@ def scene_rows(run: Run) -> tuple[list[SceneRow], int]:
     for rollout in run.rollouts:
         groups.setdefault((rollout.scene, rollout.renderer, rollout.policy), []).append(rollout)
     renderer_index = {name: i for i, name in enumerate(run.renderers)}
-    rank = {name: i for i, name in enumerate(run.scenes)}
+    is_large = len(groups) > MAX_SCENE_ROWS
+    rank = {name: i for i, name in enumerate(interesting if interesting and is_large else run.scenes)}
     keys = sorted(groups, key=lambda k: (rank[k[0]], renderer_index[k[1]], k[2]))
-    rows = [_scene_row(run, key, groups[key], renderer_index[key[1]]) for key in keys[:MAX_SCENE_ROWS]]
+    rows = [_scene_row(run, key, groups[key], renderer_index[key[1]]) for key in keys[: TELLING_ROWS if is_large else MAX_SCENE_ROWS]]
     return rows, len(keys) - len(rows)
 
 

@@ -78,9 +78,14 @@ class StratumRow:
     cells: tuple[Cell, ...]  # time, events, values
 
 
-def strata(run: Run) -> list[Strata]:
-    """Split the scored steps of a run by distance and by opacity; a variable that the run does not hold is left out."""
-    series = series_by_cell(run.steps(SERIES))
+def strata(run: Run, scenes: Sequence[str] | None = None) -> list[Strata]:
+    """Split the scored steps of a run by distance and by opacity; a variable that the run does not hold is left out.
+
+    Args:
+        run: The run.
+        scenes: Whose steps count; None: all.
+    """
+    series = series_by_cell(run.steps(SERIES, scenes))
     steps = [_Steps(r, series[r.cell]) for r in run.rollouts if r.ok and DISTANCE in series.get(r.cell, {})]
     steps = [one for one in steps if len(one.t_us)]
     found = []

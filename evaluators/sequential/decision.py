@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -68,14 +68,17 @@ class State:
     metrics: tuple[MetricState, ...]
 
 
-def state_after(question: Question, values: Mapping[str, F64], horizon: int, adjusted: Mapping[str, Draws] | None = None) -> State:
+def state_after(
+    question: Question, values: Mapping[str, F64], horizon: int, adjusted: Mapping[str, Draws] | None = None, size: int | None = None
+) -> State:
     """Return the state after the scenes so far; it depends on their order, and not on how often one looked before.
 
     Args:
         question: What is to be decided.
         values: METRIC -> ``(n,)`` differences in the order drawn, positive is worse; NaN where a scene has none.
-        horizon: Most scenes that can be driven; the size of the suite.
+        horizon: Most scenes that can be driven: the ceiling that bets are made for.
         adjusted: METRIC -> the draws where they are not simply ``values``: without replacement, or with a control. Without NaN.
+        size: Scenes of the suite; None: all can be driven.
     """
     n = len(next(iter(values.values())))
     good, bad, seen = [], [], []
@@ -83,8 +86,9 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int, adj
         x = values[one.metric]
         known = np.flatnonzero(np.isfinite(x))
         draws = (adjusted or {}).get(one.metric) or independent(x[known], *one.harm_bounds)
-        is_whole = question.population == "suite" and n == horizon and len(known) == n
-        seen.append(_Seen(one, draws, Plan(one.distance, horizon, question.alpha), question.first_look, x if is_whole else None))
+        is_whole = question.population == "suite" and n == (size or horizon) and len(known) == n
+        plan = Plan(one.distance, horizon, question.alpha)
+        seen.append(_Seen(one, draws, plan, len(question.metrics), question.first_look, x if is_whole else None))
         paths = seen[-1].paths() if len(known) else (np.empty(0), np.empty(0))
         good.append(_hold(paths[0], known, n))
         bad.append(_hold(paths[1], known, n))
@@ -134,6 +138,7 @@ class _Seen:
     question: MetricQuestion
     draws: Draws
     plan: Plan
+    sharing: int  # metrics of which one is enough for the bad answer: its evidence is averaged over them
     first_look: int
     whole: F64 | None = None  # the differences of a suite all of whose scenes are driven: its mean is known
 
@@ -147,12 +152,12 @@ class _Seen:
         return good, bad
 
     def _estimated(self) -> tuple[F64, F64]:
-        at = self.question.threshold
-        above, below = self._above(self.draws, at), self._above(self.draws.mirrored(), -at)
+        at, mirror = self.question.threshold, self.draws.mirrored()
         if self.question.direction != "none":
-            return below, above
+            return self._above(mirror, -at, 1), self._above(self.draws, at, self.sharing)
         # A change to either side counts: the size is within the margin if both ends are, and beyond it if either is.
-        low_above, low_below = self._above(self.draws, -at), self._above(self.draws.mirrored(), at)
+        below, low_above = self._above(mirror, -at, 1), self._above(self.draws, -at, 1)
+        above, low_below = self._above(self.draws, at, 2 * self.sharing), self._above(mirror, at, 2 * self.sharing)
         good = np.minimum(np.maximum.accumulate(below), np.maximum.accumulate(low_above))
         return good, np.logaddexp(above, low_below) - np.log(2.0)
 
@@ -162,11 +167,12 @@ class _Seen:
         low, high = self._bound(self.draws, 1.0), self._bound(self.draws.mirrored(), -1.0)
         return low, None if high is None else -high
 
-    def _above(self, draws: Draws, mean: float) -> F64:
-        """Return the log e-process against "the mean is at most ``mean``"."""
+    def _above(self, draws: Draws, mean: float, sharing: int) -> F64:
+        """Return the log e-process against "the mean is at most ``mean``", aimed at ``sharing`` / alpha."""
+        plan = replace(self.plan, alpha=self.plan.alpha / sharing)
         if self.question.method == "asymptotic":
-            return asymptotic.log_evidence(draws, mean, self.plan, self.first_look)
-        return betting.log_capital(draws, mean, betting.bet_sizes(draws, self._centre(draws), self.plan))
+            return asymptotic.log_evidence(draws, mean, plan, self.first_look)
+        return betting.log_capital(draws, mean, betting.bet_sizes(draws, mean, plan))
 
     def _bound(self, draws: Draws, sign: float) -> float | None:
         if self.question.method == "asymptotic":

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.types import F64, Bool
-from evaluators.aggregate.rows import RendererRows
+from evaluators.aggregate.rows import Side
 from evaluators.metrics import info
 
 
@@ -38,7 +38,7 @@ class SceneDifferences:
         return -self.diff if info(metric).direction == "higher" else self.diff
 
 
-def scene_differences(candidate: RendererRows, baseline: RendererRows, metric: str, scenes: Sequence[str]) -> SceneDifferences:
+def scene_differences(candidate: Side, baseline: Side, metric: str, scenes: Sequence[str]) -> SceneDifferences:
     """Return the differences of the scenes named, in their order.
 
     A scene with a cell that lacks its pair has no difference: which pairs are lost may depend on how the drive went.

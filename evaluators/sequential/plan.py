@@ -9,12 +9,9 @@ import numpy as np
 
 from alpasim_plugin.types import F64
 
-# Bets on the planned distance, half of it, twice and four times it; the share of the capital that each begins with; and the share that it
-# may risk on one scene. Small bets that risk little survive the scene that changes for the worse among many that do not change; large bets
-# that risk nearly all decide fast where nothing changes. Measured against other mixtures in docs/experiments/sequential.md.
-MIXTURE: tuple[tuple[float, float, float], ...] = ((0.5, 0.15, 0.3), (1.0, 0.5, 0.5), (2.0, 0.2, 0.8), (4.0, 0.15, 0.98))
-MULTIPLES, LOG_SHARES, AT_RISK = (np.array(column) for column in zip(*MIXTURE, strict=True))
-LOG_SHARES = np.log(LOG_SHARES)
+# Half of the distance that is bet on, in standard deviations of the sum over all scenes up to the ceiling. A test with a ceiling that is
+# just large enough for 80 % power has 1.4; smaller bets gain nothing, whatever the plan.
+USUAL_SLOPE, LEAST_SLOPE = 1.4, 1.0
 
 
 @dataclass(frozen=True)
@@ -22,9 +19,9 @@ class Plan:
     """How large bets are.
 
     Attributes:
-        distance: Expected distance of the true mean from the threshold, in the metric's unit; None: such that half of ``horizon`` suffices.
+        distance: Expected distance of the true mean from the threshold, in the metric's unit; None: such that ``horizon`` just suffices.
         horizon: Most scenes that can be driven.
-        alpha: Chance of a wrong decision.
+        alpha: Evidence of 1 / alpha is aimed at: the chance of a wrong decision, divided by the number of answers that share it.
     """
 
     distance: float | None
@@ -33,11 +30,11 @@ class Plan:
 
     @property
     def log_bar(self) -> float:
-        """Give the log of the e-value at which a claim is made: 1 / alpha."""
+        """Give the log of the e-value that is aimed at: 1 / alpha."""
         return -math.log(self.alpha)
 
-    def rate(self, variance: F64) -> F64:
-        """Return the bet that grows fastest at the planned distance, distance / variance, for variances of any shape."""
-        if self.distance is not None:
-            return np.asarray(self.distance / variance)
-        return np.asarray(np.sqrt(4.0 * self.log_bar / (self.horizon * variance)))
+    def slope(self, spread: F64) -> F64:
+        """Return the slope of the line that is bet on (`line.py`), for standard deviations of a scene of any shape."""
+        if self.distance is None:
+            return np.full_like(spread, USUAL_SLOPE)
+        return np.asarray(np.maximum(LEAST_SLOPE, 0.5 * self.distance * math.sqrt(self.horizon) / spread))

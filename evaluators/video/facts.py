@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from evaluators.judges.facts import CLIP_FACTS, EXTERNAL_FACTS
 from evaluators.metrics import MetricInfo, declare
 
 PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
@@ -14,6 +15,7 @@ FACTS: dict[str, MetricInfo] = {
     "perceptual-syn": MetricInfo("", "lower", "mean", "perceptual distance by the feature network that comes with the package; not LPIPS"),
     "lpips_alex": MetricInfo("", "lower", "mean", "LPIPS v0.1 with AlexNet"),
     "lpips_vgg": MetricInfo("", "lower", "mean", "LPIPS v0.1 with VGG-16"),
+    "dists": MetricInfo("", "lower", "mean", "DISTS with VGG-16, full resolution"),
     WARP: MetricInfo("", "lower", "mean", "change from frame to frame beyond the video's own motion"),
     WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
     DRIFT: MetricInfo("dB", "higher", "mean", "PSNR of the last 50 frames minus that of frames 50 to 100"),
@@ -23,7 +25,12 @@ FACTS: dict[str, MetricInfo] = {
         )
         for side, name in GRID.items()
     },
+    **CLIP_FACTS,
+    **EXTERNAL_FACTS,
     MS: MetricInfo("ms", "lower", "median", "time of the fixer per frame"),
 }
+SOMETIMES = frozenset(
+    {*CLIP_FACTS, *EXTERNAL_FACTS}
+)  # undefined on some clips, such as those without a vehicle; these are left out and counted
 for _name, _facts in FACTS.items():
     declare(_name, _facts)

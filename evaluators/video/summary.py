@@ -16,7 +16,7 @@ from alpasim_plugin.errors import EvaluatorError
 from evaluators.aggregate.intervals import t_interval
 from evaluators.aggregate.paired import compare
 from evaluators.aggregate.rows import by_renderer
-from evaluators.video.facts import FACTS, MS, WARP
+from evaluators.video.facts import FACTS, MS, SOMETIMES, WARP
 
 Row = Mapping[str, Any]
 TRUTH = "truth"  # the variant of the ground-truth frames: only metrics without a reference are measured on it
@@ -59,8 +59,13 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
 
 
 def metrics_of(rows: Sequence[Row]) -> list[str]:
-    """Return the metrics that every row carries, in the order of the tables."""
-    return [name for name in FACTS if all(value_of(row, name) is not None for row in rows)]
+    """Return the metrics that every row carries, and those that may be undefined and any row carries, in the order of the tables."""
+    return [name for name in FACTS if _carried(rows, name)]
+
+
+def _carried(rows: Sequence[Row], metric: str) -> bool:
+    found = [value_of(row, metric) is not None for row in rows]
+    return any(found) if metric in SOMETIMES else all(found)
 
 
 def value_of(row: Row, metric: str) -> float | None:
@@ -73,8 +78,10 @@ def value_of(row: Row, metric: str) -> float | None:
 
 def _mean(rows: Sequence[Row], metric: str) -> dict[str, Any]:
     values = [value_of(row, metric) for row in rows]
-    found = t_interval([v for v in values if v is not None], "clips")
-    entry: dict[str, Any] = {"mean": found.centre, "ci95": found.bounds, "n": len(values)}
+    known = [v for v in values if v is not None]
+    found = t_interval(known, "clips")
+    entry: dict[str, Any] = {"mean": found.centre, "ci95": found.bounds, "n": len(known)}
+    entry |= {"excluded": len(values) - len(known)} if len(known) < len(values) else {}
     entry |= {"unit": FACTS[metric].unit, "direction": FACTS[metric].direction}
     return entry | ({"reason": found.reason} if found.reason else {}) | ({"note": found.note} if found.note else {})
 

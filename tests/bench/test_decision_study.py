@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from alpasim_plugin.bench.decision_study import GAP, NEVER, Case, ends, fixed_scenes, overall, rate_pairs, seed_costs, suite_ends
+from alpasim_plugin.bench.decision_study import (
+    GAP,
+    NEVER,
+    Case,
+    Way,
+    ends,
+    family_ends,
+    fixed_scenes,
+    overall,
+    rate_pairs,
+    seed_costs,
+    suite_ends,
+)
 from alpasim_plugin.bench.interval_study import RATES
 
 
@@ -32,6 +46,13 @@ def test_a_suite_is_decided_sooner_than_its_population_and_a_control_helps():
     assert known < suite < population
 
 
+def test_families_as_control_save_about_what_a_stratified_order_saves():
+    random, control, stratified = (family_ends(40, 60, 0.6, way, on_threshold=False).mean_scenes(60) for way in get_args(Way))
+    assert max(control, stratified) < 0.95 * random
+    assert abs(control - stratified) < 0.15 * random
+
+
+@pytest.mark.slow
 def test_several_metrics_keep_the_error_and_chosen_seeds_cost_little_more_than_the_best():
     assert overall(100, 3, 0.5, "all on the threshold", 100)[1] <= 0.12
     chosen, one, five = (seed_costs(8, 4.0, 8.0, rule)[0] for rule in (0, 1, 5))

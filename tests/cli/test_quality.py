@@ -93,6 +93,7 @@ def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: P
         assert json.loads(work.row_file.read_text())["key"] != key
 
 
+@pytest.mark.slow
 def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(data: Path, bundle: Path, tmp_path: Path) -> None:
     command = ["bench", "quality", str(data), "--input", "truth", "--baseline", "small", "--pictures", "0", "--out", str(tmp_path)]
     assert run_command([*command, "--fixer", f"identity,small={bundle}"]) == 0

@@ -26,7 +26,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"view .*--serve", "goes on until it is stopped; tests/viewer/test_view_server.py asks it"),
     (
         r"^serve|127\.0\.0\.1:|can://|scene\.usdz",
-        "needs a service, a bus or a scene of the reader's, or goes on until it is stopped; tests/alpasim and tests/control run each",
+        "needs a service or a bus, or goes on until it is stopped: test_service_commands.py beside this file; AlpaSim's own: tests/alpasim",
     ),
     (r"--executor |s3://|/nfs/", "needs a cluster or a store of the reader's; tests/runtime/test_ray.py and its siblings run them"),
     (r"exec:docker|driver\.py", "needs a container or a driver of the reader's"),

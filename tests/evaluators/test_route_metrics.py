@@ -129,7 +129,7 @@ def is_ambiguous(path, point):
 def test_progress_so_far_is_the_same_in_blocks(monkeypatch):
     points = np.cumsum(np.ones((50, 2)), axis=0)
     whole = progress_so_far(points, points * 0.9)
-    monkeypatch.setattr("evaluators.route._MAX_CELLS", 120)
+    monkeypatch.setattr("evaluators.route._ROWS", 3)
     np.testing.assert_array_equal(progress_so_far(points, points * 0.9), whole)
 
 

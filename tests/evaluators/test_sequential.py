@@ -1,4 +1,4 @@
-"""Sequential decisions: e-processes under the null by exact enumeration, against plain loops on hard cases, and what follows from them."""
+"""Sequential decisions: e-processes under the null by exact enumeration, against plain loops on hard cases."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import optimize
 
 from alpasim_plugin.errors import InputError
-from evaluators.sequential import asymptotic, betting
+from evaluators.sequential import asymptotic, betting, line
 from evaluators.sequential.control import RIDGE, Control, adjusted_draws, of_families, of_rows, predictions
-from evaluators.sequential.decision import outcome_of, state_after
 from evaluators.sequential.draws import Draws, independent, without_replacement
+from evaluators.sequential.line import relative_slope
 from evaluators.sequential.multiplicity import closed, closed_by_sets
-from evaluators.sequential.plan import AT_RISK, LOG_SHARES, MULTIPLES, Plan
-from evaluators.sequential.question import Question, metric_question
+from evaluators.sequential.plan import LEAST_SLOPE, USUAL_SLOPE, Plan
+from evaluators.sequential.question import metric_question
 
 PLAN = Plan(0.1, 50, 0.05)
 
@@ -31,17 +32,64 @@ def capital(draws: Draws, mean: float, plan: Plan = PLAN) -> np.ndarray:
     return np.exp(betting.log_capital(draws, mean, betting.bet_sizes(draws, mean, plan)))
 
 
+def log_chance(gap: float, left: float, slope: float) -> float:
+    """Siegmund (1985), equation 3.15, as it stands."""
+    normal = [0.5 * math.erfc(-at / math.sqrt(2 * left)) for at in (-gap - slope * left, slope * left - gap)]
+    return math.log(normal[0] + math.exp(-2 * slope * gap) * normal[1])
+
+
 def plain_log_capital(x: Sequence[float], low: float, high: float, mean: float, plan: Plan) -> list[float]:
-    """Bet scene by scene, as the module's text says."""
-    squares, parts, out = betting.PRIOR_SCENES * (betting.PRIOR_WIDTH * (high - low)) ** 2, [0.0] * len(MULTIPLES), []
+    """Bet scene by scene, as the modules' texts say."""
+    half = (high - low) / 2
+    imagined = betting.PRIOR_SCENES * (2 * betting.PRIOR_WIDTH * half) ** 2
+    squares, fourths, capital, out = imagined, imagined * half**2, 0.0, []
     for i, value in enumerate(x):
-        size = float(plan.rate(np.array(squares / (betting.PRIOR_SCENES + i))))
-        for k, (multiple, risk) in enumerate(zip(MULTIPLES, AT_RISK, strict=True)):
-            parts[k] += math.log1p(min(multiple * size, risk / (mean - low)) * (value - mean))
-        squares += (value - mean) ** 2
-        top = max(parts)
-        out.append(top + math.log(sum(math.exp(part - top + share) for part, share in zip(parts, LOG_SHARES, strict=True))))
+        spread = math.sqrt(squares / (betting.PRIOR_SCENES + i))
+        left = max(plan.horizon - i, 1) / plan.horizon
+        slope = USUAL_SLOPE if plan.distance is None else max(LEAST_SLOPE, plan.distance * math.sqrt(plan.horizon) / spread / 2)
+        relative = float(relative_slope(np.array(capital - plan.log_bar), np.array(slope * math.sqrt(left))))
+        wanted = relative / (spread * math.sqrt(left * plan.horizon))
+        tail = fourths / squares
+        bet = float(np.roots([tail, 0.0, 1.0, -wanted])[np.argmin(np.abs(np.roots([tail, 0.0, 1.0, -wanted]).imag))].real)
+        capital += math.log1p(min(bet, betting.AT_RISK / (mean - low)) * (value - mean))
+        squares, fourths = squares + (value - mean) ** 2, fourths + (value - mean) ** 4
+        out.append(capital)
     return out
+
+
+# --- the line -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gap", "left", "slope"), [(1.0, 1.0, 0.0), (0.01, 0.5, 1.4), (9.0, 1.0, 0.5), (0.3, 0.002, 1.0), (2.0, 1.0, 9.0)])
+def test_the_chance_of_reaching_a_line_is_that_of_the_formula(gap, left, slope):
+    assert float(line.log_chance(np.array(gap), np.array(left), np.array(slope))) == pytest.approx(log_chance(gap, left, slope), rel=1e-9)
+
+
+def test_the_chance_is_a_martingale_of_brownian_motion_and_begins_at_alpha():
+    """Over a step of 0.3, by integrating the density of a motion that does not reach the line on the way."""
+    slope, gap, step = 1.2, 0.8, 0.3
+    assert float(np.exp(line.log_chance(line.height(np.array(slope), 0.05), np.array(1.0), np.array(slope)))) == pytest.approx(0.05)
+    assert line.log_evidence(np.array([-0.2, 3.0, 0.0]), np.array([0.1, 0.2, 0.3]), np.array([1.2]), 0.05)[1] > -math.log(0.05)
+    w = np.linspace(-8.0, gap + slope * step, 200_001)
+    # the density at w of a motion that stays below the line (Siegmund 1985, equation 3.14)
+    stays = 1.0 - np.exp(-2.0 * gap * (gap + slope * step - w) / step)
+    density = stays * np.exp(-(w**2) / (2 * step)) / math.sqrt(2 * math.pi * step)
+    later = np.exp(line.log_chance(gap + slope * step - w, np.full_like(w, 0.7), np.array(slope)))
+    reached = 1.0 - np.trapezoid(density, w)
+    now = float(np.exp(line.log_chance(np.array(gap), np.array(1.0), np.array(slope))))
+    assert reached + np.trapezoid(density * later, w) == pytest.approx(now, rel=1e-6)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.33, 1.4, 4.05, 9.7, 25.0])
+def test_the_table_of_bets_is_the_derivative_of_the_chance(slope):
+    for gap in (1e-3, 0.2, 1.0, 2.0, 5.0):
+        log_p = log_chance(gap, 1.0, slope)
+        if log_p < -40.0:
+            continue
+        h = 1e-5
+        exact = (log_chance(gap - h, 1.0, slope) - log_chance(gap + h, 1.0, slope)) / (2 * h)
+        assert float(relative_slope(np.array(log_p), np.array(slope))) == pytest.approx(exact, rel=3e-3)
+    assert float(relative_slope(np.array(0.0), np.array(slope))) == 2.0 * slope  # past the line, Wald's test
 
 
 # --- betting ------------------------------------------------------------------------------------------------------------
@@ -113,14 +161,15 @@ HARD = {
     "at the bounds": np.array([1.0, -1.0] * 30),
     "the least value each time": np.full(60, -1.0),
     "the greatest value each time": np.ones(60),
-    "ten thousand scenes": rng(1).choice([-1.0, 0.0, 1.0], 10_000, p=[0.03, 0.94, 0.03]),
+    "a thousand scenes": rng(1).choice([-1.0, 0.0, 1.0], 1000, p=[0.03, 0.94, 0.03]),
 }
 
 
 @pytest.mark.parametrize("case", HARD)
 @pytest.mark.parametrize("distance", [0.05, None])
 def test_the_capital_is_that_of_betting_scene_by_scene(case, distance):
-    x, plan = HARD[case], Plan(distance, 200, 0.05)
+    x = HARD[case]
+    plan = Plan(distance, max(50, len(x)), 0.05)
     draws = independent(x, -1.0, 1.0)
     found = betting.log_capital(draws, 0.05, betting.bet_sizes(draws, 0.05, plan))
     assert found == pytest.approx(plain_log_capital(list(x), -1.0, 1.0, 0.05, plan), rel=1e-9, abs=1e-9)
@@ -153,20 +202,21 @@ def test_a_suite_whose_scenes_left_cannot_make_up_for_it_is_refuted_at_once():
 def plain_log_evidence(x: Sequence[float], mean: float, plan: Plan, first: int) -> list[float]:
     from scipy import stats
 
-    out, rate = [], 0.0
+    out, slope, height, is_past = [], 0.0, 0.0, False
     for n in range(1, len(x) + 1):
         spread = max(float(np.std(x[:n], ddof=1)) if n > 1 else 0.0, asymptotic.LEAST_SPREAD * (plan.distance or 0.0))
         if n < first:
             out.append(-math.inf)
             continue
-        rate = rate or float(plan.rate(np.array(spread**2))) * spread
+        slope = slope or float(plan.slope(np.array(spread)))
+        height = height or optimize.brentq(lambda a: log_chance(a, 1.0, slope) + plan.log_bar, 0.1, 9.0)  # noqa: B023 (used at once)
         t = (float(np.mean(x[:n])) - mean) * math.sqrt(n) / spread
         z = -math.copysign(1.0, t) * stats.norm.ppf(stats.t.cdf(-abs(t), n - 1))
-        parts = [
-            share + m * rate * z * math.sqrt(n) - (m * rate) ** 2 * n / 2
-            for m, share in zip(asymptotic.MULTIPLES, asymptotic.LOG_SHARES, strict=True)
-        ]
-        out.append(max(parts) + math.log(sum(math.exp(part - max(parts)) for part in parts)))
+        time = n / plan.horizon
+        gap = height + slope * time - z * math.sqrt(time)
+        is_past = is_past or gap <= 0.0
+        below = log_chance(gap, 1.0 - time, slope) if gap > 0.0 and time < 1.0 else -math.inf
+        out.append((-2 * slope * gap if is_past else below) + plan.log_bar)
     return out
 
 
@@ -266,97 +316,3 @@ def test_an_earlier_run_gives_differences_and_difficulty_and_must_hold_half_of_t
     assert found.features["c"] == pytest.approx((-0.1, 0.7))  # not there: the mean
     with pytest.raises(InputError, match="2 of 5 scenes"):
         of_rows(rows, "progress", list("abcde"), "3dgs", "clean", "runs/old")
-
-
-# --- decisions ----------------------------------------------------------------------------------------------------------
-
-
-def asked(*metrics: tuple[str, float], **fields) -> Question:
-    return Question(tuple(metric_question(name, margin, "non-inferior") for name, margin in metrics), **fields)
-
-
-def test_a_decision_stays_and_intervals_only_shrink_however_often_one_looks():
-    question = asked(("collision_any", 0.2), ("lateral_distance_m", 0.2))
-    values = {"collision_any": np.zeros(80), "lateral_distance_m": rng(8).normal(0.0, 0.2, 80)}
-    states = [state_after(question, {name: x[:n] for name, x in values.items()}, 80) for n in range(5, 81, 5)]
-    answers = [state.answer for state in states]
-    assert answers[0] == "open"
-    assert answers[-1] == "good"
-    assert answers == sorted(answers, key=["open", "good"].index)
-    for k in range(2):
-        ends = np.array([[np.nan if end is None else end for end in state.metrics[k].interval] for state in states])
-        ends = ends[np.isfinite(ends).all(axis=1)]
-        assert np.all(np.diff(ends[:, 0]) >= -1e-9)
-        assert np.all(np.diff(ends[:, 1]) <= 1e-9)
-
-
-@pytest.mark.parametrize(("shift", "answer", "word"), [(0.0, "good", "non-inferior"), (0.5, "bad", "worse")])
-def test_a_metric_without_a_better_side_is_judged_by_the_size_of_the_change(shift, answer, word):
-    for sign in (1.0, -1.0):
-        state = state_after(asked(("lateral_bias_m", 0.2)), {"lateral_bias_m": sign * shift + rng(9).normal(0.0, 0.2, 60)}, 60)
-        assert (state.answer, state.metrics[0].answer) == (answer, word)
-
-
-def test_higher_is_better_turns_the_sign_of_what_is_printed_only():
-    gone = state_after(asked(("progress", 0.1)), {"progress": np.full(60, 0.5)}, 100)  # positive is worse: half of the progress is lost
-    assert gone.answer == "bad"
-    assert gone.metrics[0].diff == pytest.approx(-0.5)
-    low, high = gone.metrics[0].interval
-    assert -1.0 <= low < -0.5 < high < -0.1
-
-
-def test_one_metric_that_is_worse_decides_and_one_that_need_not_decide_does_not_hold_up():
-    x = rng(10).normal(0.0, 0.05, 60)
-    rare = metric_question("offroad", 0.05, "non-inferior", binding=False)
-    question = Question((metric_question("lateral_distance_m", 0.1, "non-inferior"), rare))
-    open_rare = state_after(question, {"lateral_distance_m": x, "offroad": np.zeros(60)[:60]}, 60)
-    assert (open_rare.answer, open_rare.metrics[1].answer) == ("good", "undecided")
-    both = Question((metric_question("lateral_distance_m", 0.1, "non-inferior"), metric_question("offroad", 0.05, "non-inferior")))
-    bad = state_after(both, {"lateral_distance_m": x, "offroad": np.array([0.0, 1.0, 1.0] * 20)}, 60)
-    assert bad.answer == "bad"
-    assert outcome_of(both, bad, "").exit_code == 1
-    assert outcome_of(both, bad, "").reasons == ("offroad is worse",)
-
-
-def test_scenes_without_a_pair_leave_the_evidence_as_it_was():
-    x = rng(11).choice([-1.0, 0.0, 1.0], 40, p=[0.05, 0.9, 0.05])
-    holed = x.copy()
-    holed[[3, 17, 39]] = np.nan
-    question = asked(("offroad", 0.1))
-    with_holes, without = state_after(question, {"offroad": holed}, 60), state_after(question, {"offroad": np.delete(x, [3, 17, 39])}, 60)
-    assert with_holes.metrics[0].n_scenes == 37
-    assert with_holes.metrics[0] == without.metrics[0]
-
-
-def test_a_suite_that_is_driven_whole_is_decided_by_its_mean():
-    question = asked(("offroad", 0.1), population="suite")
-    for changed, answer in ((1, "good"), (2, "good"), (3, "bad")):  # 5, 10 and 15 % of 20 scenes
-        x = np.zeros(20)
-        x[[3, 9, 19][-changed:]] = 1.0
-        state = state_after(
-            question, {"offroad": x}, 20, {"offroad": adjusted_draws(x, question.metrics[0], [str(i) for i in range(20)], None)}
-        )
-        assert state.answer == answer
-        assert state.metrics[0].interval == pytest.approx((changed / 20, changed / 20))
-
-
-def test_no_decision_falls_before_the_fewest_scenes_and_none_on_nothing():
-    question = asked(("lateral_distance_m", 0.1), first_look=5, min_scenes=30)
-    x = np.full(40, -1.0)
-    assert [state_after(question, {"lateral_distance_m": x[:n]}, 40).answer for n in (29, 30)] == ["open", "good"]
-    nothing = state_after(question, {"lateral_distance_m": np.full(4, np.nan)}, 40)
-    assert (nothing.answer, nothing.metrics[0].diff, nothing.metrics[0].interval) == ("open", None, (None, None))
-
-
-@pytest.mark.parametrize(
-    ("make", "found"),
-    [
-        (lambda: metric_question("lateral_bias_m", None, "better"), "no better side"),
-        (lambda: metric_question("lateral_bias_m", 0.0, "non-inferior"), "a margin of 0"),
-        (lambda: metric_question("progress", -0.1, "non-inferior"), "not a number from 0 up"),
-        (lambda: metric_question("lateral_distance_m", 0.1, "non-inferior", method="betting"), "no bounds"),
-    ],
-)
-def test_questions_without_an_answer_are_refused(make, found):
-    with pytest.raises(InputError, match=found):
-        make()

@@ -103,6 +103,7 @@ def test_the_bar_and_the_headings_use_the_same_names(usual_run: Path, usual_page
     assert len(bar) >= 8
 
 
+@pytest.mark.slow
 def test_hashes_have_the_width_of_their_column(usual_run: Path) -> None:
     run = read_run(usual_run)
     text = html.render_report(dataclasses.replace(run, info={**run.info, "weights": {"/a/long/path/to/generator.safetensors": "ab" * 32}}))
@@ -114,7 +115,7 @@ def test_hashes_have_the_width_of_their_column(usual_run: Path) -> None:
 def test_verdict_comes_first(usual_run: Path, usual_page: Page) -> None:
     page = usual_page
     heads = ["Results", "Paired differences", "Changed outcomes", "Over time", "What the camera saw", "From above", "Scene by scene"]
-    heads += ["By distance and by opacity", "Speed", "Failures", "Not in the numbers", "Repeatability", "Provenance"]
+    heads += ["Every rollout", "By distance and by opacity", "Speed", "Failures", "Not in the numbers", "Repeatability", "Provenance"]
     assert re.findall(r"<h2>([^<]*)</h2>", (usual_run / "report.html").read_text()) == heads
     assert page.text.index("3dgs drives worse than clean") < page.text.index("One value per rollout")
     assert page.tags.index("h1") < page.tags.index("table")

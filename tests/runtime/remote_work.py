@@ -18,7 +18,8 @@ DAY_S = 86_400
 class Scripted:
     """Do what the item says, and note in a folder that all nodes see which node did it, and which day it is there.
 
-    Items: ``sleep S``, ``die``, ``die once``, ``raise``, ``fetch SHA256``, ``late S`` (slow only the first time).
+    Items: ``sleep S``, ``die``, ``die once``, ``raise``, ``fetch SHA256``, ``late S`` (slow only the first time), ``hold`` (until
+    there is a note ``go``).
     """
 
     notes: Path
@@ -31,6 +32,8 @@ class Scripted:
         words = item.split("#")[0].split()
         if words[0] == "sleep" or (words[0] == "late" and seen == 0):
             time.sleep(float(words[1]))
+        while words[0] == "hold" and not (self.notes / "go").exists():
+            time.sleep(0.05)
         if words[0] == "die" and (len(words) == 1 or seen == 0):
             os.kill(os.getpid(), signal.SIGKILL)
         if words[0] == "raise":

@@ -208,8 +208,24 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
     assert "at every look, margin 60): non-inferior after 2 scenes" in out
     assert "PASS (exit code 0)" in out
     assert (tmp_path / "run" / "gate.md").read_text().startswith("## Gate: PASS")
+    # The same with the earlier run as the baseline: only the change is driven, onto the same decision.
+    alone = [str(tmp_path / "alone") if word == str(tmp_path / "run") else DARKER if word == f"{GREY},{DARKER}" else word for word in words]
+    gate.write_text(gate.read_text() + f"baseline: {GREY}\n")
+    assert run_command([*alone, "--baseline-file", str(tmp_path / "run")]) == 0
+    assert "PASS (exit code 0)" in capsys.readouterr().out
+    both, one = (read_decision(tmp_path / name) for name in ("run", "alone"))
+    assert (both["rollouts"], one["rollouts"]) == (4, 2)
+    assert [look["metrics"] for look in one["looks"]] == [look["metrics"] for look in both["looks"]]
+    assert one["baseline"] == f"{GREY} of {tmp_path / 'run'}"
+    assert run_command([*alone, "--scenes", "smoke/lead_car", "--baseline-file", str(tmp_path / "run")]) == 2
+    assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().err
+    assert run_command([*words, "--baseline-file", str(tmp_path / "run")]) == 2
+    assert "2 renderers beside a stored baseline" in capsys.readouterr().err
     assert run_command(["gate", str(tmp_path / "run"), "--scenes", "smoke/curve"]) == 2
     assert run_command(["gate", str(tmp_path / "run"), "--until-decided"]) == 2
+    capsys.readouterr()
+    assert run_command(["gate", str(tmp_path / "run"), "--executor", "ray", "--store", "here"]) == 2
+    assert "with: --executor, --store" in capsys.readouterr().err
 
 
 @pytest.mark.slow

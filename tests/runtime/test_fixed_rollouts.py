@@ -245,7 +245,8 @@ class BothWays(Watching):
     sensors: Sequence[SensorSpec] = (SensorSpec("front"), SensorSpec("rear"))
 
 
-@pytest.mark.parametrize("mode", first_of(["chunk", "speculative"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["chunk", "speculative"])
 def test_cameras_in_step_share_a_fixer_and_not_their_histories(straight_road: Scenario, mode: str) -> None:
     scenario = with_rear_camera(straight_road)
     run = drive(scenario, BothWays, mode=mode)

@@ -10,9 +10,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,51 +21,21 @@ from alpasim_plugin.runtime.executors.choice import Executor
 from alpasim_plugin.runtime.executors.dispatch import dispatch
 from alpasim_plugin.runtime.executors.identity import identity_of
 from alpasim_plugin.runtime.executors.placing import Contents
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
-from alpasim_plugin.runtime.run import RunResult, execute_run
+from alpasim_plugin.runtime.plan import RunOptions, make_plan
+from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.workers import Lost
 from scenarios.suite import expand
+from tests.runtime.cluster_nodes import Nodes, on
 from tests.runtime.grey_renderer import GREY
+from tests.runtime.on_ray import pool_on, run, scripted
 from tests.runtime.remote_work import Scripted
 from tests.runtime.test_runs import SHORT, Heard, cheap_plan, comparable, plan_of
 
 pytest.importorskip("ray", reason="the extra [ray] is not installed")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
 
-SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
-
-
-def patiently(start: Callable[[], Any]) -> Any:
-    """Start a node; Ray gives one 30 s to come up, which a busy machine may exceed."""
-    for _ in range(3):
-        try:
-            return start()
-        except Exception as error:
-            if "timed out during startup" not in str(error):
-                raise
-    return start()
-
-
-class Nodes:
-    """A cluster on this machine, a core a node; its raylets can be killed."""
-
-    def __init__(self, number: int) -> None:
-        from ray.cluster_utils import Cluster
-
-        head = {"num_cpus": 1, "include_dashboard": False, "_system_config": SYSTEM}
-        self.cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
-        for _ in range(number - 1):
-            self.add()
-
-    @property
-    def address(self) -> str:
-        return str(self.cluster.address)
-
-    def add(self, **more: Any) -> Any:
-        return patiently(lambda: self.cluster.add_node(num_cpus=1, **more))
-
-    def close(self) -> None:
-        self.cluster.shutdown()
+GIB = 2**30
+PATIENCE_S = 30.0  # for workers that do start, on a busy machine
 
 
 @pytest.fixture(scope="module")
@@ -74,27 +43,6 @@ def three() -> Iterator[Nodes]:
     nodes = Nodes(3)
     yield nodes
     nodes.close()
-
-
-def on(nodes: Nodes) -> Executor:
-    return Executor("ray", nodes.address)
-
-
-def run(plan: RunPlan, root: Path, executor: Executor, **more: Any) -> tuple[RunResult, Heard]:
-    heard = Heard()
-    result = execute_run(plan, root, None, ["simrun"], heard, certificate="none", report=False, executor=executor, **more)
-    return result, heard
-
-
-def scripted(nodes: Nodes, work: Scripted, items: list[str], contents: Contents | None = None, limit_s: float | None = None) -> dict:
-    from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
-
-    with connected(nodes.address):
-        pool: RayPool[str] = RayPool(work, contents or Contents(), identity_of(()), (), Resources(), 8, print)
-        try:
-            return dict(dispatch(pool, items, print, limit_s))
-        finally:
-            pool.close()
 
 
 @pytest.fixture(scope="module")
@@ -148,19 +96,13 @@ def test_a_raylet_that_is_killed_loses_nothing(tmp_path: Path, three: Nodes) -> 
     doomed = three.add()
     raylet = doomed.all_processes["raylet"][0].process.pid
     items = [f"sleep 0.5 #{i}" for i in range(24)]
-    from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
-
     found = {}
-    with connected(three.address):
-        pool: RayPool[str] = RayPool(Scripted(tmp_path), Contents(), identity_of(()), (), Resources(), 8, print)
-        try:
-            for item, got in dispatch(pool, items, print):
-                found[item] = got
-                if len(found) >= 4 and raylet and any(doomed.node_id[:8] in name for name in pool.nodes()):
-                    os.kill(raylet, signal.SIGKILL)
-                    raylet = 0
-        finally:
-            pool.close()
+    with pool_on(three, Scripted(tmp_path)) as pool:
+        for item, got in dispatch(pool, items, print):
+            found[item] = got
+            if len(found) >= 4 and raylet and any(doomed.node_id[:8] in name for name in pool.nodes()):
+                os.kill(raylet, signal.SIGKILL)
+                raylet = 0
     three.cluster.worker_nodes.discard(doomed)
     assert raylet == 0, "the node was never used"
     assert found == {item: item.upper() for item in items}
@@ -181,20 +123,121 @@ def test_a_node_with_another_version_is_refused_by_name(tmp_path: Path, three: N
 
 
 def test_no_node_of_the_right_version_is_an_error_that_names_it(tmp_path: Path) -> None:
-    from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
+    with (
+        pool_on(None, Scripted(tmp_path), expected={**identity_of(()), "scipy": "0.0.1"}) as pool,
+        pytest.raises(InfrastructureError, match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1"),
+    ):
+        dict(dispatch(pool, ["a"], print))
 
-    with connected(None):
-        pool: RayPool[str] = RayPool(Scripted(tmp_path), Contents(), {**identity_of(()), "scipy": "0.0.1"}, (), Resources(), 8, print)
-        with pytest.raises(InfrastructureError, match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1"):
+
+def test_a_straggler_is_done_again_on_another_node(tmp_path: Path, three: Nodes) -> None:
+    items = ["late 3000", *[f"sleep 0.2 #{i}" for i in range(20)]]
+    found = scripted(three, Scripted(tmp_path), items)
+    assert found == {item: item.upper() for item in items}
+    first, second = (note.read_text().split()[0] for note in tmp_path.glob("late*"))
+    assert first != second
+
+
+def test_workers_go_where_what_they_declare_is(tmp_path: Path, three: Nodes) -> None:
+    large = three.add(num_cpus=4, num_gpus=1, memory=3 * GIB)
+    for resources, workers in ((Resources(1, gpus=0.5), 2), (Resources(1, memory_gib=1.0, gpus=0.1), 3), (Resources(2), 2)):
+        with pool_on(three, Scripted(tmp_path), resources=resources) as pool:
+            until = time.monotonic() + 120
+            while len(pool.free()) < workers:
+                assert time.monotonic() < until, resources
+                pool.wait(0.2)
+            seen_until = time.monotonic() + 5
+            while time.monotonic() < seen_until:
+                assert len(places := pool.free()) == workers, resources
+                pool.wait(0.5)
+            assert all(large.node_id[:8] in place.node for place in places), resources
+            assert len(pool.nodes()) == 1
+    three.cluster.remove_node(large)
+
+
+def test_more_than_any_node_has_is_an_error_that_says_so(tmp_path: Path, three: Nodes) -> None:
+    with pool_on(three, Scripted(tmp_path), resources=Resources(64)) as pool, pytest.raises(InfrastructureError) as caught:
+        dict(dispatch(pool, ["a"], print))
+    assert "cores=64" in caught.value.with_what
+    assert "no node has that much" in caught.value.found
+
+
+HANGING = """
+import sys, time
+if any(word.endswith("default_worker.py") for word in sys.orig_argv):
+    time.sleep(3600)
+"""
+
+
+def test_a_node_that_starts_no_process_is_set_aside_and_others_do_its_work(
+    tmp_path: Path, three: Nodes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(HANGING)
+    stuck = three.add(num_cpus=2, env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"})
+    (tmp_path / "notes").mkdir()
+    items = [f"sleep 0.5 #{i}" for i in range(12)]
+    with pool_on(three, Scripted(tmp_path / "notes"), start_s=PATIENCE_S) as pool:
+        assert dict(dispatch(pool, items, print)) == {item: item.upper() for item in items}
+        said, until = "", time.monotonic() + 10 * PATIENCE_S
+        while " is set aside: " not in said:
+            assert time.monotonic() < until, said
+            pool.free()
+            pool.wait(0.5)
+            said += capsys.readouterr().out
+        assert len(pool.nodes()) == 3
+    three.cluster.remove_node(stuck)
+    aside = [line for line in said.splitlines() if "set aside" in line]
+    assert len(aside) == 1
+    assert f"/{stuck.node_id[:8]} is set aside: no process has started there within {PATIENCE_S:g} s" in aside[0]
+
+
+def test_an_only_node_whose_worker_is_never_ready_is_an_error_that_names_it(tmp_path: Path) -> None:
+    versions = tmp_path / "site" / "scipy-0.0.1.dist-info"
+    versions.mkdir(parents=True)
+    os.mkfifo(versions / "METADATA")  # reading it never ends, as on a file system that does not answer
+    one = Nodes(1, env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"})
+    head = str(one.cluster.head_node.node_id)
+    try:
+        with pool_on(one, Scripted(tmp_path), start_s=PATIENCE_S) as pool, pytest.raises(InfrastructureError) as caught:
             dict(dispatch(pool, ["a"], print))
-        pool.close()
+    finally:
+        one.close()
+    assert caught.value.doing == "working on a Ray cluster"
+    assert f"/{head[:8]}: its worker has started, but was not ready within {PATIENCE_S:g} s" in caught.value.found
+    assert "file systems of these nodes" in caught.value.do_this
+
+
+def test_a_node_whose_core_another_driver_holds_is_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import ray
+
+    one = Nodes(1)
+    try:
+        with pool_on(one, Scripted(tmp_path), start_s=PATIENCE_S) as pool:
+            holder = ray.remote(num_cpus=1)(Holder).remote()
+            ray.get(holder.held.remote())
+            began, said = time.monotonic(), ""
+            while time.monotonic() < began + 2.5 * PATIENCE_S:
+                assert not pool.free()
+                pool.wait(0.5)
+                said += capsys.readouterr().out
+            assert "others may hold its cores" in said
+            assert " is set aside" not in said
+            ray.kill(holder)
+            assert dict(dispatch(pool, ["a"], print)) == {"a": "A"}
+    finally:
+        one.close()
+
+
+class Holder:
+    """Another driver's worker."""
+
+    def held(self) -> None:
+        """Answer."""
 
 
 def test_stopping_ends_the_workers_and_removes_what_they_left(tmp_path: Path, three: Nodes) -> None:
-    from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
-
-    with connected(three.address):
-        pool: RayPool[str] = RayPool(Scripted(tmp_path), Contents(), identity_of(()), (), Resources(), 8, print)
+    with pool_on(three, Scripted(tmp_path)) as pool:
         outcomes = dispatch(pool, ["a", "sleep 100 #1", "sleep 100 #2"], print)
         assert next(outcomes)[0] == "a"
         until = time.monotonic() + 30
@@ -278,7 +321,7 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     disk.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)], check=False, capture_output=True)
     if mounted.returncode:
-        pytest.skip("mounting needs root")
+        pytest.skip(f"cannot mount a tiny disk: {mounted.stderr.decode().strip()}")
     yield disk
     subprocess.run(["umount", "--lazy", str(disk)], check=True)
 

@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.runtime.executors.assignment import assignment_as_here
 from alpasim_plugin.runtime.executors.base import Resources
 from alpasim_plugin.runtime.executors.choice import Executor
 from alpasim_plugin.runtime.executors.dispatch import dispatch
@@ -26,7 +28,7 @@ from tests.runtime.remote_work import Scripted
 from tests.runtime.test_runs import Heard, cheap_plan, comparable
 
 pytest.importorskip("submitit", reason="the extra [slurm] is not installed")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
 
 
 def scripted(
@@ -34,7 +36,8 @@ def scripted(
 ) -> dict:
     from alpasim_plugin.runtime.executors.slurm_pool import SlurmPool
 
-    pool: SlurmPool[str] = SlurmPool(work, contents or Contents(), expected or identity_of(()), (), Resources(), 2, "@local", folder, print)
+    given = assignment_as_here(work, contents or Contents(), (), Resources(), 2, print)
+    pool: SlurmPool[str] = SlurmPool(given if expected is None else replace(given, expected=expected), "@local", folder)
     try:
         return dict(dispatch(pool, items, print))
     finally:
@@ -74,7 +77,7 @@ import sys
 from pathlib import Path
 from tests.runtime.remote_work import Scripted
 from tests.runtime.test_slurm import scripted
-scripted(Scripted(Path(sys.argv[1])), ["a", "b", "sleep 300"], Path(sys.argv[2]))
+scripted(Scripted(Path(sys.argv[1])), ["hold", "sleep 300"], Path(sys.argv[2]))
 """
 
 
@@ -85,20 +88,23 @@ def test_a_killed_driver_leaves_results_that_the_next_one_takes_over(
     driver = subprocess.Popen(
         [sys.executable, "-c", DRIVER, str(notes), str(tmp_path)], cwd=repo, env={**os.environ, "PYTHONPATH": str(repo)}
     )
-    until = time.monotonic() + 120
-    while not list(notes.glob("sleep*")):
-        assert time.monotonic() < until
-        time.sleep(0.1)
-    driver.send_signal(signal.SIGSTOP)  # results from here on are not taken
+
+    def until(there: Callable[[], object], what: str) -> None:
+        end_s = time.monotonic() + 120
+        while not there():
+            assert time.monotonic() < end_s, what
+            time.sleep(0.1)
+
+    until(lambda: list(notes.glob("hold.*")) and list(notes.glob("sleep*")), "two jobs run")
     job = int(next(notes.glob("sleep*")).name.split(".")[-2])
     driver.kill()
     driver.wait()
     assert Path("/proc", str(job)).exists(), "a job of Slurm outlives its driver"
-    found = scripted(Scripted(notes), ["a", "b", "c"], tmp_path)
-    assert found == {"a": "A", "b": "B", "c": "C"}
-    assert "1 of its jobs are cancelled" in capsys.readouterr().out
-    until = time.monotonic() + 30
-    while Path("/proc", str(job)).exists():
-        assert time.monotonic() < until, "the job was not cancelled"
-        time.sleep(0.1)
+    (notes / "go").touch()
+    until(lambda: list(tmp_path.glob(".slurm/*/*_result.pkl")), "the job that was let go leaves its result")
+    found = scripted(Scripted(notes), ["hold", "c"], tmp_path)
+    assert found == {"hold": "HOLD", "c": "C"}
+    assert len(list(notes.glob("hold.*"))) == 1, "it was done once, by the job of the killed driver"
+    assert "1 of its results are taken over, 1 of its jobs are cancelled" in capsys.readouterr().out
+    until(lambda: not Path("/proc", str(job)).exists(), "the other job is cancelled")
     assert list(tmp_path.iterdir()) == [notes]

@@ -102,7 +102,7 @@ def nodes_in_view(spheres, poses, camera):
     kept = np.empty(spheres.shape[0], np.int64)
     count = 0
     for i in range(spheres.shape[0]):
-        if not bundle_is_out_of_view(spheres[i], 0, poses[i], camera):
+        if not bundle_is_out_of_view(spheres[i], np.int64(0), poses[i], camera):
             kept[count] = i
             count += 1
     return kept[:count]
@@ -285,5 +285,7 @@ def project_node(cursor, means, geometry, sh, sh_size, index, spheres, first_id,
                 kept_ids[count] = index[group * 16 + lane] + first_id
                 count += 1
         out = v.fetch_add(cursor, 1, count)
-        records[out * RECORD : (out + count) * RECORD] = kept[: count * RECORD]
-        ids[out : out + count] = kept_ids[:count]
+        for i in range(count * RECORD):  # no slices: numba would compile the text of an error about their shapes for seconds
+            records[out * RECORD + i] = kept[i]
+        for i in range(count):
+            ids[out + i] = kept_ids[i]

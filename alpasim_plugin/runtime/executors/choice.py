@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.runtime.executors.base import Resources, Work
+from alpasim_plugin.runtime.executors.assignment import Assignment
+from alpasim_plugin.runtime.executors.base import Resources
 from alpasim_plugin.runtime.executors.dispatch import Pool
-from alpasim_plugin.runtime.executors.placing import Contents
 
 DOING = "choosing an executor"
 
@@ -69,38 +69,35 @@ def parse_executor(text: str, cores: int | None = None, gpus: float | None = Non
 
 
 @contextmanager
-def opened_pool(
-    executor: Executor,
-    work: Work[Any, Any],
-    contents: Contents,
-    targets: Sequence[str],
-    most: int,
-    folder: Path,
-    noticed: Callable[[str], None],
-) -> Iterator[Pool[Any]]:
+def kept_open(executor: Executor) -> Iterator[None]:
+    """Stay connected to the executor's cluster during the block, in which pools are opened several times."""
+    if executor.kind != "ray":
+        yield
+        return
+    from alpasim_plugin.runtime.executors.ray_pool import connected
+
+    with connected(executor.where or None):
+        yield
+
+
+@contextmanager
+def opened_pool(executor: Executor, assignment: Assignment[Any], folder: Path) -> Iterator[Pool[Any]]:
     """Open the pool of an executor that is not ``local`` for the block; at its end, however it ends, no worker is left.
 
     Args:
         executor: Which.
-        work: What its workers do.
-        contents: What the work may fetch.
-        targets: Modules of parts that are not simrun's (`alpasim_plugin.runtime.executors.identity.targets_of`).
-        most: Most workers.
+        assignment: What its workers do.
         folder: A folder that Slurm's nodes see.
-        noticed: Called with a line for whatever a person should know.
 
     Raises:
         InputError: Its library is not installed.
         InfrastructureError: There is no cluster.
     """
-    from alpasim_plugin.runtime.executors.identity import identity_of
-
-    expected = identity_of(targets)
     if executor.kind == "ray":
         from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
 
         with connected(executor.where or None):
-            pool: RayPool[Any] = RayPool(work, contents, expected, targets, executor.resources, most, noticed)
+            pool: RayPool[Any] = RayPool(assignment)
             try:
                 yield pool
             finally:
@@ -108,7 +105,7 @@ def opened_pool(
         return
     from alpasim_plugin.runtime.executors.slurm_pool import SlurmPool
 
-    jobs: SlurmPool[Any] = SlurmPool(work, contents, expected, targets, executor.resources, most, executor.where, folder, noticed)
+    jobs: SlurmPool[Any] = SlurmPool(assignment, executor.where, folder)
     try:
         yield jobs
     finally:

@@ -8,16 +8,15 @@ import pickle
 import signal
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.optional import require_library
-from alpasim_plugin.runtime.executors.base import Resources, Work
+from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
-from alpasim_plugin.runtime.executors.placing import Contents
 from alpasim_plugin.runtime.executors.scratch import sweep
 from alpasim_plugin.runtime.executors.serving import Serving
 
@@ -27,24 +26,30 @@ DOING = "working on a Ray cluster"
 LOOK_S = 1.0  # between looks at the nodes
 BARREN_S = 60.0  # without any node before giving up
 FAILED_STARTS = 3  # of workers on a node that never had one
+START_S = 300.0  # for a worker to start, and again for it to compare versions and take the work
 AGAIN_S = 2.0  # after a failed start
 HELD_CONTENTS = 256  # references that the driver keeps, so that a scene is sent once for all its rollouts
 SWEEP_S = 20.0  # that nodes may take to remove what killed workers left
 GIB = 2**30
+SAME_VERSIONS = "install the same versions on the nodes"
+LOOK_THERE = "look at Ray's logs and the file systems of these nodes, then give the same command again"
 
 
 @dataclass
 class _Worker:
     actor: Any
     node: str
+    begun: Any  # answered when its process runs
     ref: Any  # what it is asked: to accept the work, or to do items; None: idle
+    since_s: float  # when it was asked for, then when its process was seen to run
+    has_begun: bool = False
     pid: int = 0
     ready: bool = False
 
 
 @contextmanager
 def connected(address: str | None) -> Iterator[None]:
-    """Be connected to a Ray cluster during the block.
+    """Be connected to a Ray cluster during the block; one inside another stays with the outer's.
 
     Args:
         address: HOST:PORT of its head. None: the one that ``RAY_ADDRESS`` names or that runs on this machine; where there is none, one of
@@ -58,6 +63,10 @@ def connected(address: str | None) -> Iterator[None]:
     if address is not None and address.startswith("ray://"):
         do_this = "start simrun on a node of the cluster, with --executor ray"
         raise InputError("choosing an executor", f"--executor ray:{address}", "a Ray client cannot place workers on nodes", do_this)
+    if ray.is_initialized():
+        with _signals_as_raised():
+            yield
+        return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     held = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -76,46 +85,45 @@ def connected(address: str | None) -> Iterator[None]:
         for number, handler in held.items():  # Ray puts its own in place, which would end the run without a word
             signal.signal(number, handler)
     try:
-        yield
+        with _signals_as_raised():
+            yield
     finally:
         ray.shutdown()
+
+
+@contextmanager
+def _signals_as_raised() -> Iterator[None]:
+    """Raise what a signal's handler has raised: out of Ray's compiled code it comes as the cause of a `SystemError`."""
+    try:
+        yield
+    except SystemError as error:
+        if error.__cause__ is None or isinstance(error.__cause__, Exception):
+            raise
+        raise error.__cause__ from None
 
 
 class RayPool(Generic[A]):
     """Workers on a Ray cluster; see `alpasim_plugin.runtime.executors.dispatch.Pool`.
 
     Args:
-        work: The work.
-        contents: What it may fetch.
-        expected: `alpasim_plugin.runtime.executors.identity.identity_of` of the driver.
-        targets: As that function takes them.
-        resources: Of each worker.
-        most: Most workers.
-        noticed: Called with a line for whatever a person should know.
+        assignment: What the workers do.
+        start_s: Seconds for a worker to start, and again for it to be ready. A node that fails this without another worker is set aside.
     """
 
     chunk_s = 1.0
 
-    def __init__(
-        self,
-        work: Work[A, Any],
-        contents: Contents,
-        expected: Mapping[str, str],
-        targets: Sequence[str],
-        resources: Resources,
-        most: int,
-        noticed: Callable[[str], None],
-    ) -> None:
+    def __init__(self, assignment: Assignment[A], start_s: float = START_S) -> None:
         import ray
 
-        self._ray, self._work, self._contents = ray, work, contents
-        self._expected, self._targets, self._resources, self._most, self._noticed = dict(expected), targets, resources, most, noticed
-        self._blob = ray.put(pickle.dumps(work))
+        self._ray, self._given, self._start_s = ray, assignment, start_s
+        self._blob = ray.put(pickle.dumps(assignment.work))
         self._refs: OrderedDict[str, Any] = OrderedDict()
         self._workers: dict[int, _Worker] = {}
         self._next = 0
         self._events: list[Event] = []
         self._refused: dict[str, str] = {}  # node -> why
+        self._remedy = SAME_VERSIONS  # against the last refusal
+        self._pings: dict[str, tuple[Any, float]] = {}  # node -> a process there that needs no core, when it was asked for
         self._accepted: set[str] = set()
         self._failed: dict[str, tuple[int, float]] = {}  # node -> failed starts, time of the last
         self._ended: dict[str, list[int]] = {}  # node -> processes that were killed
@@ -140,7 +148,7 @@ class RayPool(Generic[A]):
 
     def start(self, worker: int, items: Sequence[A]) -> None:
         """Hand items to a free worker."""
-        needed = dict.fromkeys(sha256 for item in items for sha256 in self._work.needs(item))
+        needed = dict.fromkeys(sha256 for item in items for sha256 in self._given.work.needs(item))
         refs = {sha256: self._reference(sha256) for sha256 in needed}
         one = self._workers[worker]
         one.ref = one.actor.do.remote(pickle.dumps(list(items)), refs)
@@ -162,7 +170,8 @@ class RayPool(Generic[A]):
     def end(self, worker: int) -> None:
         """End a worker and what it does."""
         one = self._workers.pop(worker)
-        self._ended.setdefault(one.node, []).append(one.pid)
+        if one.ready and one.ref is not None:  # at work: it may have left something
+            self._ended.setdefault(one.node, []).append(one.pid)
         self._ray.kill(one.actor)
 
     def nodes(self) -> frozenset[str]:
@@ -171,10 +180,13 @@ class RayPool(Generic[A]):
 
     def set_aside(self, node: str, why: str) -> None:
         """Use a node no more."""
+        self._refuse(node, why, LOOK_THERE)
+
+    def _refuse(self, node: str, why: str, remedy: str) -> None:
         if node in self._refused:
             return
-        self._refused[node] = why
-        self._noticed(f"node {node} is set aside: {why}")
+        self._refused[node], self._remedy = why, remedy
+        self._given.noticed(f"node {node} is set aside: {why}")
         for number in [n for n, one in self._workers.items() if one.node == node]:
             if self._workers[number].ready and self._workers[number].ref is not None:
                 self._events.append(Died(number, node, "its node was set aside", of_node=True))
@@ -183,12 +195,8 @@ class RayPool(Generic[A]):
     def close(self) -> None:
         """End all workers, and remove what those that were at work have left on their nodes."""
         for number in list(self._workers):
-            busy = self._workers[number].ready and self._workers[number].ref is not None
-            node = self._workers[number].node
             self.end(number)
-            if not busy:
-                self._ended[node].pop()
-        sweeps = [self._sweep(node, pids) for node, pids in self._ended.items() if pids and node in self._ids]
+        sweeps = [self._sweep(node, pids) for node, pids in self._ended.items() if node in self._ids]
         if sweeps:
             self._ray.wait(sweeps, num_returns=len(sweeps), timeout=SWEEP_S)
 
@@ -203,7 +211,7 @@ class RayPool(Generic[A]):
     def _reference(self, sha256: str) -> Any:
         """Return Ray's reference to a content; Ray copies it to a node once, for all workers there."""
         if sha256 not in self._refs:
-            self._refs[sha256] = self._ray.put(self._contents.read(sha256))
+            self._refs[sha256] = self._ray.put(self._given.contents.read(sha256))
             while len(self._refs) > HELD_CONTENTS:
                 self._refs.popitem(last=False)
         self._refs.move_to_end(sha256)
@@ -214,20 +222,19 @@ class RayPool(Generic[A]):
         self._looked_s = now = time.monotonic()
         alive = {f"{node['NodeManagerHostname']}/{node['NodeID'][:8]}": node for node in self._ray.nodes() if node["Alive"]}
         self._ids = {name: node["NodeID"] for name, node in alive.items()}
+        self._end_overdue(now)
         room = {name: self._room(node["Resources"]) for name, node in alive.items() if name not in self._refused}
         self._usable = frozenset(name for name, workers in room.items() if workers)
         if alive:
             self._alive_s = now
         if alive and not room:
             found = "; ".join(f"{name}: {why}" for name, why in self._refused.items())
-            raise InfrastructureError(
-                DOING, "all of its nodes", f"no node takes the work: {found}", "install the same versions on the nodes"
-            )
+            raise InfrastructureError(DOING, "all of its nodes", f"no node takes the work: {found}", self._remedy)
         if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
             found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
-            raise InfrastructureError(DOING, str(self._resources), found, "ask for less (--cores, --gpus, --memory), or add nodes")
+            raise InfrastructureError(DOING, str(self._given.resources), found, "ask for less (--cores, --gpus, --memory), or add nodes")
         on = {name: sum(one.node == name for one in self._workers.values()) for name in room}
-        while len(self._workers) < self._most:
+        while len(self._workers) < self._given.most:
             open_ = [name for name in room if on[name] < room[name] and not self._rests(name, now)]
             if not open_:
                 return
@@ -235,13 +242,46 @@ class RayPool(Generic[A]):
             on[chosen] += 1
             self._open(chosen)
 
+    def _end_overdue(self, now_s: float) -> None:
+        """End workers that do not become ready, unless they wait for cores that another driver's workers hold."""
+        starting = {number: one for number, one in self._workers.items() if not one.ready}
+        new = {one.begun: one for one in starting.values() if not one.has_begun}
+        if new:
+            for ref in self._ray.wait(list(new), num_returns=len(new), timeout=0)[0]:
+                new[ref].has_begun, new[ref].since_s = True, now_s
+        for number, one in starting.items():
+            if number not in self._workers or now_s - one.since_s < self._start_s:
+                continue
+            if not one.has_begun and self._may_wait_for_cores(one.node, now_s):
+                one.since_s = now_s
+                continue
+            self.end(number)
+            if any(other.node == one.node and other.ready for other in self._workers.values()):
+                self._failed[one.node] = self._failed.get(one.node, (0, 0.0))[0] + 1, now_s
+            else:
+                what = "its worker has started, but was not ready" if one.has_begun else "no process has started there"
+                self._refuse(one.node, f"{what} within {self._start_s:g} s", LOOK_THERE)
+
+    def _may_wait_for_cores(self, node: str, now_s: float) -> bool:
+        """Tell whether a process that needs no core starts on a node where a worker does not; true until there was time to see."""
+        if node not in self._pings:
+            options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": self._on(node)}
+            self._pings[node] = self._ray.remote(_ping).options(**options).remote(), now_s
+            self._given.noticed(f"node {node} has started no worker for {self._start_s:g} s; others may hold its cores")
+            return True
+        ping, asked_s = self._pings[node]
+        if not self._ray.wait([ping], timeout=0)[0]:
+            return now_s - asked_s < self._start_s
+        del self._pings[node]  # if it stays so, the node is asked again: it may break later
+        return True
+
     def _room(self, held: Mapping[str, float]) -> int:
         """Return how many workers fit on a node."""
-        fits = [held.get("CPU", 0.0) / self._resources.cores]
-        if self._resources.gpus:
-            fits.append(held.get("GPU", 0.0) / self._resources.gpus)
-        if self._resources.memory_gib:
-            fits.append(held.get("memory", 0.0) / (self._resources.memory_gib * GIB))
+        fits = [held.get("CPU", 0.0) / self._given.resources.cores]
+        if self._given.resources.gpus:
+            fits.append(held.get("GPU", 0.0) / self._given.resources.gpus)
+        if self._given.resources.memory_gib:
+            fits.append(held.get("memory", 0.0) / (self._given.resources.memory_gib * GIB))
         return int(min(fits) + 1e-9)
 
     def _rests(self, node: str, now_s: float) -> bool:
@@ -249,17 +289,17 @@ class RayPool(Generic[A]):
         return times > 0 and now_s - last_s < AGAIN_S
 
     def _open(self, node: str) -> None:
-        memory = {"memory": int(self._resources.memory_gib * GIB)} if self._resources.memory_gib else {}
+        memory = {"memory": int(self._given.resources.memory_gib * GIB)} if self._given.resources.memory_gib else {}
         made = self._ray.remote(Serving).options(
-            num_cpus=self._resources.cores,
-            num_gpus=self._resources.gpus,
+            num_cpus=self._given.resources.cores,
+            num_gpus=self._given.resources.gpus,
             max_restarts=0,
             max_task_retries=0,
             scheduling_strategy=self._on(node),
             **memory,
         )
-        actor = made.remote(node, self._resources.cores, self._expected, self._targets)
-        self._workers[self._next] = _Worker(actor, node, actor.accept.remote(self._blob))
+        actor = made.remote(node, self._given.resources.cores, dict(self._given.expected), self._given.targets)
+        self._workers[self._next] = _Worker(actor, node, actor.begun.remote(), actor.accept.remote(self._blob), time.monotonic())
         self._next += 1
 
     def _hear(self, number: int) -> None:
@@ -279,7 +319,7 @@ class RayPool(Generic[A]):
                 return
             one.pid, reasons = answer
             if reasons:
-                self.set_aside(one.node, "; ".join(reasons))
+                self._refuse(one.node, "; ".join(reasons), SAME_VERSIONS)
                 return
             one.ready = True
             self._accepted.add(one.node)
@@ -298,6 +338,10 @@ class RayPool(Generic[A]):
         self._failed[one.node] = times, time.monotonic()
         if times >= FAILED_STARTS and one.node not in self._accepted and not of_node:
             self.set_aside(one.node, f"no worker starts there: {found}")
+
+
+def _ping() -> None:
+    """Run at all."""
 
 
 def reason_of(error: Exception) -> str:

@@ -1,8 +1,12 @@
-"""The folder in which a node drives, and what killed workers have left there."""
+"""The folder in which a node drives, and what killed workers have left there.
+
+Machines may share the file system: each has a folder of its own in it, since only it can tell which of its processes still run.
+"""
 
 from __future__ import annotations
 
 import os
+import socket
 import tempfile
 import time
 from collections.abc import Sequence
@@ -15,9 +19,8 @@ GONE_S = 5.0  # within which a killed process must be gone
 
 
 def scratch_root() -> Path:
-    """Return where this node drives: ``$SIMRUN_SCRATCH``, or a folder of the user's below the system's temporary one."""
-    named = os.environ.get("SIMRUN_SCRATCH")
-    return Path(named) if named else Path(tempfile.gettempdir(), f"simrun-{os.getuid()}")
+    """Return where this node drives: a folder of the user and machine below ``$SIMRUN_SCRATCH``, or the system's temporary one."""
+    return Path(os.environ.get("SIMRUN_SCRATCH") or tempfile.gettempdir(), f"simrun-{os.getuid()}-{socket.gethostname()}")
 
 
 def sweep(pids: Sequence[int] = ()) -> None:
@@ -29,4 +32,4 @@ def sweep(pids: Sequence[int] = ()) -> None:
     while any(is_running(pid) for pid in pids) and time.monotonic() < until_s:
         time.sleep(0.05)
     if scratch_root().is_dir():
-        remove_left_overs(scratch_root(), time.time_ns())
+        remove_left_overs(scratch_root())

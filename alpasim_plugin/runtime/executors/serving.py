@@ -34,6 +34,9 @@ class Serving:
         self._node, self._expected, self._targets = node, expected, targets
         self._work: Any = None
 
+    def begun(self) -> None:
+        """Answer, so that the driver knows that this process runs."""
+
     def accept(self, work: bytes) -> tuple[int, list[str]]:
         """Compare this node with the driver; take the work if nothing differs. Return the process number and what differs."""
         from alpasim_plugin.runtime.executors.identity import differences, identity_of

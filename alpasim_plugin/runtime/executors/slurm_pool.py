@@ -14,7 +14,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -22,9 +22,9 @@ from alpasim_plugin.atomic import write_bytes
 from alpasim_plugin.errors import InfrastructureError
 from alpasim_plugin.optional import require_library
 from alpasim_plugin.processes import is_running, started_of
-from alpasim_plugin.runtime.executors.base import Faulty, Resources, Work
+from alpasim_plugin.runtime.executors.assignment import Assignment
+from alpasim_plugin.runtime.executors.base import Faulty
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
-from alpasim_plugin.runtime.executors.placing import Contents
 from alpasim_plugin.runtime.executors.scratch import sweep
 from alpasim_plugin.runtime.executors.serving import JobAnswer, serve_job
 
@@ -44,15 +44,9 @@ class SlurmPool(Generic[A]):
     """Jobs as workers; see `alpasim_plugin.runtime.executors.dispatch.Pool`. A worker is a slot for a job.
 
     Args:
-        work: The work; ``work.key(item)`` names an item for a later driver.
-        contents: What it may fetch.
-        expected: `alpasim_plugin.runtime.executors.identity.identity_of` of the driver.
-        targets: As that function takes them.
-        resources: Of each job.
-        most: Most jobs at a time.
+        assignment: What the jobs do.
         partition: Of Slurm; empty: its default. ``@local``: processes of this machine.
         folder: A folder that all nodes see.
-        noticed: Called with a line for whatever a person should know.
 
     Raises:
         InputError: submitit is not installed.
@@ -61,26 +55,14 @@ class SlurmPool(Generic[A]):
 
     chunk_s = 600.0
 
-    def __init__(
-        self,
-        work: Work[A, Any],
-        contents: Contents,
-        expected: Mapping[str, str],
-        targets: Sequence[str],
-        resources: Resources,
-        most: int,
-        partition: str,
-        folder: Path,
-        noticed: Callable[[str], None],
-    ) -> None:
+    def __init__(self, assignment: Assignment[A], partition: str, folder: Path) -> None:
         submitit = require_library("submitit", "choosing an executor", "--executor slurm", "pip install 'alpasim-onefixer[slurm]'")
-        self._work, self._contents, self._expected, self._targets = work, contents, dict(expected), tuple(targets)
-        self._resources, self._noticed = resources, noticed
+        self._given = assignment
         self._is_local = partition == LOCAL
-        self._inherited = _take_over(folder / FOLDER, noticed)
+        self._inherited = _take_over(folder / FOLDER, assignment.noticed)
         self._session = folder / FOLDER / f"{os.getpid()}.{os.urandom(4).hex()}"
         self._session.mkdir(parents=True)
-        self._blob = self._placed(contents.add_bytes(pickle.dumps(work)))
+        self._blob = self._placed(assignment.contents.add_bytes(pickle.dumps(assignment.work)))
         try:
             self._executor = submitit.AutoExecutor(folder=str(self._session), cluster="local" if self._is_local else "slurm")
         except RuntimeError as error:
@@ -89,14 +71,14 @@ class SlurmPool(Generic[A]):
         self._executor.update_parameters(**self._parameters("" if self._is_local else partition))
         self._jobs: dict[int, Any] = {}  # slot -> job
         self._ended_s: dict[int, float] = {}  # slot -> when its job was first seen to have ended without a result
-        self._slots = range(min(most, MOST_JOBS))
+        self._slots = range(min(assignment.most, MOST_JOBS))
         self._accepted: set[str] = set()
         self._refused: dict[str, str] = {}
 
     def inherited(self, items: Sequence[A]) -> Iterator[tuple[int, Any]]:
         """Yield index and result of items that an earlier driver's jobs have done."""
         for index, item in enumerate(items):
-            key = self._work.key(item)
+            key = self._given.work.key(item)
             if key in self._inherited:
                 yield index, self._inherited.pop(key)
 
@@ -106,18 +88,18 @@ class SlurmPool(Generic[A]):
 
     def start(self, worker: int, items: Sequence[A]) -> None:
         """Submit a job."""
-        for sha256 in dict.fromkeys(one for item in items for one in self._work.needs(item)):
+        for sha256 in dict.fromkeys(one for item in items for one in self._given.work.needs(item)):
             self._placed(sha256)
-        keys = [self._work.key(item) for item in items]
+        keys = [self._given.work.key(item) for item in items]
         job = self._executor.submit(
             serve_job,
             str(self._session),
             self._blob.name,
             pickle.dumps(list(items)),
             keys,
-            self._expected,
-            self._targets,
-            self._resources.cores,
+            dict(self._given.expected),
+            self._given.targets,
+            self._given.resources.cores,
         )
         self._jobs[worker] = job
         with (self._session / "jobs").open("a") as file:
@@ -147,7 +129,7 @@ class SlurmPool(Generic[A]):
         if node in self._refused:
             return
         self._refused[node] = why
-        self._noticed(f"node {node} is set aside: {why}")
+        self._given.noticed(f"node {node} is set aside: {why}")
         if not self._is_local:
             self._executor.update_parameters(slurm_exclude=",".join(sorted(self._refused)))
         if not self._accepted - self._refused.keys() and (self._is_local or len(self._refused) >= MOST_REFUSALS):
@@ -166,11 +148,11 @@ class SlurmPool(Generic[A]):
             self._session.parent.rmdir()
 
     def _parameters(self, partition: str) -> dict[str, Any]:
-        wanted: dict[str, Any] = {"timeout_min": JOB_MIN, "cpus_per_task": self._resources.cores, "name": "simrun"}
-        if self._resources.gpus:
-            wanted["gpus_per_node"] = max(1, round(self._resources.gpus))  # Slurm gives whole GPUs
-        if self._resources.memory_gib:
-            wanted["mem_gb"] = self._resources.memory_gib
+        wanted: dict[str, Any] = {"timeout_min": JOB_MIN, "cpus_per_task": self._given.resources.cores, "name": "simrun"}
+        if self._given.resources.gpus:
+            wanted["gpus_per_node"] = max(1, round(self._given.resources.gpus))  # Slurm gives whole GPUs
+        if self._given.resources.memory_gib:
+            wanted["mem_gb"] = self._given.resources.memory_gib
         if partition:
             wanted["slurm_partition"] = partition
         return wanted
@@ -178,7 +160,7 @@ class SlurmPool(Generic[A]):
     def _placed(self, sha256: str) -> Path:
         path = self._session / "placed" / sha256
         if not path.exists():
-            write_bytes(path, self._contents.read(sha256), "placing a file for Slurm's nodes")
+            write_bytes(path, self._given.contents.read(sha256), "placing a file for Slurm's nodes")
         return path
 
     def _look(self, slot: int) -> Event | None:

@@ -1,0 +1,55 @@
+"""``simrun aggregate``: the numbers of several runs as of one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.atomic import write_json
+from alpasim_plugin.runtime.overall import aggregate_runs
+from evaluators.report import render_table
+from evaluators.report.metric_info import HEADLINE
+from evaluators.report.tables import pair_rows
+
+EPILOG = """
+Examples:
+
+- `simrun aggregate runs/night-*`
+
+- `simrun aggregate runs/night-* --baseline clean --out night.json`
+
+- `simrun aggregate runs/mine --all`
+"""
+
+
+def aggregate(
+    runs: Annotated[list[Path], typer.Argument(help="Finished run folders.")],
+    baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first run's.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the numbers as JSON, in the form of summary.json.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Print every metric, not only the headline ones.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+) -> None:
+    """Print means, intervals and verdicts over the rollouts of several runs; tables of millions of rows are streamed."""
+    del debug
+    found = aggregate_runs(runs, baseline)
+    if out is not None:
+        write_json(out, found)
+    if as_json:
+        print(json.dumps(found))
+        return
+    Console().print(render_table(found, headline_only=not every))
+    for row in pair_rows(found):
+        if every or row.metric in HEADLINE:
+            numbers = f"{row.diff.text}, 95 % {row.interval.text}, p {row.p_value.text}".replace("\u00a0", " ")
+            print(f"{row.variant} minus {row.baseline}: {row.metric} {numbers}: {row.verdict}")
+    failures = found["failures"]
+    if failures["n_failed"]:
+        causes = ", ".join(f"{name} {n}" for name, n in failures["by_class"].items())
+        print(f"{failures['n_failed']} of {failures['n_rollouts']} rollouts failed ({causes}); they are in no average")
+    if out is not None:
+        print(f"numbers  {out}")

@@ -1,0 +1,180 @@
+// The table of every rollout: columns are unpacked once, rows are drawn where they are looked at.
+(() => {
+  const holder = document.getElementById("rollouts-data");
+  if (!holder) return;
+  const ROW = 34, SPARE = 8; // height of a row in pixels, as in the style sheet; rows drawn beyond the edges
+  const COLLIDED = 1, LEFT_ROAD = 2, FAILED = 4, HAS_FOLDER = 8, HAS_CLIP = 16;
+  const at = (id) => document.getElementById(id);
+  const box = at("rollouts-box"), table = at("table-rollouts"), head = table.tHead.rows[0], body = table.tBodies[0], picked = at("rollouts-picked");
+  const make = (tag, text, more = {}) => Object.assign(document.createElement(tag), text === undefined ? {} : { textContent: text }, more);
+
+  const unpack = async () => {
+    const packed = Uint8Array.from(atob(holder.content.textContent), (letter) => letter.charCodeAt(0));
+    holder.remove();
+    const plain = await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+    const size = new DataView(plain).getUint32(0, true);
+    const { rows, columns, renderers } = JSON.parse(new TextDecoder().decode(new Uint8Array(plain, 4, size)));
+    let from = 4 + size;
+    const found = new Map();
+    for (const column of columns) {
+      const width = column.type === "u8" ? 1 : 4;
+      const planes = new Uint8Array(plain, from, rows * width), whole = new Uint8Array(rows * width);
+      for (let byte = 0; byte < width; byte++) for (let row = 0; row < rows; row++) whole[row * width + byte] = planes[byte * rows + row];
+      from += rows * width;
+      const data = column.type === "u8" ? whole : column.type === "u32" ? new Uint32Array(whole.buffer) : new Float32Array(whole.buffer);
+      found.set(column.name, { ...column, data });
+    }
+    return { rows, columns: found, renderers };
+  };
+
+  const start = ({ rows, columns, renderers }) => {
+    const column = (name) => columns.get(name), text = (name, row) => column(name).values[column(name).data[row]];
+    const state = column("state").data;
+    const numeric = [...columns.values()].filter((one) => one.type === "f32");
+    const shortly = new Intl.NumberFormat("en", { minimumSignificantDigits: 4, maximumSignificantDigits: 4, useGrouping: false });
+    const number = (one, row) => {
+      const value = one.data[row];
+      if (Number.isNaN(value)) return "\u2014";
+      if (one.flag && (value === 0 || value === 1)) return value ? "yes" : "no";
+      if (value === 0) return one.percent ? "0\u00a0%" : one.unit ? "0\u00a0" + one.unit : "0";
+      return (shortly.format(one.percent ? 100 * value : value) + (one.percent ? "\u00a0%" : one.unit ? "\u00a0" + one.unit : "")).replace("-", "\u2212");
+    };
+    const quoted = (word) => /^[\w./@+-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`; // for a shell
+    const outcome = (row) => state[row] & FAILED ? "failed" : [state[row] & COLLIDED && "collision", state[row] & LEFT_ROAD && "off-road"].filter(Boolean).join(", ") || "no event";
+    const tone = (row) => state[row] & FAILED ? "failed" : state[row] & COLLIDED ? "collision" : state[row] & LEFT_ROAD ? "offroad" : "";
+
+    // Which columns are drawn: names, the outcome, the headline numbers that are no flags, and one more of choice.
+    const more = at("rollouts-more");
+    const own = numeric.filter((one) => one.headline && !one.flag);
+    for (const one of numeric.filter((other) => !own.includes(other))) more.append(make("option", one.name, { value: one.name }));
+    const drawn = () => [
+      { name: "scene", names: true }, { name: "renderer", names: true },
+      ...(column("policy").values.length > 1 ? [{ name: "policy", names: true }] : []),
+      { name: "seed", names: true }, { name: "outcome" }, ...own, ...(more.value ? [column(more.value)] : []),
+    ];
+
+    let order = Uint32Array.from({ length: rows }, (_, row) => row), sorted = { name: "", up: true }, opened = -1, shown = drawn();
+    const ranks = (name) => { // texts by the alphabet with numbers in it
+      const { values } = column(name), collator = new Intl.Collator("en", { numeric: true });
+      const rank = new Uint32Array(values.length);
+      values.map((value, code) => [value, code]).sort(([a], [b]) => collator.compare(a, b)).forEach(([, code], place) => { rank[code] = place; });
+      return rank;
+    };
+    const keyOf = (one) => {
+      if (one.name === "outcome") return (row) => state[row] & (COLLIDED | LEFT_ROAD | FAILED);
+      if (!one.names) return (row) => one.data[row];
+      const rank = ranks(one.name), { data } = column(one.name);
+      return (row) => rank[data[row]];
+    };
+
+    const select = () => {
+      const mask = Number(at("rollouts-state").value);
+      const words = at("rollouts-words").value.toLowerCase().split(/\s+/).filter(Boolean).map((word) =>
+        ["scene", "renderer", "policy", "seed"].map((name) => [column(name).data, column(name).values.map((value) => name === "seed" ? value === word : value.toLowerCase().includes(word))]));
+      const kept = new Uint32Array(rows);
+      let n = 0;
+      for (let row = 0; row < rows; row++) {
+        if ((!mask || state[row] & mask) && words.every((word) => word.some(([data, hits]) => hits[data[row]]))) kept[n++] = row;
+      }
+      order = kept.slice(0, n);
+      const chosen = shown.find((one) => one.name === sorted.name);
+      if (chosen) {
+        const key = keyOf(chosen), keys = new Float64Array(rows), turn = sorted.up ? 1 : -1;
+        for (const row of order) keys[row] = key(row);
+        order.sort((a, b) => { // missing numbers stay last; equals stay in the order of the run
+          const missingA = Number.isNaN(keys[a]), missingB = Number.isNaN(keys[b]);
+          return missingA || missingB ? missingA - missingB || a - b : turn * (keys[a] - keys[b]) || a - b;
+        });
+      }
+      at("rollouts-count").textContent = n === rows ? `${n} rollouts` : `${n} of ${rows} rollouts`;
+      box.scrollTop = 0;
+      draw();
+    };
+
+    const heads = () => {
+      head.replaceChildren(...shown.map((one) => {
+        const cell = make("th", undefined, { scope: "col", className: one.names || one.name === "outcome" ? "" : "r" });
+        if (one.name === sorted.name) cell.setAttribute("aria-sort", sorted.up ? "ascending" : "descending");
+        const button = make("button", one.name, { type: "button", className: "sort" });
+        button.addEventListener("click", () => {
+          sorted = { name: one.name, up: sorted.name === one.name ? !sorted.up : true };
+          heads();
+          select();
+        });
+        cell.append(button);
+        return cell;
+      }));
+    };
+
+    const line = (row) => {
+      const tr = make("tr", undefined, { className: row === opened ? "opened" : "" });
+      tr.dataset.row = row;
+      for (const one of shown) {
+        const td = make(one.name === "scene" ? "th" : "td", undefined, { className: one.names || one.name === "outcome" ? "name" : "r nowrap" });
+        if (one.name === "scene") td.scope = "row";
+        if (one.name === "renderer") {
+          td.append(make("span", "", { className: "swatch" }));
+          td.firstChild.style.setProperty("--c", `var(--variant-${renderers.indexOf(text("renderer", row)) % 8})`);
+        }
+        if (one.name === "seed") {
+          const open = make("button", text("seed", row), { type: "button", className: "open", title: "Numbers and files of this rollout" });
+          td.append(open);
+        } else if (one.name === "outcome") td.append(tone(row) ? make("span", outcome(row), { className: `chip ${tone(row)}` }) : outcome(row));
+        else td.append(one.names ? text(one.name, row) : number(one, row));
+        tr.append(td);
+      }
+      return tr;
+    };
+    const space = (n) => {
+      const tr = make("tr", undefined, { className: "space" });
+      tr.setAttribute("aria-hidden", "true");
+      const td = make("td", undefined, { colSpan: shown.length });
+      td.style.height = `${n * ROW}px`;
+      tr.append(td);
+      return tr;
+    };
+    const draw = () => {
+      const first = Math.max(0, Math.floor(box.scrollTop / ROW) - SPARE), last = Math.min(order.length, first + Math.ceil(box.clientHeight / ROW) + 2 * SPARE);
+      table.setAttribute("aria-rowcount", order.length + 1);
+      body.replaceChildren(space(first), ...Array.from(order.subarray(first, last), line), space(order.length - last));
+    };
+
+    const open = (row) => {
+      opened = row;
+      const links = make("p", undefined, { className: "small" });
+      const folder = `${text("folder", row)}/${text("leaf", row)}`;
+      if (state[row] & HAS_FOLDER) links.append(make("a", "rollout folder", { href: `${folder}/` }), " ");
+      if (state[row] & HAS_CLIP) links.append(make("a", "clip", { href: `${folder}/front.mp4` }), " ");
+      if (!(state[row] & HAS_FOLDER)) links.append("No folder of this rollout is beside this page. ");
+      links.append("Watch it: ", make("code", `simrun view RUN --scene ${quoted(text("scene", row))} --seed ${text("seed", row)}`));
+      const facts = make("dl");
+      for (const one of numeric) facts.append(make("dt", one.name), make("dd", number(one, row)));
+      const title = make("h3", `${text("scene", row)}, ${text("renderer", row)}, ${text("policy", row)}, seed ${text("seed", row)}: ${outcome(row)}`);
+      const failure = text("failure", row);
+      picked.replaceChildren(title, ...(failure ? [make("p", failure, { className: "message" })] : []), links, facts);
+      picked.hidden = false;
+      draw();
+    };
+
+    let waiting = false;
+    box.addEventListener("scroll", () => {
+      if (!waiting) requestAnimationFrame(() => { waiting = false; draw(); });
+      waiting = true;
+    });
+    body.addEventListener("click", (event) => {
+      const tr = event.target.closest("tr[data-row]");
+      if (tr) open(Number(tr.dataset.row));
+    });
+    more.addEventListener("change", () => { shown = drawn(); heads(); select(); });
+    at("rollouts-words").addEventListener("input", select);
+    at("rollouts-state").addEventListener("change", select);
+    new ResizeObserver(draw).observe(box);
+    heads();
+    select();
+    box.dataset.ready = "yes";
+  };
+
+  unpack().then(start).catch((error) => {
+    at("rollouts-count").textContent = `This browser cannot unpack the table (${error.message}); rollouts.parquet holds the same rows.`;
+  });
+})();

@@ -1,0 +1,136 @@
+"""The table of every rollout in a real browser, small and with 100,000 rows. Slow: needs an installed Chromium."""
+
+from __future__ import annotations
+
+import runpy
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evaluators.report import write_report
+from tests.report.browser import Browser
+
+pytestmark = pytest.mark.slow
+
+ROWS = "[...document.querySelectorAll('#table-rollouts tr[data-row]')]"
+DRAW = Path(__file__).resolve().parents[2] / "docs" / "scripts" / "scale_rows.py"
+LARGE = 100_000
+MOST_BYTES = 15_000_000
+
+
+def opened(browser: Browser, page: Path, width: int = 1400) -> float:
+    """Open a report, wait until its table is ready, and return the seconds that this took."""
+    browser.complaints.clear()
+    began = time.monotonic()
+    browser.open(page, width=width)
+    until(lambda: browser.evaluate("document.getElementById('rollouts-box').dataset.ready === 'yes'"))
+    return time.monotonic() - began
+
+
+def until(done: Callable[[], Any]) -> None:
+    deadline = time.monotonic() + 60.0
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def column(browser: Browser, head: str) -> list[str]:
+    index = f"[...document.querySelectorAll('#table-rollouts th[scope=col]')].findIndex(h => h.textContent === '{head}')"
+    return list(browser.evaluate(f"{ROWS}.map(r => r.children[{index}].textContent)"))
+
+
+def sort(browser: Browser, head: str) -> None:
+    browser.evaluate(f"[...document.querySelectorAll('#table-rollouts thead .sort')].find(b => b.textContent === '{head}').click()")
+
+
+def choose(browser: Browser, element: str, value: str, event: str) -> None:
+    browser.evaluate(f"(e => {{ e.value = '{value}'; e.dispatchEvent(new Event('{event}')); }})(document.getElementById('{element}'))")
+
+
+def count(browser: Browser) -> str:
+    return str(browser.evaluate("document.getElementById('rollouts-count').textContent"))
+
+
+@pytest.fixture(scope="module")
+def large_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("large") / "drawn"
+    runpy.run_path(str(DRAW))["write_drawn_run"](folder, LARGE)
+    return folder
+
+
+def test_rows_sort_filter_and_open(browser: Browser, usual_run: Path) -> None:
+    opened(browser, write_report(usual_run))
+    assert count(browser) == "72 rollouts"
+    sort(browser, "lateral_distance_m")
+    rising = [float(text.split()[0]) for text in column(browser, "lateral_distance_m") if text != "\u2014"]
+    assert rising == sorted(rising)
+    sort(browser, "lateral_distance_m")
+    falling = [float(text.split()[0]) for text in column(browser, "lateral_distance_m") if text != "\u2014"]
+    assert falling == sorted(falling, reverse=True)
+    assert falling[0] == rising[-1] or len(falling) < 72  # only the rows near the top are drawn
+    choose(browser, "rollouts-words", "3DGS urban", "input")
+    assert set(column(browser, "scene")) == {"urban/left-turn"}
+    assert set(column(browser, "renderer")) == {"3dgs"}
+    choose(browser, "rollouts-state", "4", "change")
+    assert count(browser) == "2 of 72 rollouts"
+    assert set(column(browser, "outcome")) == {"failed"}
+    choose(browser, "rollouts-more", "plan_deviation", "change")
+    assert column(browser, "plan_deviation") == ["\u2014", "\u2014"]
+    browser.evaluate(f"{ROWS}[0].querySelector('button.open').click()")
+    text = browser.evaluate("document.getElementById('rollouts-picked').textContent")
+    assert "failed" in text
+    assert "NaN pixels <b>" in text  # of the failure, as text
+    link = browser.evaluate("document.querySelector('#rollouts-picked a')?.getAttribute('href')")
+    assert link is None or (usual_run / link).is_dir()
+    choose(browser, "rollouts-words", "", "input")
+    choose(browser, "rollouts-state", "0", "change")
+    browser.evaluate(f"{ROWS}.at(-1).click()")
+    assert (usual_run / browser.evaluate("document.querySelector('#rollouts-picked a').getAttribute('href')")).is_dir()
+    assert browser.complaints == []
+
+
+def test_names_that_are_markup_stay_text(browser: Browser, hostile_run: Path) -> None:
+    opened(browser, write_report(hostile_run))
+    browser.evaluate(f"{ROWS}[0].click()")
+    assert "<img src=x" in "".join(column(browser, "scene"))
+    assert browser.evaluate("document.querySelectorAll('#rollouts img').length") == 0
+    assert browser.complaints == []
+
+
+def test_a_hundred_thousand_rollouts_load_scroll_sort_and_open(
+    browser: Browser, large_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = write_report(large_run)
+    size = page.stat().st_size
+    assert size < MOST_BYTES
+    took = {"load": opened(browser, page)}
+    assert count(browser) == "100000 rollouts"
+    assert len(column(browser, "seed")) < 100  # drawn where it is looked at
+    for name, expression in {
+        "scroll to the end": "document.getElementById('rollouts-box').scrollTop = 1e9",
+        "sort": "[...document.querySelectorAll('#table-rollouts thead .sort')].find(b => b.textContent === 'lateral_distance_m').click()",
+    }.items():
+        took[name] = browser.evaluate(
+            f"(async () => {{ const began = performance.now(); {expression};"
+            " await new Promise(done => requestAnimationFrame(() => setTimeout(done))); return (performance.now() - began) / 1000; })()"
+        )
+        if name == "scroll to the end":
+            until(lambda: column(browser, "scene")[-1] == "drawn-004999")
+            assert column(browser, "seed")[-1] == "9"
+    shortest = [float(text.split()[0]) for text in column(browser, "lateral_distance_m")]
+    assert shortest == sorted(shortest)
+    began = time.monotonic()
+    choose(browser, "rollouts-words", "drawn-001234 3dgs", "input")
+    took["filter"] = time.monotonic() - began
+    assert count(browser) == "10 of 100000 rollouts"
+    browser.evaluate(f"{ROWS}[3].click()")
+    assert "drawn-001234, 3dgs" in browser.evaluate("document.querySelector('#rollouts-picked h3').textContent")
+    choose(browser, "rollouts-words", "", "input")
+    choose(browser, "rollouts-state", "4", "change")
+    assert 300 < int(count(browser).split()[0]) < 700  # half a percent failed
+    assert browser.complaints == []
+    with capsys.disabled():
+        print(f"\n{size / 1e6:.1f} MB; " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in took.items()))

@@ -1,0 +1,67 @@
+"""Several runs aggregated as one: parts of a night give what the whole night gives."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.contents import write_contents
+from alpasim_plugin.runtime.overall import aggregate_runs
+from tests.runs.make_many import SCENES, Many, make_one
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a run, and the same rollouts in two runs of three scenes."""
+    root = tmp_path_factory.mktemp("night")
+    whole = Many("whole", shift_m={"onefixer": 0.4})
+    make_one(root, whole)
+    table, names = pq.read_table(root / "whole" / "rollouts.parquet"), list(SCENES)
+    for name, mine in (("part-1", names[:3]), ("part-2", names[3:])):
+        part = make_one(root, replace(whole, name=name, scenes={scene: SCENES[scene] for scene in mine}))
+        pq.write_table(table.filter(pc.field("scene").isin(mine)), part / "rollouts.parquet")
+        write_contents(part, {})
+    return root
+
+
+def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    whole = aggregate_runs([night / "whole"])
+    assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "worse"
+    out = tmp_path / "night.json"
+    assert run_command(["aggregate", str(night / "part-1"), str(night / "part-2"), "--json", "--out", str(out)]) == 0
+    parts = json.loads(capsys.readouterr().out)
+    assert json.loads(out.read_text()) == parts
+    for block in ("preset", "paired", "failures"):
+        assert parts[block] == whole[block]
+    stored = json.loads((night / "whole" / "summary.json").read_text())["metrics"]  # as a run of all rollouts wrote it
+    assert parts["metrics"] == whole["metrics"] == stored
+
+
+def test_the_verdicts_are_printed_one_a_line(night: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["aggregate", str(night / "part-1"), str(night / "part-2")]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("onefixer minus clean: lateral_distance_m")]
+    assert len(lines) == 1
+    assert lines[0].endswith(": worse")
+
+
+def test_runs_that_do_not_belong_together_are_refused(night: Path, tmp_path: Path) -> None:
+    changed = make_one(tmp_path, Many("changed", scenes={**SCENES, "smoke-curve": "ff" * 32}))
+    with pytest.raises(InputError, match="scene smoke-curve with another content"):
+        aggregate_runs([night / "whole", changed])
+    strict = make_one(tmp_path, Many("strict", preset="strict"))
+    with pytest.raises(InputError, match="presets 'paper' and 'strict'"):
+        aggregate_runs([night / "whole", strict])
+    with pytest.raises(InputError, match="named twice"):
+        aggregate_runs([night / "whole", night / "." / "whole"])
+    with pytest.raises(InputError, match="choose one of clean, onefixer"):
+        aggregate_runs([night / "whole"], "3dgs")
+    (strict / "contents.json").unlink()
+    with pytest.raises(InputError, match="not finished"):
+        aggregate_runs([strict])

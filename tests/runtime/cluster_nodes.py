@@ -1,0 +1,40 @@
+"""A Ray cluster of several nodes on this machine, for tests."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from alpasim_plugin.bench.executors import LIGHT, LIGHT_HEAD, patiently
+from alpasim_plugin.runtime.executors.choice import Executor
+
+# Set before Ray is imported. Otherwise a driver that finds a cluster by itself asks it for the token of an earlier one (~/.ray/auth_token).
+os.environ["RAY_AUTH_MODE"] = "disabled"
+
+SYSTEM = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500, "health_check_failure_threshold": 4}
+
+
+class Nodes:
+    """A cluster on this machine, a core a node; its raylets can be killed."""
+
+    def __init__(self, number: int, **more: Any) -> None:
+        from ray.cluster_utils import Cluster
+
+        head = {"num_cpus": 1, "_system_config": SYSTEM, **LIGHT_HEAD, **more}
+        self.cluster = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
+        for _ in range(number - 1):
+            self.add()
+
+    @property
+    def address(self) -> str:
+        return str(self.cluster.address)
+
+    def add(self, **more: Any) -> Any:
+        return patiently(lambda: self.cluster.add_node(**{"num_cpus": 1, **LIGHT, **more}))
+
+    def close(self) -> None:
+        self.cluster.shutdown()
+
+
+def on(nodes: Nodes) -> Executor:
+    return Executor("ray", nodes.address)

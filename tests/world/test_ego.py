@@ -1,0 +1,51 @@
+"""States read off a recording: one call for many times gives what one call each gives, at the ends of the log too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.geometry import quat_from_yaw
+from alpasim_plugin.types import Trajectory, Vehicle
+from alpasim_plugin.world.ego import ego_state_from_log, ego_states_from_log
+
+T_US = np.arange(0, 2_000_001, 50_000, dtype=np.int64) + 1_700_000_000_000_000  # epoch times: too long for a float's mantissa
+
+
+def circle(speed_mps: float, radius_m: float) -> Trajectory:
+    """Drive a left circle from the origin along x."""
+    s = speed_mps * (T_US - T_US[0]) * 1e-6
+    yaw = s / radius_m
+    xyz = np.stack([radius_m * np.sin(yaw), radius_m * (1 - np.cos(yaw)), np.zeros(len(s))], axis=1)
+    return Trajectory(T_US, xyz, quat_from_yaw(yaw))
+
+
+@pytest.mark.parametrize("speed_mps", [8.0, -3.0, 0.0])
+def test_many_times_at_once_are_those_times_one_by_one(speed_mps: float) -> None:
+    log, vehicle = circle(speed_mps, 40.0), Vehicle()
+    times = np.concatenate([T_US, T_US[:-1] + 13_000])
+    for one, t in zip(ego_states_from_log(log, times, vehicle), times, strict=True):
+        alone = ego_state_from_log(log, int(t), vehicle)
+        assert one.t_us == alone.t_us == t
+        np.testing.assert_array_equal(one.T_world_rig, alone.T_world_rig)
+        for name in ("speed_mps", "accel_mps2", "yaw_rate_radps", "steer_rad"):
+            assert getattr(one, name) == getattr(alone, name)
+
+
+def test_a_circle_has_its_speed_yaw_rate_and_steering_up_to_its_ends() -> None:
+    vehicle = Vehicle()
+    for one in ego_states_from_log(circle(8.0, 40.0), T_US, vehicle):
+        assert one.speed_mps == pytest.approx(8.0, rel=1e-3)
+        assert one.yaw_rate_radps == pytest.approx(0.2, rel=1e-6)
+        assert one.steer_rad == pytest.approx(np.arctan(vehicle.wheelbase_m / 40.0), rel=2e-3)
+        assert one.accel_mps2 == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_log_of_one_pose_stands_still_and_times_outside_are_refused() -> None:
+    log = circle(8.0, 40.0)
+    alone = Trajectory(log.t_us[:1], log.xyz[:1], log.quat[:1])
+    (still,) = ego_states_from_log(alone, [int(T_US[0])], Vehicle())
+    assert (still.speed_mps, still.accel_mps2, still.yaw_rate_radps, still.steer_rad) == (0.0, 0.0, 0.0, 0.0)
+    with pytest.raises(InputError, match="the trajectory covers"):
+        ego_states_from_log(log, [int(T_US[-1]) + 1], Vehicle())
