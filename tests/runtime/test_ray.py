@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -36,6 +36,25 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time g
 
 GIB = 2**30
 PATIENCE_S = 30.0  # for workers that do start, on a busy machine
+
+
+def serving() -> set[int]:
+    """Return the processes that are workers of ours."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"ray::Serving" in path.read_bytes():
+                found.add(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def wait_until(done: Callable[[], bool], otherwise: str, limit_s: float = 60.0) -> None:
+    until = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < until, otherwise
+        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +113,8 @@ def test_an_item_that_hangs_is_ended_at_the_limit(tmp_path: Path, three: Nodes) 
 
 def test_a_raylet_that_is_killed_loses_nothing(tmp_path: Path, three: Nodes) -> None:
     doomed = three.add()
-    raylet = doomed.all_processes["raylet"][0].process.pid
+    process = doomed.all_processes["raylet"][0].process
+    raylet = process.pid
     items = [f"sleep 0.5 #{i}" for i in range(24)]
     found = {}
     with pool_on(three, Scripted(tmp_path)) as pool:
@@ -102,10 +122,12 @@ def test_a_raylet_that_is_killed_loses_nothing(tmp_path: Path, three: Nodes) -> 
             found[item] = got
             if len(found) >= 4 and raylet and any(doomed.node_id[:8] in name for name in pool.nodes()):
                 os.kill(raylet, signal.SIGKILL)
+                process.wait()  # a worker of Ray ends when its raylet's process is gone, which one that nobody waited for is not
                 raylet = 0
     three.cluster.worker_nodes.discard(doomed)
     assert raylet == 0, "the node was never used"
     assert found == {item: item.upper() for item in items}
+    wait_until(lambda: not serving(), "a worker outlives its node")
 
 
 def test_a_node_with_another_version_is_refused_by_name(tmp_path: Path, three: Nodes, capsys: pytest.CaptureFixture[str]) -> None:
@@ -264,18 +286,6 @@ execute_run(cheap_plan((0, 1, 2)), Path(sys.argv[1]), None, ["simrun"], Heard(),
 """
 
 
-def serving() -> set[int]:
-    """Return the processes that are workers of ours."""
-    found = set()
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            if b"ray::Serving" in path.read_bytes():
-                found.add(int(path.parent.name))
-        except OSError:
-            continue
-    return found
-
-
 def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(tmp_path: Path, three: Nodes, repo: Path) -> None:
     command = [sys.executable, "-c", DRIVER, str(tmp_path / "run"), three.address]
     driver = subprocess.Popen(command, cwd=repo, env={**os.environ, "PYTHONPATH": str(repo)})
@@ -283,14 +293,10 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(tmp_path:
     while len(list((tmp_path / "run").rglob("manifest.json"))) < 2:
         assert time.monotonic() < until
         time.sleep(0.02)
-    workers = serving()
+    assert serving()
     driver.kill()
     driver.wait()
-    assert workers
-    until = time.monotonic() + 60
-    while serving() & workers:
-        assert time.monotonic() < until, "a worker outlives its driver"
-        time.sleep(0.1)
+    wait_until(lambda: not serving(), "a worker outlives its driver")
     done = len(list((tmp_path / "run").rglob("manifest.json")))
     assert done < 12
     _, heard = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
