@@ -41,7 +41,7 @@ WHAT: dict[JudgeName, str] = {
     "video": "Features of 16 frames of the simulator: the judge behind fd_syn_16 and fd_syn_clip; not I3D",
     "style": "Style of a frame of the simulator (clear, night, fog, snow): the judge behind style_acc_syn",
 }
-STEPS: dict[JudgeName, int] = {"lane": 1200, "cuboid": 2500, "video": 800, "style": 300}
+STEPS: dict[JudgeName, int] = {"lane": 1200, "cuboid": 2500, "video": 1200, "style": 300}
 
 
 @dataclass(frozen=True)

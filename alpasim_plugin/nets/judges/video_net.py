@@ -17,6 +17,7 @@ from alpasim_plugin.types import F32, U8
 
 FRAMES, HEIGHT, WIDTH = 16, 64, 112
 FEATURES = 128
+CHANGE = 4.0  # weight of the difference to the frame before, which is small beside the frame
 
 
 class VideoNet(nn.Module):
@@ -30,8 +31,8 @@ class VideoNet(nn.Module):
     def __init__(self, widths: tuple[int, int, int] = (24, 48, 80)) -> None:
         super().__init__()
         one, two, three = widths
-        self.patches = nn.Conv3d(3, one, (1, 4, 4), (1, 4, 4))
-        self.motion = nn.Conv3d(one, one, (3, 3, 3), (2, 1, 1), 1)
+        self.patches = nn.Conv3d(6, one, (1, 4, 4), (1, 4, 4))
+        self.motion = nn.Conv3d(one + 2, one, (3, 3, 3), (2, 1, 1), 1)
         self.two = nn.Conv3d(one, two, 3, 2, 1)
         self.three = nn.Conv3d(two, three, 3, 2, 1)
         self.four = nn.Conv3d(three, FEATURES, (2, 3, 3), (2, 1, 1), (0, 1, 1))
@@ -39,10 +40,22 @@ class VideoNet(nn.Module):
 
     def forward(self, video: Tensor) -> Tensor:
         """Map ``(B, 3, 16, 64, 112)`` in [-1, 1] to ``(B, 128)``."""
-        x = video
-        for layer, norm in zip((self.patches, self.motion, self.two, self.three), self.norms, strict=True):
+        change = F.pad(torch.diff(video, dim=2), (0, 0, 0, 0, 1, 0))
+        x = F.leaky_relu(self.norms[0](self.patches(torch.cat([video, CHANGE * change], dim=1))), 0.1)
+        x = torch.cat([x, _places(x)], dim=1)
+        for layer, norm in zip((self.motion, self.two, self.three), list(self.norms)[1:], strict=True):
             x = F.leaky_relu(norm(layer(x)), 0.1)
         return F.leaky_relu(self.four(x), 0.1).mean((2, 3, 4))
+
+
+def _places(x: Tensor) -> Tensor:
+    """Return where in the image each cell of ``(B, C, T, H, W)`` lies, ``(B, 2, T, H, W)`` in -1..1.
+
+    The mean over the image forgets places, and a drive forward differs from one backward in where things move which way.
+    """
+    b, _, t, h, w = x.shape
+    y, u = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+    return torch.stack([y, u])[None, :, None].expand(b, 2, t, h, w).to(x)
 
 
 def window_input(frames: U8) -> F32:
