@@ -17,7 +17,7 @@ from alpasim_plugin.nets.judges.detect import find_cuboids, find_lanes
 from alpasim_plugin.nets.judges.files import NAMES, check_digests, file_name, load_judge
 from alpasim_plugin.nets.judges.video_net import FRAMES, VideoNet, window_features
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.types import F64, U8, CameraSpec
+from alpasim_plugin.types import F64, U8, CameraSpec, Scenario
 from evaluators.judges.clip import cuboid_values, lane_values
 from evaluators.judges.cuboids import cuboid_f1
 from evaluators.judges.external import read_detections
@@ -77,11 +77,20 @@ def camera_of(sequence: PairSequence, scenes: Path | None) -> CameraSpec:
     info = sequence.info.get("camera", {})
     if "T_rig_camera" in info:
         return CameraSpec("camera", int(info["width"]), int(info["height"]), np.array(info["K"]), np.array(info["T_rig_camera"]))
+    return scene_of(sequence, scenes).cameras[0]
+
+
+def scene_of(sequence: PairSequence, scenes: Path | None) -> Scenario:
+    """Return the scene behind a sequence of pairs, from the folder that `simrun train scenes` wrote.
+
+    Raises:
+        InputError: It is not there.
+    """
     path = None if scenes is None else scenes / str(sequence.info.get("split")) / f"{sequence.name}.yaml"
     if path is None or not path.is_file():
-        found = "its camera's mounting is not stored, and there is no scene"
+        found = "its scene, or the mounting of its camera, is asked for, and there is no scene"
         raise InputError(DOING, str(sequence.folder), found, "name the folder of its scenes with --scenes")
-    return load_scenario(path).cameras[0]
+    return load_scenario(path)
 
 
 def judge_clip(
@@ -168,10 +177,10 @@ def judge_sets(features: Mapping[str, Sequence[Mapping[str, F64]]], baseline: st
     """
     truth = features[REFERENCE]
     out: dict[str, Any] = {}
-    for metric, key, whole in _set_metrics(truth):
-        reference = [_vectors(clip, key, whole) for clip in truth]
+    for metric, key, whole in set_metrics(truth[0]):
+        reference = [vectors(clip, key, whole) for clip in truth]
         cell: dict[str, Any] = {"oracle": _halves(reference), "dimensions": int(reference[0].shape[1]), "variants": {}}
-        sides = {name: [_vectors(clip, key, whole) for clip in clips] for name, clips in features.items() if name != REFERENCE}
+        sides = {name: [vectors(clip, key, whole) for clip in clips] for name, clips in features.items() if name != REFERENCE}
         for name, side in sides.items():
             n = sum(len(x) for x in side)
             if min(n, sum(len(x) for x in reference)) < 2:
@@ -189,10 +198,10 @@ def judge_sets(features: Mapping[str, Sequence[Mapping[str, F64]]], baseline: st
     return out
 
 
-def _set_metrics(clips: Sequence[Mapping[str, F64]]) -> list[tuple[str, str, bool]]:
-    """Return name, kind of feature, and whether a clip's vectors are averaged, of the set metrics that the features allow."""
+def set_metrics(clip: Mapping[str, F64]) -> list[tuple[str, str, bool]]:
+    """Return name, kind of feature, and whether a clip's vectors are averaged, of the set metrics that the features of a clip allow."""
     rows: list[tuple[str, str, bool]] = [(FVMD_LK, MOTION, False)]
-    for key in clips[0]:
+    for key in clip:
         if key.startswith(WINDOWS):
             seed = int(key.rsplit("-", 1)[1])
             rows += [(of_seed(FD_16, seed), key, False), (of_seed(FD_CLIP, seed), key, True)]
@@ -201,7 +210,8 @@ def _set_metrics(clips: Sequence[Mapping[str, F64]]) -> list[tuple[str, str, boo
     return rows
 
 
-def _vectors(clip: Mapping[str, F64], key: str, whole: bool) -> F64:
+def vectors(clip: Mapping[str, F64], key: str, whole: bool) -> F64:
+    """Return a clip's vectors of one kind ``(n, d)``, or their mean ``(1, d)``."""
     x = clip[key]
     return x.mean(axis=0, keepdims=True) if whole and len(x) else x
 

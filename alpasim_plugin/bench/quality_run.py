@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from alpasim_plugin.atomic import atomic_file, write_bytes, write_json
-from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row
+from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row, scene_of
+from alpasim_plugin.bench.map_error import shifted_maps
 from alpasim_plugin.bench.quality import QualityClip, Variant, measure, row_key, run_variant
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.checkpoints import file_sha256
@@ -41,6 +42,7 @@ from evaluators.video.table import markdown
 DOING = "measuring quality"
 Given = Literal["render", "truth", "lost-resolution"]  # what the fixers get
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames that are shown, as shares of a clip
+FILM_QUALITY = 80  # of JPEG
 Told = Callable[[int, int, "Work", Mapping[str, Any]], None]
 
 
@@ -59,7 +61,9 @@ class Work:
     weights: Path | None
     out: Path
     pictured: bool
+    filmed: bool = False
     judging: Judging | None = None
+    scenes: Path | None = None
 
     @property
     def row_file(self) -> Path:
@@ -74,6 +78,17 @@ class Work:
     def picture_file(self, at: int) -> Path:
         """Where a shown frame is kept."""
         return self.out / "frames" / self.variant.label / f"{self.folder.name}_{at:04d}.png"
+
+    @property
+    def film_file(self) -> Path:
+        """Where all frames of a filmed clip are kept: JPEGs in an archive of arrays, ``0000`` and so on."""
+        return self.out / "films" / self.variant.label / f"{self.folder.name}.npz"
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything but pictures is on disk."""
+        wanted = [self.row_file, *([self.features_file] if self.judging else []), *([self.film_file] if self.filmed else [])]
+        return all(path.is_file() for path in wanted)
 
 
 @dataclass(frozen=True)
@@ -91,8 +106,10 @@ class QualityRun:
         jobs: Clips at a time, one thread each.
         threads: Torch threads with one job.
         weights: Folder of metric weights.
-        shown: Names of the clips whose frames are kept as pictures.
+        shown: Names of the clips some of whose frames are kept as pictures.
+        filmed: Names of the clips all of whose frames are kept, as JPEG.
         judging: Which judges are asked; None: none.
+        scenes: Folder of the scenes behind the pairs; variants with a shifted map need it.
     """
 
     sequences: Sequence[PairSequence]
@@ -106,7 +123,9 @@ class QualityRun:
     threads: int = 1
     weights: Path | None = None
     shown: frozenset[str] = frozenset()
+    filmed: frozenset[str] = frozenset()
     judging: Judging | None = None
+    scenes: Path | None = None
 
     @property
     def networks(self) -> tuple[tuple[str, str], ...]:
@@ -124,11 +143,15 @@ class QualityRun:
         return [
             Work(
                 s.folder, self.given, variant, self.frames, self.seed, self.device, self.used_threads, networks, self.weights,
-                self.out, s.name in self.shown, self.judging,
+                self.out, s.name in self.shown, s.name in self.filmed, self.judging, self.scenes,
             )
             for s in self.sequences
             for variant in (*self.variants, Variant(TRUTH))
         ]  # fmt: skip
+
+    def finished(self, works: Sequence[Work]) -> Iterator[tuple[Work, dict[str, Any]]]:
+        """Yield every work with its row as it is finished; rows that are up to date come from disk."""
+        yield from parallel_map(finish, works, self.jobs)
 
     def measure(self, baseline: str, told: Told) -> tuple[dict[str, Any], list[Work]]:
         """Measure what is not measured yet and return the summary over all, and the works that it is about.
@@ -138,7 +161,7 @@ class QualityRun:
             told: Called after each clip with its number, the number of all, the work and its row.
         """
         works = self.works()
-        for i, (work, row) in enumerate(parallel_map(finish, works, self.jobs), start=1):
+        for i, (work, row) in enumerate(self.finished(works), start=1):
             told(i, len(works), work, row)
         summary = summarise([row_of(work) for work in works], baseline)
         if self.judging is not None:
@@ -203,8 +226,7 @@ def finish(work: Work) -> dict[str, Any]:
     asked = {} if work.judging is None else {"judging": json.dumps(work.judging.identity)}
     key = row_key(clip, work.variant, work.seed, work.device, {**dict(work.networks), **asked})
     at = shown_frames(len(clip.t_us)) if work.pictured else ()
-    complete = work.judging is None or work.features_file.is_file()
-    if work.row_file.is_file() and complete and all(work.picture_file(i).is_file() for i in at):
+    if work.complete and all(work.picture_file(i).is_file() for i in at):
         stored = read_json(work.row_file)
         if stored["key"] == key:
             return dict(stored["row"])
@@ -215,6 +237,8 @@ def finish(work: Work) -> dict[str, Any]:
     if spec is not None:
         scene = str(sequence.info.get("scene_id", sequence.name))
         fixer = build(spec, scene_id=scene, seed=work.seed, device=work.device, threads=work.threads)
+    if work.variant.map_shift is not None:
+        clip = replace(clip, sdmap=_shifted(sequence, clip, work))
     result = run_variant(clip, work.variant, fixer)
     for i in at:
         _write_png(work.picture_file(i), result.video[i])
@@ -224,10 +248,34 @@ def finish(work: Work) -> dict[str, Any]:
         camera = camera_of(sequence, work.judging.scenes)
         values, features = judge_clip(sequence.name, work.variant.label, result.video, truth, camera, work.judging)
         row["values"] |= values
+        work.features_file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(work.features_file) as partial, partial.open("wb") as file:
             np.savez(file, **cast("dict[str, Any]", features))
+    if work.filmed:
+        frames = {f"{i:04d}": _encoded(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, FILM_QUALITY)) for i, frame in enumerate(result.video)}
+        work.film_file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(work.film_file) as partial, partial.open("wb") as file:
+            np.savez(file, **cast("dict[str, Any]", frames))
     write_json(work.row_file, {"key": key, "row": row})
     return row
+
+
+def film_of(work: Work) -> list[bytes]:
+    """Return the frames of a filmed work as JPEG.
+
+    Raises:
+        InputError: They are not whole.
+    """
+    do = "remove the clip's film and start the command again"
+    with parsing(DOING, work.film_file, do, "not whole frames"), np.load(work.film_file) as stored:
+        return [stored[key].tobytes() for key in sorted(stored.files)]
+
+
+def _shifted(sequence: PairSequence, clip: QualityClip, work: Work) -> U8:
+    assert work.variant.map_shift is not None
+    scenario = scene_of(sequence, work.scenes)
+    poses = np.array(sequence.clip.T_world_camera[: len(clip.t_us)])
+    return shifted_maps(scenario, camera_of(sequence, work.scenes), poses, clip.t_us, work.variant.map_shift, work.threads)
 
 
 def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip:
@@ -272,9 +320,13 @@ def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> N
 
 
 def _write_png(path: Path, rgb: U8) -> None:
-    done, png = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    write_bytes(path, _encoded(".png", rgb).tobytes())
+
+
+def _encoded(kind: str, rgb: U8, options: Sequence[int] = ()) -> U8:
+    done, encoded = cv2.imencode(kind, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), list(options))
     assert done
-    write_bytes(path, png.tobytes())
+    return np.asarray(encoded, dtype=np.uint8)
 
 
 def _picture(path: Path) -> Any:

@@ -80,7 +80,7 @@ def quality(
     judging = None if judges is None else _judging(judges, scenes, detections, weights, judge_folder)
     sequences = evenly(PairDataset(data, split).sequences, clips)
     shown = frozenset(s.name for s in evenly(sequences, pictures)) if pictures else frozenset()
-    run = QualityRun(sequences, variants, out, given, frames, seed, device, jobs, threads, weights, shown, judging)
+    run = QualityRun(sequences, variants, out, given, frames, seed, device, jobs, threads, weights, shown, judging=judging, scenes=scenes)
     console = Console(stderr=True)
 
     def told(i: int, n: int, work: Work, row: Mapping[str, Any]) -> None:

@@ -24,18 +24,24 @@ def paper_against_ours(published: Published, table: str, measured: Measured) -> 
     rows = [["", "*ours*", *(f"`{ours}`" if (ours := published.ours(m)) else "-" for m in printed.metrics)]]
     for arm, cells in printed.rows.items():
         rows.append([f"**{arm}**", "paper", *(cells[m].text if m in cells else "not reported" for m in printed.metrics)])
-        rows.append(["", "ours", *(_ours(published.metrics[m], arm, measured) for m in printed.metrics)])
+        rows.append(["", "ours", *_line_of(published, printed.metrics, arm, measured)])
     others = [arm for arm in measured.arms if arm not in printed.rows]
-    rows += [[f"**{arm}**", "ours", *(_ours(published.metrics[m], arm, measured) for m in printed.metrics)] for arm in others]
+    rows += [[f"**{arm}**", "ours", *_line_of(published, printed.metrics, arm, measured)] for arm in others]
     title = f"{printed.title} ({printed.protocol}; {published.source})"
     return f"**{title}**\n\n" + markdown_table(head, rows)
+
+
+def _line_of(published: Published, metrics: Sequence[str], arm: str, measured: Measured) -> list[str]:
+    if arm not in measured.values:
+        return [NOT_RUN, *[""] * (len(metrics) - 1)]
+    return [_ours(published.metrics[metric], arm, measured) for metric in metrics]
 
 
 def _ours(metric: PaperMetric, arm: str, measured: Measured) -> str:
     if metric.ours is None:
         return "-"
     if not measured.has(arm, metric.ours):
-        return NOT_RUN if arm not in measured.values else "null"
+        return "null"
     found = measured.mean(arm, metric.ours)
     digits = 1 if metric.scale > 1 else DIGITS.get(metric.ours, 3)
     text = f"{found.centre * metric.scale:.{digits}f}"
