@@ -161,7 +161,7 @@ def _open_loop(
 
 def _features(works: Iterable[Work]) -> dict[str, dict[str, dict[str, Any]]]:
     stored = {(work.variant.label, work.folder.name): features_of(work) for work in works}
-    metrics = set_metrics(next(iter(stored.values())))
+    metrics = set_metrics(list(stored.values()))
     out: dict[str, dict[str, dict[str, Any]]] = {}
     for (arm, clip), kinds in stored.items():
         out.setdefault(arm, {})[clip] = {metric: vectors(kinds, key, whole) for metric, key, whole in metrics}
