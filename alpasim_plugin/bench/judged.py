@@ -17,13 +17,13 @@ from alpasim_plugin.nets.judges.detect import find_cuboids, find_lanes
 from alpasim_plugin.nets.judges.files import NAMES, check_digests, file_name, load_judge
 from alpasim_plugin.nets.judges.video_net import FRAMES, VideoNet, window_features
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.types import F64, U8, CameraSpec
+from alpasim_plugin.types import F64, U8, CameraSpec, Scenario
 from evaluators.judges.clip import cuboid_values, lane_values
 from evaluators.judges.cuboids import cuboid_f1
-from evaluators.judges.external import read_detections
+from evaluators.judges.external import read_detections, read_tracks
 from evaluators.judges.facts import FD_16, FD_CLIP, FVMD_LK, of_seed, paper_cells
 from evaluators.judges.frechet import frechet_distance, halves, swap_test
-from evaluators.judges.fvmd import RIDGE, motion_features
+from evaluators.judges.fvmd import FVMD, RIDGE, histograms, motion_features
 from evaluators.judges.lane_jitter import lane_jitter_m
 from evaluators.judges.lanes import score_clip
 from scenarios.load import load_scenario
@@ -77,11 +77,20 @@ def camera_of(sequence: PairSequence, scenes: Path | None) -> CameraSpec:
     info = sequence.info.get("camera", {})
     if "T_rig_camera" in info:
         return CameraSpec("camera", int(info["width"]), int(info["height"]), np.array(info["K"]), np.array(info["T_rig_camera"]))
+    return scene_of(sequence, scenes).cameras[0]
+
+
+def scene_of(sequence: PairSequence, scenes: Path | None) -> Scenario:
+    """Return the scene behind a sequence of pairs, from the folder that `simrun train scenes` wrote.
+
+    Raises:
+        InputError: It is not there.
+    """
     path = None if scenes is None else scenes / str(sequence.info.get("split")) / f"{sequence.name}.yaml"
     if path is None or not path.is_file():
-        found = "its camera's mounting is not stored, and there is no scene"
+        found = "its scene, or the mounting of its camera, is asked for, and there is no scene"
         raise InputError(DOING, str(sequence.folder), found, "name the folder of its scenes with --scenes")
-    return load_scenario(path).cameras[0]
+    return load_scenario(path)
 
 
 def judge_clip(
@@ -115,6 +124,8 @@ def judge_clip(
         features |= {FVD_CLIP: i3d_features(i3d, video), FVD_16: i3d_features(i3d, video, FRAMES)}
     if how.detections is not None and truth is not None:
         values |= _external(how.detections, variant, name, len(video))
+    if how.detections is not None and (tracks := how.detections / variant / f"{name}.tracks.npz").is_file():
+        features[FVMD] = np.stack([histograms(window) for window in read_tracks(tracks, len(video))])
     return {metric: value for metric, value in values.items() if value is not None}, features
 
 
@@ -168,20 +179,22 @@ def judge_sets(features: Mapping[str, Sequence[Mapping[str, F64]]], baseline: st
     """
     truth = features[REFERENCE]
     out: dict[str, Any] = {}
-    for metric, key, whole in _set_metrics(truth):
-        reference = [_vectors(clip, key, whole) for clip in truth]
+    for metric, key, whole in set_metrics(truth):
+        reference = [vectors(clip, key, whole) for clip in truth]
         cell: dict[str, Any] = {"oracle": _halves(reference), "dimensions": int(reference[0].shape[1]), "variants": {}}
-        sides = {name: [_vectors(clip, key, whole) for clip in clips] for name, clips in features.items() if name != REFERENCE}
+        made = {name: clips for name, clips in features.items() if name != REFERENCE}
+        sides = {name: [vectors(clip, key, whole) for clip in clips] for name, clips in made.items() if all(key in clip for clip in clips)}
+        cell["variants"] = {name: {"value": None, "reason": "no_detections", "n": 0} for name in made if name not in sides}
         for name, side in sides.items():
             n = sum(len(x) for x in side)
             if min(n, sum(len(x) for x in reference)) < 2:
                 cell["variants"][name] = {"value": None, "reason": "too_few_clips", "n": n}
                 continue
             entry: dict[str, Any] = {
-                "value": frechet_distance(np.concatenate(side), np.concatenate(reference), RIDGE if key == MOTION else 0.0),
+                "value": frechet_distance(np.concatenate(side), np.concatenate(reference), RIDGE if key in (MOTION, FVMD) else 0.0),
                 "n": n,
             }
-            if name != baseline and baseline in sides and key != MOTION:
+            if name != baseline and baseline in sides and key not in (MOTION, FVMD):
                 test = swap_test(side, sides[baseline], reference, swaps=200, seed=seed)
                 entry |= {"difference": test.difference, "p_value": test.p_value}
             cell["variants"][name] = entry
@@ -189,19 +202,20 @@ def judge_sets(features: Mapping[str, Sequence[Mapping[str, F64]]], baseline: st
     return out
 
 
-def _set_metrics(clips: Sequence[Mapping[str, F64]]) -> list[tuple[str, str, bool]]:
-    """Return name, kind of feature, and whether a clip's vectors are averaged, of the set metrics that the features allow."""
+def set_metrics(clips: Sequence[Mapping[str, F64]]) -> list[tuple[str, str, bool]]:
+    """Return name, kind of feature, and whether a clip's vectors are averaged, of the set metrics that all clips have features for."""
     rows: list[tuple[str, str, bool]] = [(FVMD_LK, MOTION, False)]
     for key in clips[0]:
         if key.startswith(WINDOWS):
             seed = int(key.rsplit("-", 1)[1])
             rows += [(of_seed(FD_16, seed), key, False), (of_seed(FD_CLIP, seed), key, True)]
-        if key in (FVD_CLIP, FVD_16):
+        if key in (FVD_CLIP, FVD_16, FVMD) and all(key in clip for clip in clips):
             rows.append((key, key, False))
     return rows
 
 
-def _vectors(clip: Mapping[str, F64], key: str, whole: bool) -> F64:
+def vectors(clip: Mapping[str, F64], key: str, whole: bool) -> F64:
+    """Return a clip's vectors of one kind ``(n, d)``, or their mean ``(1, d)``."""
     x = clip[key]
     return x.mean(axis=0, keepdims=True) if whole and len(x) else x
 
@@ -216,7 +230,7 @@ def paper_row(means: Mapping[str, Mapping[str, Any]], sets: Mapping[str, Any], v
     known = {name: float(entry["mean"]) for name, entry in means.items()}
     known |= {
         name: float(sets[name]["variants"][variant]["value"])
-        for name in (FVD_CLIP, FVD_16)
+        for name in (FVD_CLIP, FVD_16, FVMD)
         if name in sets and sets[name]["variants"].get(variant, {}).get("value") is not None
     }
     return paper_cells(known)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.bench.map_error import MapShift
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -49,6 +50,7 @@ class Variant:
 
     label: str
     spec: PartSpec | None = None  # None for 3dgs and the truth
+    map_shift: MapShift | None = None  # None: the map as it is
 
     def __post_init__(self) -> None:
         if self.spec is None and self.label not in (RAW, TRUTH):
@@ -56,7 +58,8 @@ class Variant:
 
     def content(self) -> dict[str, Any]:
         """Return everything that determines its images."""
-        return {"label": self.label, "fixer": self.spec and self.spec.digest}
+        shift = {} if self.map_shift is None else {"map_shift": self.map_shift.label}
+        return {"label": self.label, "fixer": self.spec and self.spec.digest, **shift}
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from alpasim_plugin.cli import (
     bench_roofline,
     bench_serve,
 )
+from alpasim_plugin.cli.bench_paper import EPILOG as PAPER_EXAMPLES
+from alpasim_plugin.cli.bench_paper import paper
 from alpasim_plugin.cli.bench_rows import print_rows
 from alpasim_plugin.cli.quality import EPILOG as QUALITY_EXAMPLES
 from alpasim_plugin.cli.quality import quality
@@ -37,6 +39,7 @@ app.command("profile", epilog=bench_profile.EPILOG)(bench_profile.profiles)
 app.command("roofline", epilog=bench_roofline.EPILOG)(bench_roofline.roofline)
 app.command("serve", epilog=bench_serve.EPILOG)(bench_serve.serve)
 app.command("quality", epilog=QUALITY_EXAMPLES)(quality)
+app.command("paper", epilog=PAPER_EXAMPLES)(paper)
 
 
 @app.command("raster", epilog="Examples: `simrun bench raster --repeats 20`, `simrun bench raster --gradients`")

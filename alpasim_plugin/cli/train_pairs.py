@@ -11,13 +11,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.jobs import parallel_map
 from alpasim_plugin.cli.training_options import AsJson, Debug, scene_files
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.cache import cache_root
 from alpasim_plugin.renderers.reconstruction import KIND, ensure
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
+from alpasim_plugin.runtime.parallel import parallel_map
 from alpasim_plugin.training.pair_import import PairSources, import_sequence
 from alpasim_plugin.training.pair_sheet import contact_sheet, measure_sequence, sheet, write_sheet
 from alpasim_plugin.training.pair_store import PairDataset

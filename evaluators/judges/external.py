@@ -21,6 +21,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.judge_types import Cuboid, Lane3D
 from alpasim_plugin.reading import parsing, read_json_object
 from alpasim_plugin.types import F64
+from evaluators.judges.fvmd import EVERY, FRAMES, GRID
 from evaluators.judges.lanes import resampled
 
 DOING = "reading a detector's results"
@@ -71,6 +72,28 @@ def read_detections(path: Path, frames: int) -> Detections:
         found = f"frames {sorted(numbers)[:3]} ... {max(numbers, default=0)} of a clip of {frames}"
         raise InputError(DOING, str(path), found, "list every frame once, counted from 0")
     return Detections(detector, weights, cuboids, lanes, K, size)
+
+
+def read_tracks(path: Path, frames: int) -> F64:
+    """Read a clip's tracks of points: an ``.npz`` with ``tracks (W, 16, 400, 2)``, a window of 16 frames every 25.
+
+    The first index of the last axis is x; both are pixels of the 256x256 image.
+
+    Args:
+        path: The file.
+        frames: Frames of the clip.
+
+    Raises:
+        InputError: Not of this form, other windows than the clip has, or a value that is not finite.
+    """
+    doing, do = "reading tracks", "write one window of 16 frames for every 25, 400 points each, as docs/judges.md describes"
+    with parsing(doing, path, do, "not an archive with tracks"), np.load(path) as stored:
+        tracks = np.asarray(stored["tracks"], dtype=np.float64)
+    wanted = (len(range(0, frames - FRAMES + 1, EVERY)), FRAMES, GRID * GRID, 2)
+    if tracks.shape != wanted or not np.isfinite(tracks).all():
+        found = f"shape {tracks.shape}" if tracks.shape != wanted else "a value that is not finite"
+        raise InputError(doing, str(path), f"{found}, a clip of {frames} frames has {wanted}", do)
+    return tracks
 
 
 def _cuboid(row: Mapping[str, Any], bottom: bool) -> Cuboid:

@@ -32,7 +32,7 @@ PAPER: Mapping[str, str] = {
     "fvd_16": "i3d_torchscript.pt in --metric-weights",
     "lpips_alex": "alexnet-owt-7be5be79.pth and lpips-v0.1-alex.pth in --metric-weights",
     "dists": "vgg16-397923af.pth and dists.pt in --metric-weights",
-    "fvmd": "PIPs++ tracks in --detections",
+    "fvmd": "PIPs++ tracks (CLIP.tracks.npz) in --detections",
     "cuboid_f1": "a detector's boxes in --detections",
     "lane_f1": "a detector's lanes in --detections",
     "lane_xerr_m": "a detector's lanes in --detections",

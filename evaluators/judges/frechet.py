@@ -48,7 +48,9 @@ def frechet_distance(a: F64, b: F64, ridge: float = 0.0) -> float:
 def _moments(x: F64) -> tuple[F64, F64]:
     x = np.asarray(x, dtype=np.float64)
     mean = x.mean(axis=0)
-    return mean, (x - mean) / np.sqrt(len(x) - 1)
+    A = (x - mean) / np.sqrt(len(x) - 1)
+    # A = Q R has the singular values of R in every product with it: d rows are enough.
+    return mean, A if len(A) <= A.shape[1] else np.asarray(np.linalg.qr(A, mode="r"))
 
 
 def check_features(a: F64, b: F64) -> None:

@@ -17,6 +17,7 @@ from alpasim_plugin.types import F32, F64, U8
 from evaluators.judges.frechet import frechet_distance
 from evaluators.video.frames import check_stack
 
+FVMD = "fvmd"  # with tracks of PIPs++, which the user supplies
 FRAMES, EVERY, SIDE_PX, JPEG = 16, 25, 256, 95
 GRID, FIRST_PX, LAST_PX = 20, 8.0, 248.0
 CELL, SPAN, ANGLES = 5, 4, 8  # points, frames, bins

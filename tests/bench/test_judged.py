@@ -67,6 +67,33 @@ def test_a_users_detector_fills_the_papers_names(tmp_path: Path) -> None:
         judge_clip("a", "v9", CLEAN, CLEAN, CAMERA, Judging((), detections=tmp_path))
 
 
+def write_tracks(folder: Path, variant: str, name: str, tracks: np.ndarray) -> None:
+    (folder / variant).mkdir(parents=True, exist_ok=True)
+    np.savez(folder / variant / f"{name}.tracks.npz", tracks=tracks)
+
+
+def test_tracks_of_the_users_give_the_papers_fvmd_and_a_variant_without_them_is_null(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    start = rng.uniform(20, 200, size=(1, 1, 400, 2))
+    features: dict[str, list[dict[str, np.ndarray]]] = {"truth": [], "v9": [], "3dgs": []}
+    for name in ("a", "b", "c"):
+        tracks = start + rng.normal(size=(1, 16, 400, 2)).cumsum(axis=1)
+        write_tracks(tmp_path, "truth", name, tracks)
+        write_tracks(tmp_path, "v9", name, tracks + 0.5 * rng.normal(size=tracks.shape))
+        for variant, mine in features.items():
+            truth = None if variant == "truth" else CLEAN
+            mine.append(judge_clip(name, variant, CLEAN, truth, CAMERA, Judging((), detections=tmp_path))[1])
+    found = judge_sets(features, "3dgs")["fvmd"]["variants"]
+    assert found["v9"]["value"] > 0
+    assert found["v9"]["n"] == 3
+    assert found["3dgs"] == {"value": None, "reason": "no_detections", "n": 0}
+    cells = paper_row({}, {"fvmd": {"variants": found}}, "v9")
+    assert cells["fvmd"]["value"] == found["v9"]["value"]
+    write_tracks(tmp_path, "v9", "a", np.zeros((2, 16, 400, 2)))
+    with pytest.raises(InputError, match=r"a clip of 17 frames has \(1, 16, 400, 2\)"):
+        judge_clip("a", "v9", CLEAN, CLEAN, CAMERA, Judging((), detections=tmp_path))
+
+
 def clips(seed: int, shift: float = 0.0, count: int = 6) -> list[dict[str, np.ndarray]]:
     rng = np.random.default_rng(seed)
     return [{MOTION: rng.poisson(1.0, (2, 32)) + shift, "windows-0": rng.normal(size=(3, 8)) + shift} for _ in range(count)]

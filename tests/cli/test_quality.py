@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.bench.quality_run import Work, finish, identity, lose_resolution, shown_frames
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.cli.quality import Work, finish, identity, lose_resolution, parse_variants, shown_frames
+from alpasim_plugin.cli.quality import parse_variants
 from alpasim_plugin.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
 from alpasim_plugin.fixers.settings import OneFixerSettings

@@ -1,0 +1,242 @@
+"""The paper's comparison on our clips: which arms there are, what each protocol measures, and what becomes of it.
+
+A protocol is a folder below the output with the rows of its clips. What is up to date there is not measured again, so the same command
+resumes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
+from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
+from alpasim_plugin.bench.quality import RAW, Variant
+from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.parts import resolve
+from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.paper.measured import Measured, from_rows
+from evaluators.paper.page import ShownClip
+from evaluators.video.summary import TRUTH
+
+DOING = "making the paper's comparison"
+BUNDLE = "fixer.safetensors"
+STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
+OURS = "V9"  # the paper's own method on the backbone that the arms share
+SHIPPED = ("onefixer", "onefixer-dit-tiny")  # rows of their own in every table
+ABLATION = ("V1", "V2", "V3", "V3b", "V4", "V5", "V6", "V7", "V8", "V9")
+PAPER_LENGTH = {"cycle": 198, "under-trained": 900, "map-error": 198}
+CURVES = ("psnr_db", "perceptual-syn", "warp_l1")
+Told = Callable[[str, int, int, Work, Mapping[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class PaperRun:
+    """What is compared, on what, how.
+
+    Args:
+        pairs: Folder of pairs; the sequences of ``split`` with a cycle render are the protocol ``cycle``, the others ``under-trained``.
+        scenes: Folder of their scenes.
+        arms: Folder with ``NAME/fixer.safetensors`` for every trained arm.
+        out: Folder of the results.
+        split: Of the pairs.
+        long: Folder of pairs for ``under-trained`` instead, of longer sequences.
+        drives: Finished run folder of the closed loop; None: that table is not made.
+        clips: At most so many clips of a protocol, evenly chosen.
+        frames: First frames of a clip; None: as many as in the paper.
+        judging: Which judges are asked.
+        jobs: Clips at a time.
+        seed: Of noise and swaps.
+        filmed: Clips on the page.
+        map_clips: Clips of the protocol ``map-error``.
+    """
+
+    pairs: Path
+    scenes: Path | None
+    arms: Path
+    out: Path
+    split: str = "test-known"
+    long: Path | None = None
+    drives: Path | None = None
+    clips: int | None = None
+    frames: int | None = None
+    judging: Judging | None = None
+    jobs: int = 1
+    seed: int = 0
+    filmed: int = 2
+    map_clips: int = 8
+    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop")
+
+
+@dataclass
+class Compared:
+    """What was measured.
+
+    Args:
+        measured: PROTOCOL -> values and features by arm.
+        works: PROTOCOL -> its works.
+        shown: Clips of the page.
+    """
+
+    measured: dict[str, Measured] = field(default_factory=dict)
+    works: dict[str, list[Work]] = field(default_factory=dict)
+    shown: list[ShownClip] = field(default_factory=list)
+
+
+def arms_in(folder: Path) -> tuple[Variant, ...]:
+    """Return the arms that were trained: a variant for each number of steps that the paper reports, in alphabetical order.
+
+    Raises:
+        InputError: No folder, or a bundle that is none.
+    """
+    if not folder.is_dir():
+        raise InputError(
+            DOING, f"--arms {folder}", "no such folder", "train arms into it: 'simrun train fixer --recipe NAME --out ARMS/NAME'"
+        )
+    found: list[Variant] = []
+    for path in sorted(folder.glob(f"*/{BUNDLE}")):
+        name, settings = bundle_fixer(path)
+        arm = path.parent.name
+        for steps in STEPS.get(arm, (None,)):
+            label, fixer = (arm, name) if steps is None else (f"{arm}@{steps}", f"{name}@{steps}")
+            found.append(Variant(label, resolve("fixer", fixer, settings)))
+    return tuple(found)
+
+
+def compare_arms(run: PaperRun, told: Told) -> Compared:
+    """Measure every arm under every protocol that is asked for.
+
+    Raises:
+        InputError: No clip for a protocol.
+    """
+    out = Compared()
+    arms = (Variant(RAW), *(Variant(name, resolve("fixer", name, ())) for name in SHIPPED), *arms_in(run.arms))
+    for name in ("cycle", "under-trained"):
+        if name in run.protocols:
+            sequences = _sequences(run, name)
+            _open_loop(run, name, sequences, arms, frozenset(s.name for s in evenly(sequences, run.filmed)), told, out)
+    if "cycle" in run.protocols:
+        out.shown = shown_clips(out.works["cycle"])
+    shifted = _shifted(arms)
+    if "map-error" in run.protocols and shifted:
+        _open_loop(run, "map-error", evenly(_sequences(run, "cycle"), run.map_clips), shifted, frozenset(), told, out)
+        out.measured["map-error"] = grouped(out.measured["map-error"])
+    if "closed-loop" in run.protocols and run.drives is not None:
+        out.measured["closed-loop"] = drives(run.drives)
+    return out
+
+
+def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:
+    cycle, long = protocol == "cycle", protocol == "under-trained" and run.long is not None
+    folder = run.long if long and run.long is not None else run.pairs
+    everything = PairDataset(folder, run.split).sequences
+    chosen = everything if long else [s for s in everything if (s.info["degradation"]["kind"] == "cycle") == cycle]
+    if not chosen:
+        raise InputError(
+            DOING, f"{folder}, split {run.split}", f"no clip of the protocol {protocol}", "make such pairs, or leave it out with --only"
+        )
+    return evenly(chosen, run.clips)
+
+
+def _open_loop(
+    run: PaperRun, name: str, sequences: Sequence[PairSequence], arms: Sequence[Variant], filmed: frozenset[str], told: Told, out: Compared
+) -> None:
+    measuring = QualityRun(
+        sequences, arms, run.out / name, frames=run.frames or PAPER_LENGTH[name], seed=run.seed, jobs=run.jobs, filmed=filmed,
+        judging=run.judging, scenes=run.scenes,
+    )  # fmt: skip
+    works = measuring.works()
+    for i, (work, row) in enumerate(measuring.finished(works), start=1):
+        told(name, i, len(works), work, row)
+    out.works[name] = works
+    out.measured[name] = Measured(from_rows([row_of(work) for work in works]), _features(works) if run.judging else None, TRUTH, run.seed)
+
+
+def _features(works: Iterable[Work]) -> dict[str, dict[str, dict[str, Any]]]:
+    stored = {(work.variant.label, work.folder.name): features_of(work) for work in works}
+    metrics = set_metrics(list(stored.values()))
+    out: dict[str, dict[str, dict[str, Any]]] = {}
+    for (arm, clip), kinds in stored.items():
+        out.setdefault(arm, {})[clip] = {metric: vectors(kinds, key, whole) for metric, key, whole in metrics}
+    return out
+
+
+def _shifted(arms: Sequence[Variant]) -> tuple[Variant, ...]:
+    """Return our method under all wrong maps, and the arm without a map as the line to stay above."""
+    by_name = {arm.label: arm for arm in arms}
+    ours = by_name.get(OURS) or by_name.get(SHIPPED[0])
+    if ours is None:
+        return ()
+    wrong = tuple(replace(ours, label=f"{ours.label} {shift.label}", map_shift=shift) for shift in CONFIGURATIONS)
+    return (Variant(RAW), *wrong, *([by_name["V5"]] if "V5" in by_name else []))
+
+
+def grouped(measured: Measured) -> Measured:
+    """Average the configurations of a wrong map by how far lanes are aside, and by how far boxes are, clip by clip.
+
+    Returns:
+        Arms ``NAME, lanes 0.25 m aside`` and ``NAME, boxes 0.35 m aside`` beside those without a shift.
+    """
+    shifts = {shift.label: shift for shift in CONFIGURATIONS}
+    values: dict[str, dict[str, dict[str, list[float]]]] = {}
+    plain: dict[str, Mapping[str, Mapping[str, float]]] = {}
+    for arm, clips in measured.values.items():
+        name, _, label = arm.rpartition(" ")
+        if label not in shifts:
+            plain[arm] = clips
+            continue
+        for group in _groups(name, shifts[label]):
+            for clip, found in clips.items():
+                for metric, value in found.items():
+                    values.setdefault(group, {}).setdefault(clip, {}).setdefault(metric, []).append(value)
+    means = {
+        group: {clip: {metric: float(np.mean(many)) for metric, many in found.items()} for clip, found in clips.items()}
+        for group, clips in values.items()
+    }
+    return Measured({**plain, **dict(sorted(means.items()))}, None, measured.reference, measured.seed)
+
+
+def _groups(name: str, shift: MapShift) -> tuple[str, str]:
+    return f"{name}, lanes {abs(shift.lanes_left_m):.2f} m aside", f"{name}, boxes {shift.boxes_m:.2f} m aside"
+
+
+def drives(folder: Path) -> Measured:
+    """Return a run of the closed loop as arms and scenes: the mean over seeds of each scene, which is the unit of the intervals.
+
+    Raises:
+        InputError: No finished run.
+    """
+    path = folder / "rollouts.parquet"
+    if not path.is_file():
+        raise InputError(DOING, f"--drives {folder}", "no rollouts.parquet", "name the folder of a finished run")
+    metrics = ("collision_at_fault", "offroad", "route_distance_m")
+    rows = pq.read_table(path).to_pylist()
+    many: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for row in rows:
+        for metric in metrics:
+            if row["status"] == "ok" and row.get(metric) is not None:
+                many.setdefault(row["renderer"], {}).setdefault(row["scene"], {}).setdefault(metric, []).append(float(row[metric]))
+    return Measured(
+        {arm: {s: {m: float(np.mean(v)) for m, v in found.items()} for s, found in scenes.items()} for arm, scenes in many.items()}
+    )
+
+
+def shown_clips(works: Sequence[Work]) -> list[ShownClip]:
+    """Return the filmed clips with the curves of all arms, the clean frames last."""
+    clips: dict[str, list[Work]] = {}
+    for work in works:
+        if work.filmed:
+            clips.setdefault(work.folder.name, []).append(work)
+    shown = []
+    for name, mine in clips.items():
+        rows = {work.variant.label: row_of(work) for work in mine}
+        curves = {m: {arm: row["series"][m] for arm, row in rows.items() if m in row["series"]} for m in CURVES}
+        shown.append(ShownClip(name, {work.variant.label: film_of(work) for work in mine}, curves))
+    return shown

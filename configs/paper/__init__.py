@@ -1,0 +1,1 @@
+"""Published numbers that ours are printed beside."""

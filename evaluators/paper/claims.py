@@ -1,0 +1,149 @@
+"""The paper's claims as contests between arms: what must be better than what, on which metric, under which protocol.
+
+The list is that of the paper's text and tables, in the words of our metrics. A metric that the paper measures with networks of others
+is replaced by ours (`published`), so a claim is tested in the form that can be tested here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+Relation = Literal["better", "not better", "close"]
+FD, PERCEPTUAL, CUBOID, XERR, LANE, JITTER = (
+    "fd_syn_clip", "perceptual-syn", "cuboid_f1_syn", "lane_xerr_syn_m", "lane_f1_syn", "lane_jitter_syn_m",
+)  # fmt: skip
+MOTION, WARP, PSNR, SSIM, MS = "fvmd_lk", "warp_l1", "psnr_db", "ssim", "ms_per_frame"
+CLOSE = 0.10  # share of the second arm's value below which a difference counts as none
+
+ONE_STEP = ("difix", "harmonizer", "harmonizer-temporal", "artifixer", "omnidreams@1", "self-forcing", "one-forcing")
+ALL_ARMS = ("gsfix3d@8", *ONE_STEP, "3dgs-enhancer@8", "artifixer-pre@1", "artifixer-pre@4", "omnidreams@4")
+LONG_ARMS = tuple(arm for arm in ALL_ARMS if not arm.startswith("artifixer-pre"))
+DISTILLED = ("self-forcing", "one-forcing")
+OURS = "V9"  # the paper's own method on the shared backbone
+
+
+@dataclass(frozen=True)
+class Contest:
+    """One comparison.
+
+    Args:
+        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop`` or ``map-error``.
+        metric: Ours.
+        first, second: Arms.
+        relation: ``better``: the paired difference favours the first; ``not better``: it does not; ``close``: its interval lies within a
+            tenth of the second's value.
+    """
+
+    protocol: str
+    metric: str
+    first: str
+    second: str
+    relation: Relation = "better"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper.
+
+    Args:
+        number: In the order of the paper.
+        text: The claim.
+        where: Table or figure.
+        contests: All must come out for the claim to hold.
+    """
+
+    number: int
+    text: str
+    where: str
+    contests: tuple[Contest, ...]
+
+
+def each(protocol: str, metrics: Sequence[str], first: str, rivals: Sequence[str], relation: Relation = "better") -> tuple[Contest, ...]:
+    """Return the contests of an arm with every rival on every metric."""
+    return tuple(Contest(protocol, metric, first, rival, relation) for metric in metrics for rival in rivals)
+
+
+CLAIMS: tuple[Claim, ...] = (
+    Claim(
+        1, "OneFixer is best on FVD, LPIPS, DISTS, Cuboid F1 and lane x-error (Waymo), on all but jitter and Warp L1 (Seoul)", "Table 1",
+        (
+            *each("cycle", (FD, PERCEPTUAL, CUBOID, XERR), OURS, ALL_ARMS),
+            *each("under-trained", (FD, PERCEPTUAL, CUBOID, XERR, PSNR, SSIM, LANE, MOTION), OURS, LONG_ARMS),
+        ),
+    ),
+    Claim(
+        2, "Distilled arms have the best PSNR and SSIM, and worse LPIPS, DISTS, FVD and FVMD than OneFixer", "Table 1, Waymo",
+        (
+            *(contest for arm in DISTILLED for contest in each("cycle", (PSNR, SSIM), arm, (OURS,))),
+            *each("cycle", (PERCEPTUAL, FD, MOTION), OURS, DISTILLED),
+        ),
+    ),
+    Claim(
+        3, "Temporal Harmonizer has the best Warp L1 and is otherwise no better than the frame-wise one", "Table 1",
+        (
+            *each("cycle", (WARP,), "harmonizer-temporal", (*(arm for arm in ALL_ARMS if arm != "harmonizer-temporal"), OURS)),
+            *each("cycle", (FD, PERCEPTUAL, PSNR, CUBOID, XERR), "harmonizer-temporal", ("harmonizer",), "not better"),
+        ),
+    ),
+    Claim(
+        4, "OmniDreams at 4 steps is better than at 1 on LPIPS, FVD and FVMD, and worse on Warp L1 over 900 frames", "Table 1",
+        (
+            *each("cycle", (PERCEPTUAL, FD, MOTION), "omnidreams@4", ("omnidreams@1",)),
+            *each("under-trained", (PERCEPTUAL, FD, MOTION), "omnidreams@4", ("omnidreams@1",)),
+            Contest("under-trained", WARP, "omnidreams@1", "omnidreams@4"),
+        ),
+    ),
+    Claim(
+        5, "Distillation improves ArtiFixer at one step (FVD 13.3 to 8.46); before it, four steps stay better (6.88)", "Table 1, Waymo",
+        (Contest("cycle", FD, "artifixer", "artifixer-pre@1"), Contest("cycle", FD, "artifixer-pre@4", "artifixer")),
+    ),
+    Claim(
+        6, "Own history (V2) moves better than clean history (V1) but stays perceptually worse; LPIPS alone (V3) is as close but moves "
+        "worse; V9 is the best balance", "Table 2a",
+        (
+            Contest("cycle", MOTION, "V2", "V1"),
+            Contest("cycle", PERCEPTUAL, "V3", "V2"),
+            Contest("cycle", MOTION, OURS, "V3"),
+            *each("cycle", (FD,), OURS, ("V1", "V2", "V3")),
+        ),
+    ),
+    Claim(
+        7, "From noise (V6) collapses; re-denoised history (V8) has the worst LPIPS of the joint variants; two stages (V7) and k = 1 (V4) "
+        "have worse FVD and FVMD", "Table 2a",
+        (
+            *each("cycle", (FD, PERCEPTUAL), "3dgs", ("V6",)),
+            *(Contest("cycle", PERCEPTUAL, joint, "V8") for joint in ("V4", "V5", OURS)),
+            *each("cycle", (FD, MOTION), OURS, ("V7", "V4")),
+            Contest("cycle", PERCEPTUAL, OURS, "V4", "close"),
+        ),
+    ),
+    Claim(
+        8, "Without a map (V5) it still beats every one-step baseline on FVD, LPIPS and Cuboid F1", "Tables 2a and 1",
+        each("cycle", (FD, PERCEPTUAL, CUBOID), "V5", ONE_STEP),
+    ),
+    Claim(
+        9, "In closed loop DiFix collides more than the raw render and leaves the road less; arms of the same backbone stay near the raw "
+        "render", "Table 2b",
+        (
+            Contest("closed-loop", "collision_at_fault", "3dgs", "difix"),
+            Contest("closed-loop", "offroad", "difix", "3dgs"),
+            *each("closed-loop", ("collision_at_fault",), "omnidreams@4", ("3dgs",), "close"),
+            *each("closed-loop", ("collision_at_fault",), "self-forcing", ("3dgs",), "close"),
+        ),
+    ),
+    Claim(
+        10, "Over 900 frames distilled arms are close to OmniDreams at one step", "Table 1, Seoul",
+        tuple(contest for arm in DISTILLED for contest in each("under-trained", (PERCEPTUAL, PSNR), arm, ("omnidreams@1",), "close")),
+    ),
+    Claim(
+        11, "OneFixer takes far less time a frame than video fixers; with a shifted map its lanes and vehicles stay better than with none",
+        "latency and robustness figures",
+        (
+            *each("cycle", (MS,), OURS, ("3dgs-enhancer@8", "omnidreams@4", "artifixer-pre@4")),
+            *each("map-error", (LANE,), "V9, lanes 0.50 m aside", ("V5",)),
+            *each("map-error", (CUBOID,), "V9, boxes 0.35 m aside", ("V5",)),
+        ),
+    ),
+)  # fmt: skip

@@ -1,0 +1,116 @@
+"""Markdown of the comparison: the paper's value above ours for every arm, paired differences, and the verdict of every claim."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from evaluators.metrics import info
+from evaluators.paper.measured import Difference, Measured
+from evaluators.paper.published import PaperMetric, Published
+from evaluators.paper.verdict import Judged, Result
+from evaluators.video.table import DIGITS, SCALE
+
+NOT_RUN = "not run"
+ARROWS = {"higher": "↑", "lower": "↓"}
+
+
+def paper_against_ours(published: Published, table: str, measured: Measured) -> str:
+    """Return one table of the paper: for every arm a line of the paper's numbers and a line of ours; the first line names our metrics.
+
+    Arms that the paper does not have (``3dgs``, the per-frame ``onefixer``, variants of another table) follow, with our line alone.
+    """
+    printed = published.tables[table]
+    head = ["arm", "", *(f"{published.metrics[m].heading} {ARROWS[published.metrics[m].better]}" for m in printed.metrics)]
+    rows = [["", "*ours*", *(f"`{ours}`" if (ours := published.ours(m)) else "-" for m in printed.metrics)]]
+    for arm, cells in printed.rows.items():
+        rows.append([f"**{arm}**", "paper", *(cells[m].text if m in cells else "not reported" for m in printed.metrics)])
+        rows.append(["", "ours", *_line_of(published, printed.metrics, arm, measured)])
+    others = [arm for arm in measured.arms if arm not in printed.rows]
+    rows += [[f"**{arm}**", "ours", *_line_of(published, printed.metrics, arm, measured)] for arm in others]
+    title = f"{printed.title} ({printed.protocol}; {published.source})"
+    return f"**{title}**\n\n" + markdown_table(head, rows)
+
+
+def _line_of(published: Published, metrics: Sequence[str], arm: str, measured: Measured) -> list[str]:
+    if arm not in measured.values:
+        return [NOT_RUN, *[""] * (len(metrics) - 1)]
+    return [_ours(published.metrics[metric], arm, measured) for metric in metrics]
+
+
+def _ours(metric: PaperMetric, arm: str, measured: Measured) -> str:
+    if metric.ours is None:
+        return "-"
+    if not measured.has(arm, metric.ours):
+        return "null"
+    found = measured.mean(arm, metric.ours)
+    digits = 1 if metric.scale > 1 else DIGITS.get(metric.ours, 3)
+    text = f"{found.centre * metric.scale:.{digits}f}"
+    if found.low is None or found.high is None:
+        return text
+    return f"{text}±{(found.high - found.low) / 2 * metric.scale:.{digits}f}"
+
+
+def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Sequence[str]) -> str:
+    """Return the paired differences ``arm - rival``; those that are shown are bold."""
+    rows = []
+    for rival in rivals:
+        cells = []
+        for metric in metrics:
+            there = measured.has(arm, metric) and measured.has(rival, metric)
+            cells.append(difference_text(measured.difference(metric, arm, rival)) if there else NOT_RUN)
+        rows.append([rival, *cells])
+    return markdown_table([f"{arm} minus", *(f"{m} {ARROWS.get(info(m).direction, '')}" for m in metrics)], rows)
+
+
+def difference_text(found: Difference) -> str:
+    """Return a difference with its half-width, or with its p-value for a metric of whole sets; bold where it is shown."""
+    digits, scale = DIGITS.get(found.metric, 4), SCALE.get(found.metric, 1.0)
+    text = f"{found.difference * scale:+.{digits}f}"
+    if found.low is not None and found.high is not None:
+        text += f" ± {(found.high - found.low) / 2 * scale:.{digits}f}"
+    elif found.p_value is not None:
+        text += f" (p {found.p_value:.3f})"
+    return f"**{text}**" if found.favours else text
+
+
+def verdicts(judged: Sequence[Judged], reasons: Mapping[int, str]) -> str:
+    """Return a line for every claim, and below it a paragraph for each that does not hold: which contests, and why.
+
+    Args:
+        judged: All claims.
+        reasons: Number of a claim -> why it comes out as it does here, written by whoever looked; nothing is made up for the others.
+    """
+    rows = [[str(one.claim.number), one.claim.text, one.claim.where, f"**{one.verdict}**", _tally(one)] for one in judged]
+    out = [markdown_table(["", "claim", "where", "verdict", "contests"], rows)]
+    for one in judged:
+        if one.verdict == "not measured":
+            missing = sorted({result.missing for result in one.results if result.missing})
+            out.append(
+                f"**Claim {one.claim.number}** was not measured: {'; '.join(missing[:6])}{' and others' if len(missing) > 6 else ''}.\n"
+            )
+            continue
+        telling = [
+            r for r in one.results if r.outcome == ("for" if one.verdict == "holds" else "against" if one.count("against") else "open")
+        ]
+        lines = "".join(f"- {_sentence(result)}\n" for result in telling[:8])
+        more = f"- and {len(telling) - 8} more\n" if len(telling) > 8 else ""
+        why = f"\n{reasons[one.claim.number]}\n" if one.claim.number in reasons else ""
+        out.append(f"**Claim {one.claim.number}: {one.verdict}.**\n\n{lines}{more}{why}")
+    return "\n".join(out)
+
+
+def _tally(one: Judged) -> str:
+    names = ("for", "against", "open", "not measured")
+    return ", ".join(f"{count} {name}" for name in names if (count := one.count(name)))  # type: ignore[arg-type]
+
+
+def _sentence(result: Result) -> str:
+    contest = result.contest
+    assert result.difference is not None
+    return f"{contest.protocol}, `{contest.metric}`: {contest.first} minus {contest.second} {difference_text(result.difference)}"
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table whose first column is left-aligned and the others right-aligned."""
+    lines = [head, ["---", *(["---:"] * (len(head) - 1))], *rows]
+    return "".join(f"| {' | '.join(cell for cell in line)} |\n" for line in lines)

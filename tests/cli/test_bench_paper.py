@@ -1,0 +1,84 @@
+"""`simrun bench paper`: two protocols over made-up pairs, once and again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.bench import paper as bench_paper
+from alpasim_plugin.cli.main import run_command
+from tests.training.pair_files import make
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    for name, kind in (("a", "cycle"), ("b", "cycle"), ("c", "reconstruction"), ("d", "reconstruction")):
+        sequence = make(tmp_path / "pairs", "val", name, frames=6)
+        path = sequence.folder / "sequence.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "degradation": {"kind": kind}}))
+    return tmp_path / "pairs"
+
+
+def test_tables_verdicts_and_a_page_and_nothing_is_measured_twice(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_paper, "SHIPPED", ("onefixer",))
+    (tmp_path / "arms").mkdir()
+    out = tmp_path / "out"
+    command = [
+        "bench",
+        "paper",
+        str(data),
+        "--arms",
+        str(tmp_path / "arms"),
+        "--split",
+        "val",
+        "--only",
+        "cycle,under-trained",
+        "--out",
+        str(out),
+    ]
+    assert run_command([*command, "--json"]) == 0
+    verdicts = json.loads(capsys.readouterr().out)
+    assert [one["verdict"] for one in verdicts] == ["not measured"] * 11
+    text = (out / "paper.md").read_text()
+    assert "**3dgs** | ours" in text
+    assert "**onefixer** | ours" in text
+    page = (out / "side-by-side.html").read_text()
+    assert page.count('class="arm"') == 3
+    rows = {path: path.stat().st_mtime_ns for path in out.rglob("clips/*/*.json")}
+    assert len(rows) == 2 * 2 * 3
+    assert run_command(command) == 0
+    assert {path: path.stat().st_mtime_ns for path in rows} == rows
+
+
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        (["--only", "cycle,loop"], "unknown: loop"),
+        (["--arms", "nowhere"], "no such folder"),
+        (["--drives", "."], "no rollouts.parquet"),
+        (["--reasons", "why.json"], "no such file"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], found: str
+) -> None:
+    (tmp_path / "arms").mkdir()
+    command = [
+        "bench",
+        "paper",
+        str(data),
+        "--split",
+        "val",
+        "--arms",
+        str(tmp_path / "arms"),
+        "--only",
+        "closed-loop",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert run_command([*command, *more]) == 2
+    assert found in " ".join(capsys.readouterr().err.split())
