@@ -18,6 +18,7 @@ from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDeco
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
+from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
 from alpasim_plugin.nets.schedule import CONTEXT_STEP, from_names
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
@@ -70,13 +71,27 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, sou
         source: Where the weights come from, for errors.
 
     Raises:
-        InputError: Weights that do not fit together, or whose map input has other channels than streaming gives.
+        InputError: Weights that do not fit together, or that take another condition than the settings give.
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
-    if net.sizes.map_channels != LATENT:
-        found = f"its map input has {net.sizes.map_channels} channels, streaming gives {LATENT} (variant V6 takes the render there)"
-        raise InputError(DOING, source, found, "train a variant that starts from the render, for example V9")
+    expected = condition_sizes(settings)
+    found = {key: getattr(net.sizes, key) for key in expected}
+    if found != expected:
+        do = "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them"
+        raise InputError(DOING, source, f"{_listed(found)}, streaming gives {_listed(expected)}", do)
     return net
+
+
+def condition_sizes(settings: OneFixerSettings) -> dict[str, int]:
+    """Return the sizes of the condition that streaming gives a transformer."""
+    return {
+        "map_channels": LATENT * (1 + settings.render_input),
+        "opacity_channels": OPACITY_CHANNELS if settings.opacity_input else 0,
+    }
+
+
+def _listed(sizes: Mapping[str, int]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in sizes.items())
 
 
 @lru_cache(maxsize=4)
@@ -125,7 +140,7 @@ class Parts:
         given = self.tensors("dit")
         if given is None:
             self.allow_untrained("dit")
-            sizes = DiTSizes(**settings.dit.model_dump())
+            sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
             given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
         return streaming_dit(given[0], settings, given[1])
 
