@@ -146,6 +146,7 @@ class OneFixerSettings(FixerSettings):
     untrained: Literal["identity", "random", "refuse"] = Field(
         default="refuse", description="Initialisation without weights: an identity, random, or an error (refuse)."
     )
+    trained_by: str | None = Field(default=None, description="Command that trains the weights, for the error where there are none.")
     window: Positive = Field(default=6, description="Attention window in latents, the block itself and the sink included.")
     sink: int = Field(default=0, ge=0, description="Attention sink: first latents of the rollout that stay in the window.")
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")

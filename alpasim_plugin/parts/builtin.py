@@ -27,6 +27,11 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "onefixer-dit-tiny": (_BLOCKS, "one-step causal transformer on latents, block by block, for a CPU at 256x144"),
         "onefixer-dit-s": (_BLOCKS, "the same for a small GPU"),
         "onefixer-2b": (_BLOCKS, "the same at the size of OmniDreams single view; needs its weights"),
+        "omnidreams": (_BLOCKS, "arm of the comparison: diffusion forcing from the mixed source; to be trained"),
+        "self-forcing": (_BLOCKS, "arm of the comparison: distilled on its own rollouts; to be trained"),
+        "one-forcing": (_BLOCKS, "arm of the comparison: the same with an adversarial head; to be trained"),
+        "artifixer-pre": (_BLOCKS, "arm of the comparison: opacity in every block, long blocks; to be trained"),
+        "artifixer": (_BLOCKS, "arm of the comparison: the same, distilled; to be trained"),
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
     "policy": {

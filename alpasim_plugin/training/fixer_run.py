@@ -8,6 +8,7 @@ Every stage resumes from its own checkpoint; a finished one makes no update. A l
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -145,15 +146,16 @@ def _train_stage(
     before: int,
 ) -> Path:
     """Train one stage and write its bundle."""
-    task = stage.objective.task(stage_inputs(run, stage, clips, files, distance))
+    inputs = stage_inputs(run, stage, clips, files, distance)
+    task = stage.objective.task(inputs)
     for name, parameter in task.parts.named_parameters():
         parameter.requires_grad_(any(f"{name}.".startswith(f"{part}.") for part in stage.trained))
     schedule = run.schedule_of(stage)
     facts = {
         **task.facts, "recipe": run.recipe.name, "stage": stage.name, "clips": len(clips), "latents": clips.digest,
-        "batches": asdict(run.batches), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
-        "attention": asdict(stage.attention(clip_latents(run, stage))), "distance": distance[0] if distance else "none",
-        "start": {part: _digest(files, source) for part, source in stage.start.items()},
+        "batches": asdict(inputs.form), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
+        "attention": asdict(inputs.attention), "distance": distance[0] if distance else "none",
+        "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
         "vae": file_sha256(run.vae), "precision": str(run.precision),
     }  # fmt: skip
     trainer = Trainer(task.parts, folder, schedule, task.batch, task.loss, facts, run.precision, parts=stage.trained)
@@ -206,7 +208,7 @@ def deployed_settings(run: FixerRun, stage: Stage) -> OneFixerSettings:
     said = run.recipe.settings(stage, clip_latents(run, stage))
     fold = {"fold": False} if said["opacity_input"] else {}
     try:
-        return OneFixerSettings.model_validate({**run.settings.model_dump(), **said, **fold})
+        return type(run.settings).model_validate({**run.settings.model_dump(), **said, **fold})
     except ValueError as error:
         raise InputError("deploying a recipe", f"{run.recipe.name}, stage {stage.name}", str(error), "correct the recipe") from error
 
@@ -245,9 +247,14 @@ def _weights(files: Mapping[str, Path], source: str) -> Weights | None:
     return parts[part]
 
 
-def _digest(files: Mapping[str, Path], source: str) -> str | None:
-    name = source.partition(".")[0]
-    return f"{source.partition('.')[2]} of {file_sha256(files[name])}" if name in files else None
+def _digest(weights: Weights | None) -> str | None:
+    """Return a digest of tensors. A file's would not do: the order of its header is not fixed, and a stage's bundle is written again."""
+    if weights is None:
+        return None
+    out = hashlib.blake2b(digest_size=16)
+    for key, value in sorted(weights.items()):
+        out.update(key.encode() + value.contiguous().numpy().tobytes())
+    return out.hexdigest()
 
 
 def _from(report: Report | None, before: int) -> Report | None:
