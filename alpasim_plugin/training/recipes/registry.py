@@ -12,7 +12,7 @@ from alpasim_plugin.training.flow_matching import FlowMatching
 from alpasim_plugin.training.generator import SharedRollout
 from alpasim_plugin.training.recipes.ablation import ABLATION
 from alpasim_plugin.training.recipes.causal_arms import CAUSAL_ARMS
-from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, Stage, whole_clip
+from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, whole_clip
 
 
 def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
