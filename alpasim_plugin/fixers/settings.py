@@ -184,8 +184,6 @@ class OneFixerSettings(FixerSettings):
             raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
         if self.holes == "everywhere" and not self.render_input:
             raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
-        if self.opacity_input and self.fold:
-            raise ValueError("fold with opacity_input | blocks that embed the opacity cannot be folded: set fold false")
         if self.decoder.kind == "render" and self.vae.kind != "tiny":
             raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
         if self.decoder.kind == "taehv" and self.vae.kind != "wan":

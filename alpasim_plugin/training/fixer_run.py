@@ -206,9 +206,8 @@ def deployed_settings(run: FixerRun, stage: Stage) -> OneFixerSettings:
         InputError: Settings that do not fit together.
     """
     said = run.recipe.settings(stage, clip_latents(run, stage))
-    fold = {"fold": False} if said["opacity_input"] else {}
     try:
-        return type(run.settings).model_validate({**run.settings.model_dump(), **said, **fold})
+        return type(run.settings).model_validate({**run.settings.model_dump(), **said})
     except ValueError as error:
         raise InputError("deploying a recipe", f"{run.recipe.name}, stage {stage.name}", str(error), "correct the recipe") from error
 
