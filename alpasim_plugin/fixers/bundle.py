@@ -1,8 +1,9 @@
 """Weights of a fixer in one safetensors file: its networks, and the settings they were trained with.
 
-Keys carry their part. A bundle of the kind ``block`` has ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and
-``prompt.text``; one of the kind ``per-frame`` has ``generator.``. The header holds ``format``, ``kind``, ``trained``, ``note`` and
-``settings``, the JSON of the settings that the weights were trained with. Only safetensors is read: a pickle is refused.
+Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers (``block``, ``render-step``,
+``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and ``prompt.text``. The header holds
+``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained with. Only safetensors
+is read: a pickle is refused.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
@@ -23,7 +25,7 @@ from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.reading.json_files import kind_of, parse_json
 
-BundleSettings = OneFixerSettings | PixelFixerSettings
+BundleSettings = OneFixerSettings | PixelFixerSettings | RenderStepSettings | NoiseWindowSettings
 FORMAT = "simrun-fixer-1"
 DOING = "loading a fixer's weights"
 RENAMED = {"onefixer-tiny": "onefixer-dit-tiny", "onefixer-s": "onefixer-dit-s"}  # former names in the headers of older bundles
@@ -53,13 +55,12 @@ class Kind:
         ]
 
 
+_LATENT_PARTS = frozenset({"dit", "vae"}), frozenset({"decoder", "prompt"})
+_LATENT = ("rope_ratios", "vae.kind", "decoder.kind", "decoder.scaled")
 KINDS: Mapping[str, Kind] = {
-    "block": Kind(
-        frozenset({"dit", "vae"}),
-        frozenset({"decoder", "prompt"}),
-        ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled"),
-        ("steps", "history", "window", "sink", "holes", "uses_map"),
-    ),
+    "block": Kind(*_LATENT_PARTS, (*_LATENT, "block_latents"), ("steps", "history", "window", "sink", "holes", "uses_map")),
+    "render-step": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "render_level.alpha", "render_level.sigma"), ("references",)),
+    "noise-window": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "window_frames"), ("steps", "stride_frames", "noise")),
     "per-frame": Kind(frozenset({"generator"}), frozenset(), (), ("steps", "holes", "uses_map")),
 }
 
@@ -102,7 +103,13 @@ def save_bundle(
 
 def bundle_kind(settings: BundleSettings) -> str:
     """Return the kind of bundle that a fixer's settings take."""
-    return "per-frame" if isinstance(settings, PixelFixerSettings) else "block"
+    kinds = {
+        OneFixerSettings: "block",
+        PixelFixerSettings: "per-frame",
+        RenderStepSettings: "render-step",
+        NoiseWindowSettings: "noise-window",
+    }
+    return next(kind for model, kind in kinds.items() if isinstance(settings, model))
 
 
 def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 _PER_FRAME = "alpasim_plugin.fixers.factory:per_frame"
 _BLOCKS = "alpasim_plugin.fixers.factory:onefixer"
+_IMAGE = "alpasim_plugin.fixers.factory:image"
+_WINDOWS = "alpasim_plugin.fixers.factory:windows"
 _BROKEN = "alpasim_plugin.renderers.broken:"
 
 BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
@@ -27,6 +29,11 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "onefixer-dit-tiny": (_BLOCKS, "one-step causal transformer on latents, block by block, for a CPU at 256x144"),
         "onefixer-dit-s": (_BLOCKS, "the same for a small GPU"),
         "onefixer-2b": (_BLOCKS, "the same at the size of OmniDreams single view; needs its weights"),
+        "difix": (_IMAGE, "DiFix3D+: one step from the render at t = 0.363, frame by frame; needs its weights"),
+        "harmonizer": (_IMAGE, "DiffusionHarmonizer: one step from the render at t = 0.2, frame by frame; needs its weights"),
+        "harmonizer-temporal": (_IMAGE, "the same, looking at its last four outputs; needs its weights"),
+        "gsfix3d": (_WINDOWS, "GSFix3D: eight steps from noise, the render as a condition, frame by frame; needs its weights"),
+        "3dgs-enhancer": (_WINDOWS, "3DGS-Enhancer: the same in windows of 25 frames, of recorded clips only; needs its weights"),
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
     "policy": {
