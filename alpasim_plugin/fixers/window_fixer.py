@@ -1,7 +1,8 @@
 """Windows over a whole clip: the session of a fixer that needs later frames (3DGS-Enhancer).
 
 A clip is one block. Every window is fixed by itself, from noise of its own; where windows overlap, the later one fades in over the one
-before, linearly and in pixels. A frame needs those after it in its window, which a closed loop has not driven yet: it is refused such a fixer.
+before, linearly and in pixels. A frame needs those after it in its window, which a closed loop has not driven yet: such a fixer is refused
+there.
 """
 
 from __future__ import annotations
