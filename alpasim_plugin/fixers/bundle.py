@@ -58,7 +58,11 @@ class Kind:
 _LATENT_PARTS = frozenset({"dit", "vae"}), frozenset({"decoder", "prompt"})
 _LATENT = ("rope_ratios", "vae.kind", "decoder.kind", "decoder.scaled")
 KINDS: Mapping[str, Kind] = {
-    "block": Kind(*_LATENT_PARTS, (*_LATENT, "block_latents"), ("steps", "history", "window", "sink", "holes", "uses_map")),
+    "block": Kind(
+        *_LATENT_PARTS,
+        (*_LATENT, "block_latents", "render_input", "opacity_input"),
+        ("steps", "history", "window", "sink", "holes", "uses_map", "no_map"),
+    ),
     "render-step": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "render_level.alpha", "render_level.sigma"), ("references",)),
     "noise-window": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "window_frames"), ("steps", "stride_frames", "noise")),
     "per-frame": Kind(frozenset({"generator"}), frozenset(), (), ("steps", "holes", "uses_map")),
@@ -125,6 +129,8 @@ def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
         do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
         raise InputError(DOING, f"{path} with the settings of {settings.name}", f"a bundle of the kind {found_kind!r}, not {name!r}", do)
     kind = KINDS[name]
+    # A header written before a setting existed lacks it: its weights were trained at what is now the default.
+    trained_with = {**_defaults(settings), **trained_with}
     differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*kind.must_match, *kind.may_differ)]
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in kind.must_match]
     if wrong:
@@ -185,6 +191,12 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
         do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
         raise InputError(DOING, str(path), found, do)
     return header, settings
+
+
+def _defaults(settings: BundleSettings) -> dict[str, object]:
+    """Return the settings that have a default, at it, as JSON has them."""
+    fields = type(settings).model_fields.items()
+    return {key: field.get_default() for key, field in fields if isinstance(field.get_default(), str | bool | int | float)}
 
 
 def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:

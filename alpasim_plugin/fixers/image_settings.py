@@ -7,10 +7,9 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from alpasim_plugin.fixers.settings import LatentFixerSettings, Part, Positive, Unit, check_no_blocks, check_steps, counted_steps
-from alpasim_plugin.nets.clips import GROUP
-from alpasim_plugin.nets.fixed_step import RenderLevel
+from alpasim_plugin.nets.schedule import RenderLevel
 
-LATENT_FRAMES = GROUP  # of every latent but a clip's first
+LATENT_FRAMES = 4  # of every latent but a clip's first
 
 
 class RenderLevelSettings(Part):

@@ -13,11 +13,12 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
-from alpasim_plugin.fixers.settings import FixerSettings, LatentFixerSettings
+from alpasim_plugin.fixers.settings import FixerSettings, LatentFixerSettings, OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
+from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
 from alpasim_plugin.nets.schedule import CONTEXT_STEP
 from alpasim_plugin.nets.streaming_state import State
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
@@ -71,13 +72,28 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: LatentFixerSettings, 
         source: Where the weights come from, for errors.
 
     Raises:
-        InputError: Weights that do not fit together, or whose map input has other channels than streaming gives.
+        InputError: Weights that do not fit together, or that take another condition than the settings give.
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
-    if net.sizes.map_channels != LATENT:
-        found = f"its map input has {net.sizes.map_channels} channels, streaming gives {LATENT} (variant V6 takes the render there)"
-        raise InputError(DOING, source, found, "train a variant that starts from the render, for example V9")
+    expected = condition_sizes(settings)
+    found = {key: getattr(net.sizes, key) for key in expected}
+    if found != expected:
+        do = "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them"
+        raise InputError(DOING, source, f"{_listed(found)}, streaming gives {_listed(expected)}", do)
     return net
+
+
+def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
+    """Return the sizes of the condition that a transformer is given; models without a map take the render, or nothing, in its place."""
+    blocks = isinstance(settings, OneFixerSettings)
+    return {
+        "map_channels": LATENT * (1 + (blocks and settings.render_input)),
+        "opacity_channels": OPACITY_CHANNELS if blocks and settings.opacity_input else 0,
+    }
+
+
+def _listed(sizes: Mapping[str, int]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in sizes.items())
 
 
 def decode(
@@ -149,7 +165,7 @@ class Parts:
         given = self.tensors("dit")
         if given is None:
             self.allow_untrained("dit")
-            sizes = DiTSizes(**settings.dit.model_dump())
+            sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
             given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
         return streaming_dit(given[0], settings, given[1])
 

@@ -210,9 +210,16 @@ class OneFixerSettings(LatentFixerSettings):
         description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step. none: no history, "
         "every frame is fixed by itself.",
     )
-    holes: Literal["noise", "render"] = Field(
-        default="noise", description="Source of a block where the render is transparent: noise (Eq. 1), or the render."
+    holes: Literal["noise", "render", "everywhere"] = Field(
+        default="noise",
+        description="Source of a block where the render is transparent: noise (Eq. 1), or the render. everywhere: noise alone, which needs "
+        "render_input.",
     )
+    no_map: Literal["nothing", "black"] = Field(
+        default="nothing", description="In the map's place where there is none: nothing is added to the tokens, or a black map is encoded."
+    )
+    render_input: bool = Field(default=False, description="Whether the render's latents are a condition beside the map's.")
+    opacity_input: bool = Field(default=False, description="Whether every block of the transformer embeds the opacity (ArtiFixer).")
     graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
 
     @property
@@ -243,6 +250,10 @@ class OneFixerSettings(LatentFixerSettings):
             raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
         if self.history == "none" and self.block_latents != 1:
             raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
+        if self.holes == "everywhere" and not self.render_input:
+            raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
+        if self.opacity_input and self.fold:
+            raise ValueError("fold with opacity_input | blocks that embed the opacity cannot be folded: set fold false")
         return self
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.nets.adaln import LowRankModulation, Modulation, fold_input, fold_output, residual, stack_rows
 from alpasim_plugin.nets.attention import Attend, CrossAttention, SelfAttention
-from alpasim_plugin.nets.layers import PATCH, layer_norm
+from alpasim_plugin.nets.layers import PATCH, PatchLinear, layer_norm
 from alpasim_plugin.nets.rope import RopeTable
 from alpasim_plugin.nets.sizes import DiTSizes
 
@@ -39,11 +39,14 @@ class Block(nn.Module):
         self.self_attn = SelfAttention(sizes.width, sizes.head_width)
         self.cross_attn = CrossAttention(sizes.width, sizes.context_width, sizes.head_width)
         self.mlp = Mlp(sizes.width, sizes.mlp_width)
+        self.opacity_embed = PatchLinear(sizes.opacity_channels, sizes.width) if sizes.opacity_channels else None
         self.adaln_modulation_self_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
         self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
         self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
 
-    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend) -> Tensor:
+    def forward(
+        self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend, opacity: Tensor | None = None
+    ) -> Tensor:
         """Apply the block.
 
         Args:
@@ -52,8 +55,15 @@ class Block(nn.Module):
             text: Cross-attention keys and values of this block.
             table: Rotation of the block's tokens.
             attention: Self-attention with the cached past.
+            opacity: ``(B, opacity_channels, T, H, W)`` for a block that embeds it: added to the modulated input of self-attention.
         """
-        x = residual(x, lambda n: self.self_attn(n, table, attention), _modulation(self.adaln_modulation_self_attn, time))
+        seen = None if self.opacity_embed is None or opacity is None else self.opacity_embed.embed(opacity)
+
+        def attend(n: Tensor) -> Tensor:
+            out: Tensor = self.self_attn(n if seen is None else n + seen, table, attention)
+            return out
+
+        x = residual(x, attend, _modulation(self.adaln_modulation_self_attn, time))
         x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
         return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
 

@@ -3,9 +3,9 @@
     z_r = E(r),  x = z_r / (alpha + sigma),  z_0 = x - t v(x, t),  y' = D(z_0)          `nets.fixed_step`
     L   = | y' - y |^2  +  lambda min(d(y', y), c)  +  w L_warp(y')                      on values in [-1, 1]
 
-``r`` render, ``y`` clean frame, ``d`` perceptual distance of a picture, ``c`` the largest value that counts (DiffusionHarmonizer: a larger one
-has no gradient), ``L_warp`` of `warping` (its temporal form). The temporal form encodes the clip ``[r_t, y'_t-1 ... y'_t-4]``, newest first:
-the last four outputs are the model's own, rounded to eight bits as they are shown, without gradients.
+``r`` render, ``y`` clean frame, ``d`` perceptual distance of a picture, ``c`` the largest value that counts (DiffusionHarmonizer: beyond it
+there is no gradient), ``L_warp`` of `warping` (its temporal form). The temporal form encodes the clip ``[r_t, y'_t-1 ... y'_t-4]``, newest
+first: the last four outputs are the model's own, rounded to eight bits as they are shown, without gradients.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.nets.dit import CosmosCausalDiT
-from alpasim_plugin.nets.fixed_step import RenderLevel, fixed_step
+from alpasim_plugin.nets.fixed_step import fixed_step
+from alpasim_plugin.nets.schedule import RenderLevel
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.warping import flow_between, warping_loss

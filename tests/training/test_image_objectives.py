@@ -15,9 +15,9 @@ from alpasim_plugin.fixers.image_settings import RenderStepSettings
 from alpasim_plugin.fixers.networks import Parts
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
 from alpasim_plugin.nets.euler import CONDITION_KEY, LATENT_KEY, euler, share_embedding
-from alpasim_plugin.nets.fixed_step import RenderLevel, fixed_step
+from alpasim_plugin.nets.fixed_step import fixed_step
 from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.schedule import names
+from alpasim_plugin.nets.schedule import RenderLevel, names
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.cut_outs import cut_out, soft_mask

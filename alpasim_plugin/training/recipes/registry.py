@@ -1,0 +1,78 @@
+"""All recipes by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.training.flow_matching import FlowMatching
+from alpasim_plugin.training.generator import SharedRollout
+from alpasim_plugin.training.recipes.ablation import ABLATION
+from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, Stage, whole_clip
+
+
+def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
+    """Return recipes by their names.
+
+    Raises:
+        InputError: Two of one name.
+    """
+    found: dict[str, Recipe] = {}
+    for recipe in recipes:
+        if recipe.name in found:
+            raise InputError("registering a recipe", recipe.name, "a recipe of that name already", "choose another name")
+        found[recipe.name] = recipe
+    return MappingProxyType(found)
+
+
+RECIPES = by_name((*ABLATION,))
+
+
+def recipe_of(name: str) -> Recipe:
+    """Return a recipe by its name.
+
+    Raises:
+        InputError: No such recipe.
+    """
+    if name not in RECIPES:
+        raise InputError("choosing what to train", f"recipe {name!r}", "no such recipe", f"choose one of {', '.join(RECIPES)}")
+    return RECIPES[name]
+
+
+def with_perceptual_weight(recipe: Recipe, weight: float) -> Recipe:
+    """Return a recipe with another weight lambda of the shared rollout's perceptual term; others keep their papers' weights.
+
+    Raises:
+        InputError: A negative weight.
+    """
+
+    def weighted(objective: Objective) -> Objective:
+        return objective.weighted(weight) if isinstance(objective, SharedRollout) else objective
+
+    return _with_objectives(recipe, weighted)
+
+
+def with_source_share(recipe: Recipe, share: float) -> Recipe:
+    """Return a recipe with another share of positions at the source, where its flow matching has such a share."""
+
+    def shared(objective: Objective) -> Objective:
+        return replace(objective, source_share=share) if isinstance(objective, FlowMatching) and objective.source_share else objective
+
+    return _with_objectives(recipe, shared)
+
+
+def with_attention(recipe: Recipe, block: int | None = None, window: int | None = None, sink: int | None = None) -> Recipe:
+    """Return a recipe whose causal stages have another block, window or sink in latents; None leaves the recipe's."""
+    chosen = {key: value for key, value in (("block_latents", block), ("window", window), ("sink", sink)) if value is not None}
+
+    def attention(stage: Stage) -> Callable[[int], Attention]:
+        return lambda latents: replace(stage.attention(latents), **chosen)
+
+    stages = (stage if stage.attention is whole_clip else replace(stage, attention=attention(stage)) for stage in recipe.stages)
+    return replace(recipe, stages=tuple(stages)) if chosen else recipe
+
+
+def _with_objectives(recipe: Recipe, change: Callable[[Objective], Objective]) -> Recipe:
+    return replace(recipe, stages=tuple(replace(stage, objective=change(stage.objective)) for stage in recipe.stages))
