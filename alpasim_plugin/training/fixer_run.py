@@ -18,6 +18,7 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import load_tiny_vae, parts_of, save_bundle
+from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
@@ -31,6 +32,7 @@ from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 BUNDLE_FILE = "fixer.safetensors"
 BUNDLED = ("dit", "vae")
+TrainableSettings = OneFixerSettings | RenderStepSettings | NoiseWindowSettings
 Report = Callable[[int, Mapping[str, float]], None]
 
 
@@ -52,7 +54,7 @@ class FixerRun:
         precision: Of the forward passes: None is float32.
     """
 
-    settings: OneFixerSettings
+    settings: TrainableSettings
     recipe: Recipe
     data: Path
     vae: Path
@@ -176,6 +178,7 @@ def stage_inputs(
     return StageInputs(
         run.settings.dit, run.settings.rope_ratios, stage.attention(latents), stage.seen, weights, vae, clips,
         replace(run.batches, latents=latents), stage.updates(run.schedule.steps), run.schedule.accumulate, run.equal_channels, distance,
+        run.settings,
     )  # fmt: skip
 
 
@@ -197,16 +200,19 @@ def write_bundle(
     return path
 
 
-def deployed_settings(run: FixerRun, stage: Stage) -> OneFixerSettings:
+def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
     """Return the settings that a stage's weights are deployed with.
 
     Raises:
         InputError: Settings that do not fit together.
     """
-    said = run.recipe.settings(stage, clip_latents(run, stage))
-    fold = {"fold": False} if said["opacity_input"] else {}
+    if isinstance(run.settings, OneFixerSettings):
+        said = run.recipe.settings(stage, clip_latents(run, stage))
+        said |= {"fold": False} if said["opacity_input"] else {}
+    else:
+        said = run.recipe.own_settings(stage)
     try:
-        return OneFixerSettings.model_validate({**run.settings.model_dump(), **said, **fold})
+        return type(run.settings).model_validate({**run.settings.model_dump(), **said})
     except ValueError as error:
         raise InputError("deploying a recipe", f"{run.recipe.name}, stage {stage.name}", str(error), "correct the recipe") from error
 
