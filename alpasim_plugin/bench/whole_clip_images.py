@@ -49,7 +49,9 @@ def whole_clip_images(settings: RenderStepSettings | NoiseWindowSettings, frames
 def _one_by_one(networks: Networks, settings: RenderStepSettings, clip: Clip, size: ClipSize) -> Tensor:
     """x = z_r / (alpha + sigma), z_0 = x - t v(x, t), over the clip [render, last outputs] where there are enough outputs."""
     alpha, sigma = settings.render_level.alpha, settings.render_level.sigma
-    t, shown, made = sigma / (alpha + sigma), [], []
+    t = sigma / (alpha + sigma)
+    shown: list[Tensor] = []
+    made: list[Tensor] = []
     for i in range(clip.rgb.shape[2]):
         rgb = clip.rgb[:, :, i : i + 1]
         video = torch.cat([rgb, *shown[-1 : -settings.references - 1 : -1]], dim=2) if len(shown) >= settings.references else rgb

@@ -17,15 +17,14 @@ from torch import Tensor
 
 from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.settings import LatentFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.reading.json_files import kind_of, parse_json
 
-BundleSettings = OneFixerSettings | PixelFixerSettings | RenderStepSettings | NoiseWindowSettings
+BundleSettings = LatentFixerSettings | PixelFixerSettings
 FORMAT = "simrun-fixer-1"
 DOING = "loading a fixer's weights"
 RENAMED = {"onefixer-tiny": "onefixer-dit-tiny", "onefixer-s": "onefixer-dit-s"}  # former names in the headers of older bundles
@@ -94,7 +93,7 @@ def save_bundle(
     Raises:
         InputError: A part that is not known, or one that is missing.
     """
-    kind = bundle_kind(settings)
+    kind = settings.bundle_kind
     problems = KINDS[kind].problems(parts)
     if problems:
         do = f"give {', '.join(sorted(KINDS[kind].needed))}, and nothing else but {', '.join(sorted(KINDS[kind].optional)) or 'these'}"
@@ -105,17 +104,6 @@ def save_bundle(
     write_safetensors(path, tensors, header)
 
 
-def bundle_kind(settings: BundleSettings) -> str:
-    """Return the kind of bundle that a fixer's settings take."""
-    kinds = {
-        OneFixerSettings: "block",
-        PixelFixerSettings: "per-frame",
-        RenderStepSettings: "render-step",
-        NoiseWindowSettings: "noise-window",
-    }
-    return next(kind for model, kind in kinds.items() if isinstance(settings, model))
-
-
 def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
     """Read a bundle for use with some settings.
 
@@ -123,7 +111,7 @@ def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
     header, trained_with = _header(path)
-    name = bundle_kind(settings)
+    name = settings.bundle_kind
     found_kind = header.get("kind", OLDEST_KIND)
     if found_kind != name:
         do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"

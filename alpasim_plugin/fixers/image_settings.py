@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -42,6 +42,7 @@ class MaplessSettings(LatentFixerSettings):
 class RenderStepSettings(MaplessSettings):
     """One deterministic step from the render, at a fixed time: DiFix3D+, DiffusionHarmonizer."""
 
+    bundle_kind: ClassVar[str] = "render-step"
     render_level: RenderLevelSettings = Field(description="The noise level that the render is taken to have.")
     references: Literal[0, 4] = Field(
         default=0, description="Last outputs that the network looks at; a camera's first frames, which have fewer, are fixed without."
@@ -67,6 +68,7 @@ class RenderStepSettings(MaplessSettings):
 class NoiseWindowSettings(MaplessSettings):
     """Windows of frames sampled from noise by Euler steps, with the render as a condition: GSFix3D, 3DGS-Enhancer."""
 
+    bundle_kind: ClassVar[str] = "noise-window"
     opacity_to_decoder: bool = Field(default=True, description=MaplessSettings.model_fields["opacity_to_decoder"].description)
     steps: tuple[float, ...] = Field(min_length=1, description="Times of the network's calls, falling from 1000, without a shift.")
     window_frames: Positive = Field(default=1, description="Frames of a window, 1 + 4 n. More than one: whole clips only.")

@@ -85,10 +85,11 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: LatentFixerSettings, 
 
 def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
     """Return the sizes of the condition that a transformer is given; models without a map take the render, or nothing, in its place."""
-    blocks = isinstance(settings, OneFixerSettings)
+    if not isinstance(settings, OneFixerSettings):
+        return {"map_channels": LATENT, "opacity_channels": 0}
     return {
-        "map_channels": LATENT * (1 + (blocks and settings.render_input)),
-        "opacity_channels": OPACITY_CHANNELS if blocks and settings.opacity_input else 0,
+        "map_channels": LATENT * (1 + settings.render_input),
+        "opacity_channels": OPACITY_CHANNELS if settings.opacity_input else 0,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -24,6 +24,7 @@ class PixelSizesSettings(Part):
 class PixelFixerSettings(FixerSettings):
     """A causal generator in pixels, one frame at a time."""
 
+    bundle_kind: ClassVar[str] = "per-frame"  # of `alpasim_plugin.fixers.bundle.KINDS`
     uses_map: bool = Field(default=True, description="Whether the semantic map is drawn and given to the fixer.")
     generator: PixelSizesSettings = Field(default=PixelSizesSettings(), description="Sizes where no weights say them.")
     weights: WeightsSettings = Field(default=WeightsSettings(), description="File with weights: `bundle` alone.")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -168,6 +168,7 @@ def check_steps(steps: tuple[float, ...]) -> None:
 class LatentFixerSettings(FixerSettings):
     """Any fixer with an autoencoder and a transformer on its latents."""
 
+    bundle_kind: ClassVar[str]  # of `alpasim_plugin.fixers.bundle.KINDS`
     dit: DiTSettings = Field(description="Sizes of the transformer where no weights say them.")
     rope_ratios: tuple[float, float, float] = Field(default=(3.0, 3.0, 1.0), description="NTK stretch: height, width, time.")
     vae: CodecSettings = Field(description="The video autoencoder.")
@@ -202,6 +203,7 @@ class LatentFixerSettings(FixerSettings):
 class OneFixerSettings(LatentFixerSettings):
     """A causal latent fixer: autoencoder, transformer with history, flow steps."""
 
+    bundle_kind: ClassVar[str] = "block"
     window: Positive = Field(default=6, description="Attention window in latents, the block itself and the sink included.")
     sink: int = Field(default=0, ge=0, description="Attention sink: first latents of the rollout that stay in the window.")
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
