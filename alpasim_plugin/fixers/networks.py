@@ -211,4 +211,6 @@ class Parts:
     def refuse(self, part: str, found: str) -> None:
         """Raise the error for weights that are missing."""
         do = f"give --set fixer.weights.{part}=FILE (or fixer.weights.bundle=FILE); for timing alone, fixer.untrained=random"
+        if self.settings.trained_by is not None:
+            do = f"train it: {self.settings.trained_by}; then {do}"
         raise InputError(DOING, f"{self.settings.name}, weights.{part}", found, do)

@@ -177,6 +177,7 @@ class LatentFixerSettings(FixerSettings):
     untrained: Literal["identity", "random", "refuse"] = Field(
         default="refuse", description="Initialisation without weights: an identity, random, or an error (refuse)."
     )
+    trained_by: str | None = Field(default=None, description="Command that trains the weights, for the error where there are none.")
     precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
     codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
     fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")

@@ -8,6 +8,7 @@ Every stage resumes from its own checkpoint; a finished one makes no update. A l
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -147,15 +148,16 @@ def _train_stage(
     before: int,
 ) -> Path:
     """Train one stage and write its bundle."""
-    task = stage.objective.task(stage_inputs(run, stage, clips, files, distance))
+    inputs = stage_inputs(run, stage, clips, files, distance)
+    task = stage.objective.task(inputs)
     for name, parameter in task.parts.named_parameters():
         parameter.requires_grad_(any(f"{name}.".startswith(f"{part}.") for part in stage.trained))
     schedule = run.schedule_of(stage)
     facts = {
         **task.facts, "recipe": run.recipe.name, "stage": stage.name, "clips": len(clips), "latents": clips.digest,
-        "batches": asdict(run.batches), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
-        "attention": asdict(stage.attention(clip_latents(run, stage))), "distance": distance[0] if distance else "none",
-        "start": {part: _digest(files, source) for part, source in stage.start.items()},
+        "batches": asdict(inputs.form), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
+        "attention": asdict(inputs.attention), "distance": distance[0] if distance else "none",
+        "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
         "vae": file_sha256(run.vae), "precision": str(run.precision),
     }  # fmt: skip
     trainer = Trainer(task.parts, folder, schedule, task.batch, task.loss, facts, run.precision, parts=stage.trained)
@@ -251,9 +253,14 @@ def _weights(files: Mapping[str, Path], source: str) -> Weights | None:
     return parts[part]
 
 
-def _digest(files: Mapping[str, Path], source: str) -> str | None:
-    name = source.partition(".")[0]
-    return f"{source.partition('.')[2]} of {file_sha256(files[name])}" if name in files else None
+def _digest(weights: Weights | None) -> str | None:
+    """Return a digest of tensors. A file's would not do: the order of its header is not fixed, and a stage's bundle is written again."""
+    if weights is None:
+        return None
+    out = hashlib.blake2b(digest_size=16)
+    for key, value in sorted(weights.items()):
+        out.update(key.encode() + value.contiguous().numpy().tobytes())
+    return out.hexdigest()
 
 
 def _from(report: Report | None, before: int) -> Report | None:
