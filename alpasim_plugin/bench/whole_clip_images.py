@@ -68,7 +68,7 @@ def _in_windows(networks: Networks, settings: NoiseWindowSettings, clip: Clip, n
     """Sum over windows of weight times the window's frames; z <- z - v / n, n times, in each."""
     frames = clip.rgb.shape[2]
     parts = windows(frames, settings.window_frames, settings.stride_frames)
-    weights = torch.from_numpy(fade_weights(parts, settings.window_frames - settings.stride_frames))
+    weights = torch.from_numpy(fade_weights(parts, settings.fade_frames))
     out = torch.zeros_like(clip.rgb)
     for window, eps, weight in zip(parts, noise, weights, strict=True):
         here = slice(window.start, window.stop)

@@ -63,7 +63,7 @@ KINDS: Mapping[str, Kind] = {
         ("steps", "history", "window", "sink", "holes", "uses_map", "no_map"),
     ),
     "render-step": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "render_level.alpha", "render_level.sigma"), ("references",)),
-    "noise-window": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "window_frames"), ("steps", "stride_frames", "noise")),
+    "noise-window": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "window_frames"), ("steps", "stride_frames", "stitch", "noise")),
     "per-frame": Kind(frozenset({"generator"}), frozenset(), (), ("steps", "holes", "uses_map")),
 }
 

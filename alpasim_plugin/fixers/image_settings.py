@@ -73,6 +73,9 @@ class NoiseWindowSettings(MaplessSettings):
     steps: tuple[float, ...] = Field(min_length=1, description="Times of the network's calls, falling from 1000, without a shift.")
     window_frames: Positive = Field(default=1, description="Frames of a window, 1 + 4 n. More than one: whole clips only.")
     stride_frames: Positive = Field(default=1, description="Frames from the start of a window to that of the next.")
+    stitch: Literal["fade", "cut"] = Field(
+        default="fade", description="Where windows overlap: the later one fades in linearly, or takes over at once."
+    )
     noise: Literal["fresh", "fixed"] = Field(
         default="fresh", description="Noise of a window: its own, or the first window's in all of them, which flickers less."
     )
@@ -81,6 +84,11 @@ class NoiseWindowSettings(MaplessSettings):
     def latents(self) -> int:
         """Latents of a window."""
         return 1 + (self.window_frames - 1) // LATENT_FRAMES
+
+    @property
+    def fade_frames(self) -> int:
+        """Frames over which a window fades in."""
+        return self.window_frames - self.stride_frames if self.stitch == "fade" else 0
 
     @property
     def network_times(self) -> tuple[float, ...]:

@@ -102,12 +102,11 @@ class WindowFixer(Fixer):
         """Return the fixed frames ``(B, 3, T, H, W)`` in [-1, 1], not clipped, on the CPU."""
         settings = self.settings
         parts = windows(view.size.frames, settings.window_frames, settings.stride_frames)
-        overlap = settings.window_frames - settings.stride_frames
         out = torch.empty(len(view.cameras), 3, view.size.frames, *view.shape)
         for index, window in enumerate(parts):
             made = self._sample(view, window, index)
             begun = parts[index - 1].stop - window.start if index else 0  # frames that the windows before reach into this one
-            share = torch.from_numpy(fade_in(window, parts[index - 1] if index else None, overlap))[:begun, None, None]
+            share = torch.from_numpy(fade_in(window, parts[index - 1] if index else None, settings.fade_frames))[:begun, None, None]
             here = out[:, :, window.start : window.stop]
             here[:, :, :begun].lerp_(made[:, :, :begun], share)
             here[:, :, begun:] = made[:, :, begun:]

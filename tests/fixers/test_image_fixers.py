@@ -68,16 +68,16 @@ def test_streaming_equals_the_whole_clip(
     assert np.abs(streamed.astype(int) - pixels(frames)).mean() > 2, "these weights do something"
 
 
-@pytest.mark.parametrize("count", [7, 25, 45])
+@pytest.mark.parametrize(("count", "stitch"), [(7, "fade"), (25, "fade"), (45, "fade"), (45, "cut")])
 def test_windows_equal_the_weighted_sum_over_the_whole_clip(
-    session: Callable[..., Fixer], settings_of: Callable[..., Settings], count: int
+    session: Callable[..., Fixer], settings_of: Callable[..., Settings], count: int, stitch: str
 ) -> None:
     frames = moving_picture(count, (16, 24))
-    streamed = run(session("3dgs-enhancer", "steps=2"), frames)
+    streamed = run(session("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames)
     assert [frame.t_us for frame in streamed] == [frame.t_us for frame in frames]
     if count < 25:
         frames = frames + [replace(frames[-1], t_us=frames[-1].t_us + 1 + i) for i in range(25 - count)]
-    wanted = whole_clip_images(settings_of("3dgs-enhancer", "steps=2"), frames, "scene", 0)
+    wanted = whole_clip_images(settings_of("3dgs-enhancer", "steps=2", f"stitch={stitch}"), frames, "scene", 0)
     assert levels(pixels(streamed), wanted[:count]) <= 1
 
 
