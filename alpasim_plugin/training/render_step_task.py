@@ -35,14 +35,15 @@ class RenderStepLoss:
         references: The last four outputs that the network looks at: its ``own``, the ``clean`` frames in their place (teacher forcing), or
             none.
         single: Share of batches without references, where there are any: a rollout begins with four frames without.
-        warp: Weight of `warp-farneback`.
+        warp: Weight of `warp-farneback`. The published one is not known; this one makes its gradient about half as long as the picture
+            term's (docs/arms.md).
     """
 
     weight: float = 1.0
     clamp: float | None = None
     references: Literal["own", "clean"] | None = None
     single: float = 0.5
-    warp: float = 1.0
+    warp: float = 0.1
     perceptual: bool = True
 
     def task(self, inputs: StageInputs) -> RenderStepTask:
