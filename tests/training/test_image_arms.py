@@ -6,12 +6,14 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
 
 from alpasim_plugin.atomic import write_safetensors
+from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.train import app
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -114,6 +116,29 @@ def test_an_arm_resumes_bit_for_bit(train: Train, trained: Callable[[str], Path]
     whole = load_weights(trained(recipe))
     assert again.keys() == whole.keys()
     assert all(torch.equal(value, whole[key]) for key, value in again.items())
+
+
+def test_windows_fix_recorded_clips_by_both_commands(
+    trained: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle, frames = trained("3dgs-enhancer"), 27  # two windows
+    make(tmp_path / "pairs", "val", "a", frames=frames, width=32)
+    given, made = tmp_path / "given", tmp_path / "made"
+    given.mkdir()
+    for i, image in enumerate(pixels(moving_picture(frames, (32, 32)))):
+        cv2.imwrite(str(given / f"{i:03d}.png"), image)
+    weights = f"fixer.weights.bundle={bundle}"
+    assert run_command(["refine", str(given), "-o", str(made), "--fixer", "3dgs-enhancer", "--set", weights, "--anyway", "--quiet"]) == 0
+    assert len(list(made.iterdir())) == frames
+    command = ["bench", "quality", str(tmp_path / "pairs"), "--split", "val", "--pictures", "0", "--out", str(tmp_path / "q"), "--json"]
+    capsys.readouterr()
+    assert run_command([*command, "--fixer", f"3dgs,e={bundle},g={trained('gsfix3d')}"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["arms"]["e"]["psnr_db"]["mean"] != summary["arms"]["3dgs"]["psnr_db"]["mean"]
+    units = summary["run"]["units"]
+    assert units["3dgs"] is None
+    assert (units["e"]["lookahead_frames"], units["e"]["calls_per_frame"]) == (24, pytest.approx(8 / 17))
+    assert (units["g"]["lookahead_frames"], units["g"]["calls_per_frame"]) == (0, 8)
 
 
 def test_the_clamp_is_measured_written_down_and_the_temporal_batches_are_of_both_kinds(trained: Callable[[str], Path]) -> None:
