@@ -125,4 +125,5 @@ class _Reader(nn.Module):
         seen = self.features_norm(x)
         q, k, v = (layer(y).unflatten(-1, (self.heads, -1)) for layer, y in ((self.q, token), (self.k, seen), (self.v, seen)))
         token = token + self.out(attend(self.q_norm(q), self.k_norm(k), v))
-        return (token + self.ffn(self.inner_norm(token)))[:, 0]
+        out: Tensor = token + self.ffn(self.inner_norm(token))
+        return out[:, 0]

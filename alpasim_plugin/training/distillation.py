@@ -6,7 +6,7 @@ every fifth one, from the first, also trains the student. Both losses of such an
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ from alpasim_plugin.seeding import derive_seed, stream
 from alpasim_plugin.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.training.causal_rollout import causal_rollout
 from alpasim_plugin.training.clip_batches import ClipBatches
-from alpasim_plugin.training.dmd import critic_loss, direction, generator_loss, noised, score_levels
+from alpasim_plugin.training.dmd import Score, critic_loss, direction, generator_loss, noised, score_levels
 from alpasim_plugin.training.recipes.recipe import StageInputs
 from alpasim_plugin.training.recipes.start import transformer_of
 from alpasim_plugin.training.shared_rollout import T_SOURCE, Sample
@@ -128,8 +128,9 @@ class DistillationTask:
 
     def loss(self, batch: DistillationBatch, index: int) -> Loss:
         """Return the fake score's loss, with the student's where it is trained; neither reaches the other's weights."""
-        s, numbers, losses = batch.sample, {}, []
-        z = None
+        s, z = batch.sample, None
+        numbers: dict[str, float] = {}
+        losses: list[Tensor] = []
         if batch.student is not None:
             z = self.roll_out(s, batch.student)
             loss, found = self._student_loss(z, s, batch.student)
@@ -217,10 +218,10 @@ class ScoreNet:
         v: Tensor = functional_call(self.net, _detached(self.net), args, attention) if frozen else self.net(*args, **attention)
         return v
 
-    def given(self, condition: Tensor) -> Any:
+    def given(self, condition: Tensor) -> Score:
         """Return the score of clips with this condition."""
         return lambda x, sigma: self(x, sigma, condition)
 
 
-def _detached(module: nn.Module) -> Mapping[str, Tensor]:
+def _detached(module: nn.Module) -> dict[str, Tensor]:
     return {name: parameter.detach() for name, parameter in module.named_parameters()}

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.nets.dit import CosmosCausalDiT
 from alpasim_plugin.nets.sampling import interpolant, mixed_source
-from alpasim_plugin.nets.schedule import SHIFT, TABLE, context_level, shifted
+from alpasim_plugin.nets.schedule import TABLE, context_level, shifted
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.clip_batches import ClipBatches, Drawn
 from alpasim_plugin.training.recipes.recipe import Attention, StageInputs
@@ -141,6 +141,3 @@ def bell_weight(sigma: Tensor) -> Tensor:
     table = [math.exp(-2 * (shifted(1 - i / TABLE) - 0.5) ** 2) for i in range(TABLE)]
     least = min(table)
     return (torch.exp(-2 * (sigma - 0.5).square()) - least) / (sum(table) / TABLE - least)
-
-
-__all__ = ["SHIFT", "FlowMatching", "FlowMatchingTask", "bell_weight", "flow_matching", "noise_levels"]

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import DiTSizes
 from alpasim_plugin.nets.attention import block_causal_attention
 from tests.examples import examples
@@ -21,6 +22,7 @@ SIZES = [
     DiTSizes(96, 3, 8, 64, 96, 11, 6, 16, 1),  # many heads of the smallest useful width, square AdaLN, map of one channel
     DiTSizes(64, 2, 64, 256, 16, 48, 40, 16, 16),
     DiTSizes(20, 2, 10, 33, 4, 3, 2, 5, 7),  # no power of two anywhere
+    DiTSizes(24, 2, 12, 40, 5, 7, 9, 4, 3, 6),  # every block sees the opacity
 ]
 
 
@@ -156,7 +158,7 @@ def test_a_number_is_a_time_step_for_every_latent():
         assert furthest(net(x, torch.full((1, 1), 357.0), text, hdmap), by_latent) < 1e-5
 
 
-@pytest.mark.parametrize("sizes", SIZES, ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
+@pytest.mark.parametrize("sizes", [s for s in SIZES if not s.opacity_channels], ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
 @pytest.mark.parametrize("t", [1000.0, 803.5714, 128.0])
 def test_folded_network_is_an_exact_rewrite(sizes, t):
     net = network(sizes)
@@ -165,6 +167,11 @@ def test_folded_network_is_an_exact_rewrite(sizes, t):
     with torch.no_grad():
         assert furthest(folded(x, t, text, hdmap), net(x, t, text, hdmap)) < 1e-5
     assert not any("adaln" in name for name, _ in folded.named_parameters())
+
+
+def test_a_network_that_embeds_the_opacity_is_not_folded():
+    with pytest.raises(InputError, match="embed the opacity"):
+        network(SIZES[-1]).folded(1000.0)
 
 
 def test_folded_and_plain_network_share_a_cache():

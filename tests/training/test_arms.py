@@ -20,14 +20,14 @@ from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.training.adversarial import AdversarialTerm
 from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.distillation import Distillation
-from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
+from alpasim_plugin.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.training.recipes.causal_arms import CAUSAL_ARMS
 from alpasim_plugin.training.recipes.recipe import Recipe, Stage
 from alpasim_plugin.training.recipes.registry import by_name, recipe_of
 from alpasim_plugin.training.trainer import STATE_FILE, Schedule
 from tests.fixers.fixer_cases import SMALL_DIT, fixer, maps_of, moving_picture, pixels, run_blocks
 
-from .test_generator import FORM, data  # noqa: F401 - data is a fixture
+from .test_generator import FORM, clips_of, data  # noqa: F401 - data is a fixture
 
 STEPS = 2  # U
 
@@ -123,6 +123,33 @@ def test_the_student_moves_in_its_updates_alone(data: Path, student: Path, tmp_p
     moved = {key.split(".")[1] for key in first if key.startswith("weight.") and not torch.equal(first[key], second[key])}
     assert moved == {"fake"}
     assert all(torch.equal(first[key], second[key]) for key in first if key.startswith("average.dit"))
+
+
+@pytest.mark.parametrize(("same", "rollouts"), [(True, 1), (False, 2)])
+def test_the_critic_judges_the_students_rollout_or_one_of_its_own(
+    data: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    same: bool,
+    rollouts: int,
+) -> None:
+    recipe = recipe_of("self-forcing")
+    stage = replace(recipe.stages[-1], objective=Distillation(same_rollout=same))
+    run = run_of(data, recipe)
+    task = stage.objective.task(stage_inputs(run, stage, clips_of(data, tmp_path), {}, None))
+    made: list[torch.Tensor] = []
+    judged: list[torch.Tensor] = []
+    roll_out, critic = task.roll_out, task._critic_loss
+    monkeypatch.setattr(task, "roll_out", lambda *args: made.append(roll_out(*args)) or made[-1])
+    monkeypatch.setattr(task, "_critic_loss", lambda z, *args: judged.append(z) or critic(z, *args))
+    batch = task.batch(0)
+    task.loss(batch, 0)
+    assert len(made) == rollouts
+    assert torch.equal(judged[0], made[-1])
+    assert not judged[0].requires_grad
+    assert batch.student is not None
+    assert not torch.equal(batch.student.score, batch.critic.score)
+    assert task.batch(1).student is None
 
 
 def test_a_head_that_no_longer_teaches_stops_its_run(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811

@@ -118,6 +118,7 @@ def test_an_arm_resumes_bit_for_bit(train: Train, trained: Callable[[str], Path]
     assert all(torch.equal(value, whole[key]) for key, value in again.items())
 
 
+@pytest.mark.slow
 def test_windows_fix_recorded_clips_by_both_commands(
     trained: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,7 +7,9 @@ has the choice.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
+from alpasim_plugin.nets.schedule import SHIFT
 from alpasim_plugin.training.adversarial import AdversarialTerm
 from alpasim_plugin.training.clip_batches import Seen
 from alpasim_plugin.training.distillation import Distillation
@@ -42,19 +44,23 @@ def long_blocks(latents: int) -> Attention:
     return Attention(block, 3 * block, block, "last-forward")
 
 
-_FIXED = {"seen": Seen(map="nothing", opacity=True)}
-_SHIFTED = {"shift": 5.0, "bell": True, "tail_drop": TailDrop()}
-BIDIRECTIONAL = Stage("bidirectional", FlowMatching("clip", **_SHIFTED), attention=whole_clip, start={"dit": f"{INIT_BI}.dit"}, **_FIXED)
-FORCED = Stage("causal", FlowMatching("block", **_SHIFTED), 1.5, long_blocks, start={"dit": "bidirectional.dit"}, **_FIXED)
+def artifixers(times: Literal["block", "clip"]) -> FlowMatching:
+    """Return ArtiFixer's flow matching: times warped towards the source, errors weighted by a bell, renders hidden from a frame on."""
+    return FlowMatching(times, shift=SHIFT, bell=True, tail_drop=TailDrop())
+
+
+OPACITY = Seen(map="nothing", opacity=True)
+BIDIRECTIONAL = Stage("bidirectional", artifixers("clip"), attention=whole_clip, seen=OPACITY, start={"dit": f"{INIT_BI}.dit"})
+FORCED = Stage("causal", artifixers("block"), 1.5, long_blocks, OPACITY, {"dit": "bidirectional.dit"})
 DISTILLED = Stage(
     "dmd",
     Distillation(steps=4, same_rollout=True, gradient_latents=None, tail_drop=TailDrop()),
     0.5,
     long_blocks,
-    start={"dit": "causal.dit", "real": "bidirectional.dit", "fake": "bidirectional.dit"},
-    trained={"dit": STUDENT, "fake": CRITIC},
+    OPACITY,
+    {"dit": "causal.dit", "real": "bidirectional.dit", "fake": "bidirectional.dit"},
+    {"dit": STUDENT, "fake": CRITIC},
     constant_rate=True,
-    **_FIXED,
 )
 
 CAUSAL_ARMS = (

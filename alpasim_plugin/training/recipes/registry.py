@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 from alpasim_plugin.errors import InputError
@@ -12,7 +13,7 @@ from alpasim_plugin.training.generator import SharedRollout
 from alpasim_plugin.training.recipes.ablation import ABLATION
 from alpasim_plugin.training.recipes.causal_arms import CAUSAL_ARMS
 from alpasim_plugin.training.recipes.image_arms import IMAGE_ARMS
-from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, Stage, whole_clip
+from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, whole_clip
 
 
 def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
@@ -67,13 +68,22 @@ def with_source_share(recipe: Recipe, share: float) -> Recipe:
 
 def with_attention(recipe: Recipe, block: int | None = None, window: int | None = None, sink: int | None = None) -> Recipe:
     """Return a recipe whose causal stages have another block, window or sink in latents; None leaves the recipe's."""
-    chosen = {key: value for key, value in (("block_latents", block), ("window", window), ("sink", sink)) if value is not None}
+    if block is None and window is None and sink is None:
+        return recipe
 
-    def attention(stage: Stage) -> Callable[[int], Attention]:
-        return lambda latents: replace(stage.attention(latents), **chosen)
+    def chosen(of: Callable[[int], Attention], latents: int) -> Attention:
+        own = of(latents)
+        return Attention(
+            own.block_latents if block is None else block,
+            own.window if window is None else window,
+            own.sink if sink is None else sink,
+            own.history,
+        )
 
-    stages = (stage if stage.attention is whole_clip else replace(stage, attention=attention(stage)) for stage in recipe.stages)
-    return replace(recipe, stages=tuple(stages)) if chosen else recipe
+    stages = (
+        stage if stage.attention is whole_clip else replace(stage, attention=partial(chosen, stage.attention)) for stage in recipe.stages
+    )
+    return replace(recipe, stages=tuple(stages))
 
 
 def _with_objectives(recipe: Recipe, change: Callable[[Objective], Objective]) -> Recipe:
