@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.bench.fixer_speed import Clip
-from alpasim_plugin.fixers.networks import LATENT, Networks, load_networks
+from alpasim_plugin.fixers.networks import LATENT, Networks, decode, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.pipeline import condition_of, map_video, opacity_input
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.views import group_views, to_clip, to_images
-from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.clips import on_grid
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names
@@ -78,10 +77,7 @@ def refine_clip(
     mask = torch.zeros_like(mask) if settings.holes == "everywhere" else mask
     condition = condition_of(settings, z_map, z_render, opacity_input(settings, rgb, alpha, first=True))
     clean = refine_latents(networks, settings, z_render, mask, condition, noise)
-    if settings.decoder.kind != "render":
-        return networks.decoder.decode(clean, clamp=False)
-    assert isinstance(networks.decoder, TinyVAE), "settings allow no other decoder to see the render"
-    return networks.decoder.decode(clean, render=rgb, opacity=alpha, clamp=False)
+    return decode(networks, settings, clean, rgb, alpha)[0]
 
 
 def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int) -> U8:

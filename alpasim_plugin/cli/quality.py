@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -152,6 +152,7 @@ def quality(
     summary["run"] = {
         "data": str(data), "split": split, "input": given, "frames": frames, "seed": seed, "device": device, "jobs": jobs, "threads": used,
         "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in variants}, "networks": dict(networks),
+        "units": {variant.label: unit_of(variant) for variant in variants},
         "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
     }  # fmt: skip
     write_results(summary, todo, out)
@@ -205,6 +206,12 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
             DOING, f"--set {next(iter(own), '')}", "no fixer of this label", f"the variants are {', '.join(variants) or 'none'}"
         )
     return tuple(variants.values())
+
+
+def unit_of(variant: Variant) -> dict[str, Any] | None:
+    """Return what a fixer makes at a time and what that costs; None for the render, and where a fixer does not say."""
+    unit = getattr(variant.spec and variant.spec.settings, "unit", None)
+    return unit and {**asdict(unit), "calls_per_frame": unit.calls_per_frame}
 
 
 def evenly(sequences: Sequence[PairSequence], count: int | None) -> list[PairSequence]:

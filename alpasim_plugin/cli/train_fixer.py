@@ -17,7 +17,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.training.clip_batches import BatchForm
-from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
+from alpasim_plugin.training.fixer_run import FixerRun, TrainableSettings, train_fixer
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.recipes.recipe import INIT
 from alpasim_plugin.training.recipes.registry import (
@@ -44,6 +44,19 @@ def onefixer_settings(name: str) -> OneFixerSettings:
         raise InputError(
             "choosing a fixer to train", f"--fixer {name}", "it has no networks", "choose a block generator, such as onefixer-dit-tiny"
         )
+    return settings
+
+
+def trainable_settings(name: str) -> TrainableSettings:
+    """Return the settings of a shipped fixer that a recipe can be trained for.
+
+    Raises:
+        InputError: Unknown, or a fixer without latents.
+    """
+    settings = fixer_settings(name)
+    if not isinstance(settings, TrainableSettings):
+        do = "leave it out, or choose a block generator, such as onefixer-dit-tiny"
+        raise InputError("choosing a fixer to train", f"--fixer {name}", "it has no networks on latents", do)
     return settings
 
 
@@ -101,7 +114,10 @@ def train_fixer_command(
     options.use_threads(threads)
     chosen = with_perceptual_weight(with_source_share(recipe_of(recipe), source_share), perceptual)
     chosen = with_attention(with_objective(chosen, objective or []), block, window, sink)
-    settings = onefixer_settings(fixer or chosen.fixer)
+    settings = trainable_settings(fixer or chosen.fixer)
+    if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
+        do = "leave out --block, --window and --sink"
+        raise InputError("choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do)
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
     batches = BatchForm(clips, None, columns, seed)

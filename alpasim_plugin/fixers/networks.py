@@ -13,13 +13,14 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
-from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
+from alpasim_plugin.fixers.settings import FixerSettings, LatentFixerSettings, OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
 from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
-from alpasim_plugin.nets.schedule import CONTEXT_STEP, from_names
+from alpasim_plugin.nets.schedule import CONTEXT_STEP
+from alpasim_plugin.nets.streaming_state import State
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
 from alpasim_plugin.seeding import derive_seed
@@ -50,7 +51,7 @@ class Networks:
         return self.dit.device
 
 
-def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
+def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Networks:
     """Build the networks that the settings name, or return them if this process has built them before.
 
     Raises:
@@ -62,7 +63,7 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
     return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
 
 
-def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, source: str) -> CosmosCausalDiT:
+def streaming_dit(weights: Mapping[str, Tensor], settings: LatentFixerSettings, source: str) -> CosmosCausalDiT:
     """Build a transformer for streaming inference.
 
     Args:
@@ -82,8 +83,10 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, sou
     return net
 
 
-def condition_sizes(settings: OneFixerSettings) -> dict[str, int]:
-    """Return the sizes of the condition that streaming gives a transformer."""
+def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
+    """Return the sizes of the condition that a transformer is given; models without a map take the render, or nothing, in its place."""
+    if not isinstance(settings, OneFixerSettings):
+        return {"map_channels": LATENT, "opacity_channels": 0}
     return {
         "map_channels": LATENT * (1 + settings.render_input),
         "opacity_channels": OPACITY_CHANNELS if settings.opacity_input else 0,
@@ -94,8 +97,30 @@ def _listed(sizes: Mapping[str, int]) -> str:
     return ", ".join(f"{key} {value}" for key, value in sizes.items())
 
 
+def decode(
+    networks: Networks, settings: LatentFixerSettings, z: Tensor, render: Tensor, opacity: Tensor | None, state: State | None = None
+) -> tuple[Tensor, State]:
+    """Decode latents as the settings say.
+
+    Args:
+        networks: Theirs.
+        settings: The kind of decoder.
+        z: ``(B, 16, m, h, w)``.
+        render: ``(B, 3, n, 8h, 8w)`` in [-1, 1], for a decoder that sees it.
+        opacity: ``(B, 1, n, 8h, 8w)`` its opacity; None: opaque everywhere.
+        state: The decoder's, None at the start of a video.
+
+    Returns:
+        Frames like ``render``, not clipped to [-1, 1], and the decoder's state after them.
+    """
+    if settings.decoder.kind != "render":
+        return networks.decoder.decode_next(z, state, clamp=False)
+    assert isinstance(networks.decoder, TinyVAE), "settings allow no other decoder to see the render"
+    return networks.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
+
+
 @lru_cache(maxsize=4)
-def _load(settings: OneFixerSettings, device: str) -> Networks:
+def _load(settings: LatentFixerSettings, device: str) -> Networks:
     return build_networks(Parts(settings), device, device)
 
 
@@ -105,10 +130,11 @@ def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks
     plain = parts.dit().to(dit_device)
     with torch.no_grad():
         text = text_at_precision(plain.encode_text(parts.prompt(plain.sizes).to(dit_device)), precision)
-    fold = settings.fold and len(settings.steps) == 1
+    times = settings.network_times
+    fold = settings.fold and len(times) == 1
     # Folded at float32 and cast after that, so that every weight is rounded once.
-    dit = at_precision(plain.folded(from_names(settings.steps)[0].t) if fold else plain, precision)
-    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.history == "finalise" else dit
+    dit = at_precision(plain.folded(times[0]) if fold else plain, precision)
+    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.finalises else dit
     vae = codec_at_precision(parts.vae(), settings.codec_precision).to(codec_device)
     own = settings.decoder.kind != "taehv"
     decoder = vae if own else codec_at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
@@ -118,7 +144,7 @@ def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks
 class Parts:
     """The parts of a fixer with their weights: from the bundle, from a file of their own, or initialised as ``untrained`` says."""
 
-    def __init__(self, settings: OneFixerSettings) -> None:
+    def __init__(self, settings: LatentFixerSettings) -> None:
         self.settings, self.weights = settings, settings.weights
         self.bundle = read_bundle(self.weights.bundle, settings) if self.weights.bundle is not None else None
         self.trained = self.bundle.trained if self.bundle else self.weights.dit is not None

@@ -19,9 +19,8 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.networks import Networks
+from alpasim_plugin.fixers.networks import Networks, decode
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.graphs import CudaRecorder, Function, GraphedFunction, Recorder
 from alpasim_plugin.nets.kv_cache import RollingCache
 from alpasim_plugin.nets.sampling import finalise, mixed_source, opacity_mask, opacity_values, sample_block, sources_needed
@@ -202,11 +201,7 @@ class BlockPipeline:
         with self.stage("dit"):
             z_0 = sample_block(nets.dit, sources, nets.text, condition, cache, self.schedule, "last-forward", commit=False)
         with self.stage("decode"):
-            if self.settings.decoder.kind == "render":
-                assert isinstance(nets.decoder, TinyVAE), "settings allow no other decoder to see the render"
-                out, decoder = nets.decoder.decode_next(z_0, decoder, render=rgb, opacity=alpha, clamp=False)
-            else:
-                out, decoder = nets.decoder.decode_next(z_0, decoder, clamp=False)
+            out, decoder = decode(nets, self.settings, z_0, rgb, alpha, decoder)
         return out, z_0, condition, encoder, decoder
 
     def _finalise(self, cache: RollingCache, z_0: Tensor, eps: Tensor, z_map: Tensor) -> None:

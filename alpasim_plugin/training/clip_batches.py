@@ -74,14 +74,14 @@ class Drawn(NamedTuple):
     clips: Sequence[LatentClip]
     columns: slice
 
-    def frames(self, end: int) -> tuple[Tensor, Tensor]:
-        """Return the render ``(B, 3, end, H, W)`` in [-1, 1] and its opacity ``(B, 1, end, H, W)`` of the clips' first frames."""
-        both = [clip.frames(end) for clip in self.clips]
+    def frames(self, end: int, begin: int = 0) -> tuple[Tensor, Tensor]:
+        """Return the render ``(B, 3, T, H, W)`` in [-1, 1] and its opacity ``(B, 1, T, H, W)``: the clips' frames ``begin`` to ``end``."""
+        both = [clip.frames(end, begin) for clip in self.clips]
         return torch.stack([self._cut(render) for render, _ in both]), torch.stack([self._cut(opacity) for _, opacity in both])
 
-    def clean(self, end: int) -> Tensor:
-        """Return the clean frames ``(B, 3, end, H, W)`` in [-1, 1] of the clips' first ``end``."""
-        return torch.stack([self._cut(clip.clean(end)) for clip in self.clips])
+    def clean(self, end: int, begin: int = 0) -> Tensor:
+        """Return the clean frames ``(B, 3, T, H, W)`` in [-1, 1] of the clips' frames ``begin`` to ``end``."""
+        return torch.stack([self._cut(clip.clean(end, begin)) for clip in self.clips])
 
     def _cut(self, frames: Tensor) -> Tensor:
         return frames[..., self.columns.start * SIDE : self.columns.stop * SIDE]

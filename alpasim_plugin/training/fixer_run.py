@@ -19,6 +19,7 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import load_tiny_vae, parts_of, save_bundle
+from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
@@ -32,6 +33,7 @@ from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 BUNDLE_FILE = "fixer.safetensors"
 BUNDLED = ("dit", "vae")
+TrainableSettings = OneFixerSettings | RenderStepSettings | NoiseWindowSettings
 Report = Callable[[int, Mapping[str, float]], None]
 
 
@@ -53,7 +55,7 @@ class FixerRun:
         precision: Of the forward passes: None is float32.
     """
 
-    settings: OneFixerSettings
+    settings: TrainableSettings
     recipe: Recipe
     data: Path
     vae: Path
@@ -178,6 +180,7 @@ def stage_inputs(
     return StageInputs(
         run.settings.dit, run.settings.rope_ratios, stage.attention(latents), stage.seen, weights, vae, clips,
         replace(run.batches, latents=latents), stage.updates(run.schedule.steps), run.schedule.accumulate, run.equal_channels, distance,
+        run.settings,
     )  # fmt: skip
 
 
@@ -199,13 +202,16 @@ def write_bundle(
     return path
 
 
-def deployed_settings(run: FixerRun, stage: Stage) -> OneFixerSettings:
+def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
     """Return the settings that a stage's weights are deployed with.
 
     Raises:
         InputError: Settings that do not fit together.
     """
-    said = run.recipe.settings(stage, clip_latents(run, stage))
+    if isinstance(run.settings, OneFixerSettings):
+        said = run.recipe.settings(stage, clip_latents(run, stage))
+    else:
+        said = run.recipe.own_settings(stage)
     try:
         return type(run.settings).model_validate({**run.settings.model_dump(), **said})
     except ValueError as error:

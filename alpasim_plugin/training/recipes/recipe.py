@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 from torch import Tensor, nn
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.settings import DiTSettings
+from alpasim_plugin.fixers.settings import DiTSettings, LatentFixerSettings
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.training.clip_batches import BatchForm, Seen
 from alpasim_plugin.training.latent_clips import LatentClips
@@ -102,6 +102,7 @@ class StageInputs:
         accumulate: Batches an update.
         equal_channels: Whether flow matching weights all latent channels alike.
         distance: Name and function of the perceptual term; None where the recipe has none.
+        settings: Of the fixer that is trained.
     """
 
     dit: DiTSettings
@@ -116,6 +117,7 @@ class StageInputs:
     accumulate: int = 1
     equal_channels: bool = False
     distance: tuple[str, Distance] | None = None
+    settings: LatentFixerSettings | None = None
 
 
 class Objective(Protocol):
@@ -150,6 +152,7 @@ class Stage:
         trained: Trained parts, by the first names of their parameters, with learning rates relative to the run's.
         constant_rate: Whether the learning rate stays at its peak instead of falling along a cosine.
         latents: Latents from a clip's start; None for the whole clip.
+        deployed: Settings of its weights that differ from the recipe's.
     """
 
     name: str
@@ -161,6 +164,7 @@ class Stage:
     trained: Mapping[str, PartSchedule] = field(default_factory=lambda: TRAINED_DIT)
     constant_rate: bool = False
     latents: int | None = None
+    deployed: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -199,5 +203,9 @@ class Recipe:
             known.append(stage.name)
 
     def settings(self, stage: Stage, latents: int) -> dict[str, Any]:
-        """Return the settings to deploy a stage's weights with, for clips of so many latents."""
-        return {"steps": (1000.0,), **asdict(stage.attention(latents)), **stage.seen.settings(), **self.deployed}
+        """Return the settings to deploy a stage's weights with in a block generator, for clips of so many latents."""
+        return {"steps": (1000.0,), **asdict(stage.attention(latents)), **stage.seen.settings(), **self.own_settings(stage)}
+
+    def own_settings(self, stage: Stage) -> dict[str, Any]:
+        """Return the settings that recipe and stage name: all that there are for a fixer without blocks."""
+        return {**self.deployed, **stage.deployed}

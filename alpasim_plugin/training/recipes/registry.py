@@ -16,6 +16,7 @@ from alpasim_plugin.training.flow_matching import FlowMatching
 from alpasim_plugin.training.generator import SharedRollout
 from alpasim_plugin.training.recipes.ablation import ABLATION
 from alpasim_plugin.training.recipes.causal_arms import CAUSAL_ARMS
+from alpasim_plugin.training.recipes.image_arms import IMAGE_ARMS
 from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, whole_clip
 
 
@@ -33,7 +34,7 @@ def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
     return MappingProxyType(found)
 
 
-RECIPES = by_name((*ABLATION, *CAUSAL_ARMS))
+RECIPES = by_name((*ABLATION, *CAUSAL_ARMS, *IMAGE_ARMS))
 
 
 def recipe_of(name: str) -> Recipe:

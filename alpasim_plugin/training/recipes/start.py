@@ -9,6 +9,7 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
+from alpasim_plugin.nets.euler import share_embedding
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
 from alpasim_plugin.seeding import derive_seed
@@ -23,16 +24,27 @@ AREA = 4  # latents of a token
 
 def transformer_of(inputs: StageInputs, part: str) -> CosmosCausalDiT:
     """Build a part that is a transformer; inputs that its weights do not have yet start at zero, so that they change nothing."""
-    weights = inputs.weights.get(part)
-    if weights is None:
-        weights = initial_weights(
-            DiTSizes(**inputs.dit.model_dump()), derive_seed("training", inputs.form.seed, "generator"), zero_velocity=True
-        )
+    weights = start_weights(inputs, part)
     if inputs.seen.source == "noise":
         weights = widen_map(weights, 2 * LATENT)
     if inputs.seen.opacity:
         weights = with_opacity(weights)
     return CosmosCausalDiT.from_state_dict(weights, inputs.rope_ratios, source=f"initial weights of {part}")
+
+
+def transformer_with_render(inputs: StageInputs, part: str) -> CosmosCausalDiT:
+    """Build a part that is a transformer whose map input takes the render's latents instead; see `euler.share_embedding`."""
+    weights = share_embedding(start_weights(inputs, part))
+    return CosmosCausalDiT.from_state_dict(weights, inputs.rope_ratios, source=f"initial weights of {part}")
+
+
+def start_weights(inputs: StageInputs, part: str) -> Mapping[str, Tensor]:
+    """Return a part's weights as given, or those of a transformer that returns its source unchanged."""
+    weights = inputs.weights.get(part)
+    if weights is not None:
+        return weights
+    sizes = DiTSizes(**inputs.dit.model_dump())
+    return initial_weights(sizes, derive_seed("training", inputs.form.seed, "generator"), zero_velocity=True)
 
 
 def channel_weights_of(inputs: StageInputs) -> Tensor | None:
