@@ -96,9 +96,7 @@ def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) ->
     assert (a != b).any()
 
 
-def test_given_weights_take_the_place_of_a_stage_and_the_student_moves_in_its_updates_alone(
-    data: Path, student: Path, tmp_path: Path
-) -> None:  # noqa: F811
+def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811
     recipe = recipe_of("self-forcing")
     run = run_of(data, recipe, student=student, teacher=student)
     assert [stage.name for stage in run.stages()] == ["dmd"]
