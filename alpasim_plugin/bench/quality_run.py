@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -174,8 +174,14 @@ class QualityRun:
             "input": self.given, "frames": self.frames, "seed": self.seed, "device": self.device, "jobs": self.jobs,
             "threads": self.used_threads,
             "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in self.variants},
-            "networks": dict(self.networks), "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
+            "networks": dict(self.networks), "units": {variant.label: unit_of(variant) for variant in self.variants}, "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
         }  # fmt: skip
+
+
+def unit_of(variant: Variant) -> dict[str, Any] | None:
+    """Return what a fixer makes at a time and what that costs; None for the render, and where a fixer does not say."""
+    unit = getattr(variant.spec and variant.spec.settings, "unit", None)
+    return unit and {**asdict(unit), "calls_per_frame": unit.calls_per_frame}
 
 
 def row_of(work: Work) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from alpasim_plugin.fixers.bundle import save_bundle
+from alpasim_plugin.fixers.networks import condition_sizes
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.init import initial_weights
@@ -32,7 +33,10 @@ def save_stand_in(path: str | Path, settings: OneFixerSettings, seed: int = 0) -
         seed: Of all weights.
     """
     key = derive_seed("fixer-stand-in", seed, settings.name)
-    dit = initial_weights(DiTSizes(**settings.dit.model_dump()), key)
+    dit = initial_weights(DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings)), key)
+    for name in (name for name in dit if name.endswith("opacity_embed.weight")):
+        draw = stream("fixer-stand-in", seed, name).standard_normal(tuple(dit[name].shape))
+        dit[name] = torch.from_numpy(draw).float() / dit[name].shape[1] ** 0.5
     dit["final_layer.linear.weight"] *= VELOCITY  # its input is normalised, so this is the spread of its output
     last = dit["final_layer.adaln_modulation.2.weight"]
     draw = stream("fixer-stand-in", seed, "modulation").standard_normal(tuple(last.shape))

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.bench.fixer_speed import Clip
-from alpasim_plugin.fixers.networks import LATENT, Networks, load_networks
+from alpasim_plugin.fixers.networks import LATENT, Networks, decode, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
+from alpasim_plugin.fixers.pipeline import condition_of, map_video, opacity_input
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.views import group_views, to_clip, to_images
-from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.clips import on_grid
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names
@@ -23,14 +23,15 @@ from alpasim_plugin.types import U8, BlockRule
 
 
 def refine_latents(
-    networks: Networks, settings: OneFixerSettings, z_render: Tensor, mask: Tensor, z_map: Tensor, noise: Sequence[Tensor]
+    networks: Networks, settings: OneFixerSettings, z_render: Tensor, mask: Tensor, condition: Tensor, noise: Sequence[Tensor]
 ) -> Tensor:
     """Fix the latents of a whole clip.
 
     Args:
         networks: In float32, not folded.
         settings: Steps, history, window, block length.
-        z_render, z_map: ``(B, 16, T, h, w)``.
+        z_render: ``(B, 16, T, h, w)``.
+        condition: ``(B, channels, T, h, w)``, from `condition_of`.
         mask: ``(B, 1, T, h, w)``, ``m`` of Eq. 1.
         noise: Draws like ``z_render``.
 
@@ -46,7 +47,9 @@ def refine_latents(
         for i, level in enumerate(schedule):
             given = torch.cat([past, x], dim=2)
             t = torch.cat([past_t, torch.full((1, x.shape[2]), level.t)], dim=1)
-            v = networks.dit(given, t, networks.text, z_map[:, :, : start + n], block_latents=n, window=settings.window, sink=settings.sink)
+            v = networks.dit(
+                given, t, networks.text, condition[:, :, : start + n], block_latents=n, window=settings.window, sink=settings.sink
+            )
             z_0 = flow_step(x, v[:, :, start:], level.sigma)  # Eq. 2
             if i + 1 < len(schedule):
                 x = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
@@ -68,13 +71,13 @@ def refine_clip(
         ``(B, 3, T, H, W)``, not clipped to [-1, 1].
     """
     z_render = networks.vae.encode(rgb)
-    z_map = torch.zeros_like(z_render) if sdmap is None else networks.vae.encode(sdmap)
+    shown = map_video(settings, rgb, sdmap)
+    z_map = torch.zeros_like(z_render) if shown is None else networks.vae.encode(shown)
     mask = torch.ones_like(z_render[:, :1]) if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=True)
-    clean = refine_latents(networks, settings, z_render, mask, z_map, noise)
-    if settings.decoder.kind != "render":
-        return networks.decoder.decode(clean, clamp=False)
-    assert isinstance(networks.decoder, TinyVAE), "settings allow no other decoder to see the render"
-    return networks.decoder.decode(clean, render=rgb, opacity=alpha, clamp=False)
+    mask = torch.zeros_like(mask) if settings.holes == "everywhere" else mask
+    condition = condition_of(settings, z_map, z_render, opacity_input(settings, rgb, alpha, first=True))
+    clean = refine_latents(networks, settings, z_render, mask, condition, noise)
+    return decode(networks, settings, clean, rgb, alpha)[0]
 
 
 def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int) -> U8:

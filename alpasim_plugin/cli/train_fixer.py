@@ -1,9 +1,9 @@
-"""``simrun train fixer``: train a variant of OneFixer from pairs; ``simrun train memory``: its memory and time."""
+"""``simrun train fixer``: train a recipe from pairs; ``simrun train memory``: its memory and time."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,11 +16,19 @@ from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.training.fixer_run import FixerRun, train_fixer
-from alpasim_plugin.training.generator import GeneratorRecipe
+from alpasim_plugin.training.clip_batches import BatchForm
+from alpasim_plugin.training.fixer_run import FixerRun, TrainableSettings, train_fixer
 from alpasim_plugin.training.latent_clips import ClipForm
+from alpasim_plugin.training.recipes.recipe import INIT
+from alpasim_plugin.training.recipes.registry import (
+    RECIPES,
+    recipe_of,
+    with_attention,
+    with_objective,
+    with_perceptual_weight,
+    with_source_share,
+)
 from alpasim_plugin.training.trainer import Schedule
-from alpasim_plugin.training.variants import VARIANTS, variant_of
 
 PRECISIONS: Mapping[str, torch.dtype | None] = {"fp32": None, "bf16": torch.bfloat16}
 
@@ -39,13 +47,30 @@ def onefixer_settings(name: str) -> OneFixerSettings:
     return settings
 
 
+def trainable_settings(name: str) -> TrainableSettings:
+    """Return the settings of a shipped fixer that a recipe can be trained for.
+
+    Raises:
+        InputError: Unknown, or a fixer without latents.
+    """
+    settings = fixer_settings(name)
+    if not isinstance(settings, TrainableSettings):
+        do = "leave it out, or choose a block generator, such as onefixer-dit-tiny"
+        raise InputError("choosing a fixer to train", f"--fixer {name}", "it has no networks on latents", do)
+    return settings
+
+
 def train_fixer_command(
     data: options.Pairs,
     vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle.")],
     out: options.RunFolder,
-    variant: Annotated[str, typer.Option("--variant", help=f"One of {', '.join(VARIANTS)}.")] = "V9",
+    recipe: Annotated[str, typer.Option("--recipe", "--variant", help=f"One of {', '.join(RECIPES)}.")] = "V9",
     init: Annotated[Path | None, typer.Option("--init", help="Initial weights: a run's fixer.safetensors, or a transformer.")] = None,
-    steps: options.Steps = 400,
+    weights: Annotated[
+        list[str] | None,
+        typer.Option("--weights", help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained."),
+    ] = None,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")] = 400,
     clips: options.Clips = 4,
     accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")] = 2,
     latents: options.Latents = 12,
@@ -54,8 +79,15 @@ def train_fixer_command(
     lr: options.PeakLr = 2e-4,
     ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.99,
     source_share: Annotated[
-        float, typer.Option("--source-share", min=0.0, max=0.8, help="Variant base: share of positions at t = 1, the start of sampling.")
+        float, typer.Option("--source-share", min=0.0, max=0.8, help="Recipe base: share of positions at t = 1, the start of sampling.")
     ] = 0.35,
+    objective: Annotated[
+        list[str] | None,
+        typer.Option("--objective", help="KEY=VALUE or STAGE.KEY=VALUE of the recipe's objectives, repeatable, such as dmd.steps=4."),
+    ] = None,
+    block: Annotated[int | None, typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's.")] = None,
+    window: Annotated[int | None, typer.Option("--window", min=1, help="Attention window in latents, instead of the recipe's.")] = None,
+    sink: Annotated[int | None, typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's.")] = None,
     perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper.")] = 10.0,
     channels: Annotated[
         Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: by amplitude in pixels, or equal.")
@@ -72,25 +104,48 @@ def train_fixer_command(
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
     threads: options.Threads = None,
     seed: options.Seed = 0,
-    fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer-dit-tiny",
+    fixer: Annotated[str | None, typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's.")] = None,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
 ) -> None:
-    """Train a variant of the fixer; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
+    """Train a recipe: one system of the paper's tables; writes OUT/fixer.safetensors (averaged weights, float16) and its card."""
     del debug
     options.use_threads(threads)
-    chosen, progress = variant_of(variant).with_perceptual_weight(perceptual), options.Progress(steps)
-    recipe = GeneratorRecipe(
-        clips=clips, columns=columns, steps=steps, accumulate=accumulate, seed=seed, source_share=source_share, channels=channels
-    )
-    settings = onefixer_settings(fixer).model_copy(update={"window": recipe.window, "history": "finalise"})
+    chosen = with_perceptual_weight(with_source_share(recipe_of(recipe), source_share), perceptual)
+    chosen = with_attention(with_objective(chosen, objective or []), block, window, sink)
+    settings = trainable_settings(fixer or chosen.fixer)
+    if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
+        do = "leave out --block, --window and --sink"
+        raise InputError("choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do)
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
-    run = FixerRun(settings, chosen, data, vae, init, form, recipe, schedule, PRECISIONS[precision])
-    distance = progress.perceptual_term(metric_weights) if any(stage.horizon for stage in chosen.stages) else None
+    batches = BatchForm(clips, None, columns, seed)
+    run = FixerRun(
+        settings, chosen, data, vae, named_weights(init, weights or []), form, batches, schedule, channels == "equal", PRECISIONS[precision]
+    )
+    progress = options.Progress(run.updates)
+    distance = progress.perceptual_term(metric_weights) if run.perceptual else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
     progress.wrote(train_fixer(run, out, distance, encoded, progress.update, stop_at), as_json)
+
+
+def named_weights(init: Path | None, pairs: Sequence[str]) -> dict[str, Path]:
+    """Return files by name from ``--init FILE`` and repeated ``--weights NAME=FILE``.
+
+    Raises:
+        InputError: Not NAME=FILE, or a name twice.
+    """
+    found = {} if init is None else {INIT: init}
+    for text in pairs:
+        name, equals, path = text.partition("=")
+        if not equals or not path or name in found:
+            wrong = "a name that has a file already" if equals and path else "not NAME=FILE"
+            raise InputError(
+                "reading --weights", f"--weights {text}", wrong, "write for example --weights teacher=runs/t/fixer.safetensors"
+            )
+        found[name] = Path(path)
+    return found
 
 
 def memory_command(

@@ -1,8 +1,9 @@
 """Weights of a fixer in one safetensors file: its networks, and the settings they were trained with.
 
-Keys carry their part. A bundle of the kind ``block`` has ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and
-``prompt.text``; one of the kind ``per-frame`` has ``generator.``. The header holds ``format``, ``kind``, ``trained``, ``note`` and
-``settings``, the JSON of the settings that the weights were trained with. Only safetensors is read: a pickle is refused.
+Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers (``block``, ``render-step``,
+``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and ``prompt.text``. The header holds
+``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained with. Only safetensors
+is read: a pickle is refused.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from torch import Tensor
 from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.settings import LatentFixerSettings
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.reading.json_files import kind_of, parse_json
 
-BundleSettings = OneFixerSettings | PixelFixerSettings
+BundleSettings = LatentFixerSettings | PixelFixerSettings
 FORMAT = "simrun-fixer-1"
 DOING = "loading a fixer's weights"
 RENAMED = {"onefixer-tiny": "onefixer-dit-tiny", "onefixer-s": "onefixer-dit-s"}  # former names in the headers of older bundles
@@ -53,13 +54,16 @@ class Kind:
         ]
 
 
+_LATENT_PARTS = frozenset({"dit", "vae"}), frozenset({"decoder", "prompt"})
+_LATENT = ("rope_ratios", "vae.kind", "decoder.kind", "decoder.scaled")
 KINDS: Mapping[str, Kind] = {
     "block": Kind(
-        frozenset({"dit", "vae"}),
-        frozenset({"decoder", "prompt"}),
-        ("rope_ratios", "block_latents", "vae.kind", "decoder.kind", "decoder.scaled"),
-        ("steps", "history", "window", "sink", "holes", "uses_map"),
+        *_LATENT_PARTS,
+        (*_LATENT, "block_latents", "render_input", "opacity_input"),
+        ("steps", "history", "window", "sink", "holes", "uses_map", "no_map"),
     ),
+    "render-step": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "render_level.alpha", "render_level.sigma"), ("references",)),
+    "noise-window": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "window_frames"), ("steps", "stride_frames", "stitch", "noise")),
     "per-frame": Kind(frozenset({"generator"}), frozenset(), (), ("steps", "holes", "uses_map")),
 }
 
@@ -89,7 +93,7 @@ def save_bundle(
     Raises:
         InputError: A part that is not known, or one that is missing.
     """
-    kind = bundle_kind(settings)
+    kind = settings.bundle_kind
     problems = KINDS[kind].problems(parts)
     if problems:
         do = f"give {', '.join(sorted(KINDS[kind].needed))}, and nothing else but {', '.join(sorted(KINDS[kind].optional)) or 'these'}"
@@ -100,11 +104,6 @@ def save_bundle(
     write_safetensors(path, tensors, header)
 
 
-def bundle_kind(settings: BundleSettings) -> str:
-    """Return the kind of bundle that a fixer's settings take."""
-    return "per-frame" if isinstance(settings, PixelFixerSettings) else "block"
-
-
 def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
     """Read a bundle for use with some settings.
 
@@ -112,12 +111,14 @@ def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
     header, trained_with = _header(path)
-    name = bundle_kind(settings)
+    name = settings.bundle_kind
     found_kind = header.get("kind", OLDEST_KIND)
     if found_kind != name:
         do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
         raise InputError(DOING, f"{path} with the settings of {settings.name}", f"a bundle of the kind {found_kind!r}, not {name!r}", do)
     kind = KINDS[name]
+    # A header written before a setting existed lacks it: its weights were trained at what is now the default.
+    trained_with = {**_defaults(settings), **trained_with}
     differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*kind.must_match, *kind.may_differ)]
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in kind.must_match]
     if wrong:
@@ -178,6 +179,12 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
         do = f"give a file that save_bundle wrote ({FORMAT}), or the parts as weights.dit and weights.vae"
         raise InputError(DOING, str(path), found, do)
     return header, settings
+
+
+def _defaults(settings: BundleSettings) -> dict[str, object]:
+    """Return the settings that have a default, at it, as JSON has them."""
+    fields = type(settings).model_fields.items()
+    return {key: field.get_default() for key, field in fields if isinstance(field.get_default(), str | bool | int | float)}
 
 
 def _flat(data: Mapping[str, object], prefix: str = "") -> list[str]:

@@ -1,18 +1,21 @@
-"""The factories of ``onefixer`` in all its forms: what a run knows of it without loading a network."""
+"""The factories of the fixers with networks: what a run knows of it without loading a network."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.interfaces import Declaration
 from alpasim_plugin.nets.headers import read_metadata
 
 if TYPE_CHECKING:
+    from alpasim_plugin.fixers.image_fixer import ImageFixer
     from alpasim_plugin.fixers.onefixer import OneFixer
     from alpasim_plugin.fixers.pixel_fixer import PixelFixer
+    from alpasim_plugin.fixers.window_fixer import WindowFixer
 
 PARTS = ("bundle", "dit", "vae", "decoder", "prompt")
 
@@ -31,7 +34,24 @@ def per_frame(settings: PixelFixerSettings, scene_id: str, seed: int = 0, device
     return PixelFixer(settings, scene_id, seed, device, threads)
 
 
-def describe(settings: OneFixerSettings | PixelFixerSettings) -> Declaration:
+def image(settings: RenderStepSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> ImageFixer:
+    """Make one rollout's session of an image model; see `alpasim_plugin.fixers.image_fixer.ImageFixer`."""
+    from alpasim_plugin.fixers.image_fixer import ImageFixer  # loads torch
+
+    return ImageFixer(settings, scene_id, seed, device, threads)
+
+
+def windows(
+    settings: NoiseWindowSettings, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None
+) -> ImageFixer | WindowFixer:
+    """Make one rollout's session from noise: of single frames, or, where a window has more, of a whole clip."""
+    from alpasim_plugin.fixers.image_fixer import ImageFixer  # loads torch
+    from alpasim_plugin.fixers.window_fixer import WindowFixer
+
+    return (WindowFixer if settings.is_offline else ImageFixer)(settings, scene_id, seed, device, threads)
+
+
+def describe(settings: OneFixerSettings | PixelFixerSettings | RenderStepSettings | NoiseWindowSettings) -> Declaration:
     """Say whose weights the settings name.
 
     Raises:
@@ -54,3 +74,7 @@ onefixer.settings_model = OneFixerSettings  # type: ignore[attr-defined]
 onefixer.describe = describe  # type: ignore[attr-defined]
 per_frame.settings_model = PixelFixerSettings  # type: ignore[attr-defined]
 per_frame.describe = describe  # type: ignore[attr-defined]
+image.settings_model = RenderStepSettings  # type: ignore[attr-defined]
+image.describe = describe  # type: ignore[attr-defined]
+windows.settings_model = NoiseWindowSettings  # type: ignore[attr-defined]
+windows.describe = describe  # type: ignore[attr-defined]

@@ -13,12 +13,14 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
-from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings
+from alpasim_plugin.fixers.settings import FixerSettings, LatentFixerSettings, OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
-from alpasim_plugin.nets.schedule import CONTEXT_STEP, from_names
+from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
+from alpasim_plugin.nets.schedule import CONTEXT_STEP
+from alpasim_plugin.nets.streaming_state import State
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
 from alpasim_plugin.seeding import derive_seed
@@ -49,7 +51,7 @@ class Networks:
         return self.dit.device
 
 
-def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
+def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Networks:
     """Build the networks that the settings name, or return them if this process has built them before.
 
     Raises:
@@ -61,7 +63,7 @@ def load_networks(settings: OneFixerSettings, device: str = "cpu") -> Networks:
     return _load(settings.model_copy(update={key: getattr(loop, key) for key in ("mode", "tolerance_m", "tolerance_deg")}), device)
 
 
-def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, source: str) -> CosmosCausalDiT:
+def streaming_dit(weights: Mapping[str, Tensor], settings: LatentFixerSettings, source: str) -> CosmosCausalDiT:
     """Build a transformer for streaming inference.
 
     Args:
@@ -70,17 +72,55 @@ def streaming_dit(weights: Mapping[str, Tensor], settings: OneFixerSettings, sou
         source: Where the weights come from, for errors.
 
     Raises:
-        InputError: Weights that do not fit together, or whose map input has other channels than streaming gives.
+        InputError: Weights that do not fit together, or that take another condition than the settings give.
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
-    if net.sizes.map_channels != LATENT:
-        found = f"its map input has {net.sizes.map_channels} channels, streaming gives {LATENT} (variant V6 takes the render there)"
-        raise InputError(DOING, source, found, "train a variant that starts from the render, for example V9")
+    expected = condition_sizes(settings)
+    found = {key: getattr(net.sizes, key) for key in expected}
+    if found != expected:
+        do = "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them"
+        raise InputError(DOING, source, f"{_listed(found)}, streaming gives {_listed(expected)}", do)
     return net
 
 
+def condition_sizes(settings: LatentFixerSettings) -> dict[str, int]:
+    """Return the sizes of the condition that a transformer is given; models without a map take the render, or nothing, in its place."""
+    if not isinstance(settings, OneFixerSettings):
+        return {"map_channels": LATENT, "opacity_channels": 0}
+    return {
+        "map_channels": LATENT * (1 + settings.render_input),
+        "opacity_channels": OPACITY_CHANNELS if settings.opacity_input else 0,
+    }
+
+
+def _listed(sizes: Mapping[str, int]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in sizes.items())
+
+
+def decode(
+    networks: Networks, settings: LatentFixerSettings, z: Tensor, render: Tensor, opacity: Tensor | None, state: State | None = None
+) -> tuple[Tensor, State]:
+    """Decode latents as the settings say.
+
+    Args:
+        networks: Theirs.
+        settings: The kind of decoder.
+        z: ``(B, 16, m, h, w)``.
+        render: ``(B, 3, n, 8h, 8w)`` in [-1, 1], for a decoder that sees it.
+        opacity: ``(B, 1, n, 8h, 8w)`` its opacity; None: opaque everywhere.
+        state: The decoder's, None at the start of a video.
+
+    Returns:
+        Frames like ``render``, not clipped to [-1, 1], and the decoder's state after them.
+    """
+    if settings.decoder.kind != "render":
+        return networks.decoder.decode_next(z, state, clamp=False)
+    assert isinstance(networks.decoder, TinyVAE), "settings allow no other decoder to see the render"
+    return networks.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
+
+
 @lru_cache(maxsize=4)
-def _load(settings: OneFixerSettings, device: str) -> Networks:
+def _load(settings: LatentFixerSettings, device: str) -> Networks:
     return build_networks(Parts(settings), device, device)
 
 
@@ -90,10 +130,11 @@ def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks
     plain = parts.dit().to(dit_device)
     with torch.no_grad():
         text = text_at_precision(plain.encode_text(parts.prompt(plain.sizes).to(dit_device)), precision)
-    fold = settings.fold and len(settings.steps) == 1
+    times = settings.network_times
+    fold = settings.fold and len(times) == 1
     # Folded at float32 and cast after that, so that every weight is rounded once.
-    dit = at_precision(plain.folded(from_names(settings.steps)[0].t) if fold else plain, precision)
-    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.history == "finalise" else dit
+    dit = at_precision(plain.folded(times[0]) if fold else plain, precision)
+    finalise = at_precision(plain.folded(CONTEXT_STEP), precision) if fold and settings.finalises else dit
     vae = codec_at_precision(parts.vae(), settings.codec_precision).to(codec_device)
     own = settings.decoder.kind != "taehv"
     decoder = vae if own else codec_at_precision(parts.decoder(), settings.codec_precision).to(codec_device)
@@ -103,7 +144,7 @@ def build_networks(parts: Parts, dit_device: str, codec_device: str) -> Networks
 class Parts:
     """The parts of a fixer with their weights: from the bundle, from a file of their own, or initialised as ``untrained`` says."""
 
-    def __init__(self, settings: OneFixerSettings) -> None:
+    def __init__(self, settings: LatentFixerSettings) -> None:
         self.settings, self.weights = settings, settings.weights
         self.bundle = read_bundle(self.weights.bundle, settings) if self.weights.bundle is not None else None
         self.trained = self.bundle.trained if self.bundle else self.weights.dit is not None
@@ -125,7 +166,7 @@ class Parts:
         given = self.tensors("dit")
         if given is None:
             self.allow_untrained("dit")
-            sizes = DiTSizes(**settings.dit.model_dump())
+            sizes = DiTSizes(**settings.dit.model_dump(), **condition_sizes(settings))
             given = initial_weights(sizes, self.seed, zero_velocity=settings.untrained == "identity"), "initial weights"
         return streaming_dit(given[0], settings, given[1])
 
@@ -170,4 +211,6 @@ class Parts:
     def refuse(self, part: str, found: str) -> None:
         """Raise the error for weights that are missing."""
         do = f"give --set fixer.weights.{part}=FILE (or fixer.weights.bundle=FILE); for timing alone, fixer.untrained=random"
+        if self.settings.trained_by is not None:
+            do = f"train it: {self.settings.trained_by}; then {do}"
         raise InputError(DOING, f"{self.settings.name}, weights.{part}", found, do)

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
-
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
+from alpasim_plugin.fixers.devices import take_threads
 from alpasim_plugin.fixers.networks import LATENT, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState, no_clock
@@ -22,7 +21,6 @@ from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import DOING, SIDE, Views, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE as LATENT_SIDE
 from alpasim_plugin.nets.clips import crop_clip
-from alpasim_plugin.nets.machine_probe import choose_threads
 from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
@@ -65,11 +63,7 @@ class OneFixer(Fixer):
         if not isinstance(settings, OneFixerSettings):
             found = f"settings of type {type(settings).__name__}"
             raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
-        self.chosen: dict[str, Any] = {}
-        if threads is not None:
-            number = choose_threads(threads)
-            torch.set_num_threads(number.number)
-            self.chosen["threads"] = number.as_dict()
+        self.chosen: dict[str, Any] = take_threads(threads)
         self.chosen["precision"] = {"name": settings.precision, "codec": settings.codec_precision, "why": "as set"}
         self.settings, self.scene_id, self.seed = settings, scene_id, seed
         self.networks = load_networks(settings, device)

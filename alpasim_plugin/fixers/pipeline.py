@@ -19,12 +19,11 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.fixers.networks import Networks
+from alpasim_plugin.fixers.networks import Networks, decode
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.graphs import CudaRecorder, Function, GraphedFunction, Recorder
 from alpasim_plugin.nets.kv_cache import RollingCache
-from alpasim_plugin.nets.sampling import finalise, mixed_source, opacity_mask, sample_block, sources_needed
+from alpasim_plugin.nets.sampling import finalise, mixed_source, opacity_mask, opacity_values, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import from_names
 from alpasim_plugin.nets.streaming_state import State
 
@@ -34,6 +33,30 @@ Stage = Callable[[str], AbstractContextManager[object]]
 def no_clock(name: str) -> AbstractContextManager[object]:
     """Run a stage untimed."""
     return nullcontext()
+
+
+def condition_of(settings: OneFixerSettings, z_map: Tensor, z_render: Tensor, opacity: Tensor | None) -> Tensor:
+    """Return what the transformer sees besides its source ``(B, channels, T, h, w)``.
+
+    Args:
+        settings: Say which of the inputs it sees.
+        z_map, z_render: ``(B, 16, T, h, w)``.
+        opacity: From `opacity_input`.
+    """
+    parts = [z_map, *([z_render] if settings.render_input else []), *([] if opacity is None else [opacity])]
+    return torch.cat(parts, dim=1) if len(parts) > 1 else z_map
+
+
+def opacity_input(settings: OneFixerSettings, rgb: Tensor, alpha: Tensor | None, first: bool) -> Tensor | None:
+    """Return the opacity for the transformer's blocks, None where they do not embed it; no opacity is an opaque render."""
+    if not settings.opacity_input:
+        return None
+    return opacity_values(torch.ones_like(rgb[:, :1]) if alpha is None else alpha, first)
+
+
+def map_video(settings: OneFixerSettings, rgb: Tensor, sdmap: Tensor | None) -> Tensor | None:
+    """Return the map's frames, or what the settings put in the place of none: black frames, or None for zero latents."""
+    return torch.full_like(rgb, -1.0) if sdmap is None and settings.no_map == "black" else sdmap
 
 
 @dataclass(eq=False)
@@ -106,7 +129,7 @@ class BlockPipeline:
             state: From `start` or an earlier run; a draft's state is kept first.
             rgb: ``(B, 3, T, H, W)`` render in [-1, 1]; T is ``1 + 4 (block_latents - 1)`` in the first block, then ``4 block_latents``.
             alpha: ``(B, 1, T, H, W)`` opacity, or None where all is opaque.
-            sdmap: ``(B, 3, T, H, W)`` semantic map in [-1, 1], or None for the whole rollout: the map then adds nothing to the tokens.
+            sdmap: ``(B, 3, T, H, W)`` semantic map in [-1, 1], or None for the whole rollout; then ``no_map`` says what takes its place.
             noise: `draws` standard normal tensors ``(B, 16, block_latents, H / 8, W / 8)``.
 
         Returns:
@@ -122,14 +145,16 @@ class BlockPipeline:
             raise InputError("fixing a block", f"latent {state.latent}", found, "give the map in every block of a rollout, or in none")
         with self.stage("source"):
             mask = None if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=state.latent == 0)
+            opacity = opacity_input(settings, rgb, alpha, first=state.latent == 0)
         cache, history = state.history.cache, state.history
-        block = rgb, alpha, sdmap, mask, list(noise[: len(self.schedule)]), state.encoder, state.decoder
-        out, z_0, z_map, encoder, decoder = self._call(history, history.fix, *block)
+        shown = map_video(settings, rgb, sdmap)
+        block = rgb, alpha, shown, mask, opacity, list(noise[: len(self.schedule)]), state.encoder, state.decoder
+        out, z_0, condition, encoder, decoder = self._call(history, history.fix, *block)
         new = PipelineState(state.latent + z_0.shape[2], encoder, decoder, sdmap is not None, history)
 
         def write() -> None:
             if settings.history == "finalise":
-                self._call(history, history.finalise, z_0, noise[-1], z_map)
+                self._call(history, history.finalise, z_0, noise[-1], condition)
             cache.commit()
 
         history.draft, history.write = new, write
@@ -151,6 +176,7 @@ class BlockPipeline:
         alpha: Tensor | None,
         sdmap: Tensor | None,
         mask: Tensor | None,
+        opacity: Tensor | None,
         noise: Sequence[Tensor],
         encoder: State | None,
         decoder: State | None,
@@ -158,7 +184,7 @@ class BlockPipeline:
         """Fix the frames of a block; writes only to the open block of the cache.
 
         Returns:
-            Frames, latents, the map's latents, and both codecs' states after the block.
+            Frames, latents, the condition, and both codecs' states after the block.
         """
         nets = self.networks
         with self.stage("encode"):
@@ -167,16 +193,16 @@ class BlockPipeline:
             z_render, z_map = latents[: len(rgb)].float(), latents[len(rgb) :].float()
             z_map = torch.zeros_like(z_render) if sdmap is None else z_map
         with self.stage("source"):
-            sources = [z_render if mask is None else mixed_source(z_render, mask, eps) for eps in noise]
-        with self.stage("dit"):
-            z_0 = sample_block(nets.dit, sources, nets.text, z_map, cache, self.schedule, "last-forward", commit=False)
-        with self.stage("decode"):
-            if self.settings.decoder.kind == "render":
-                assert isinstance(nets.decoder, TinyVAE), "settings allow no other decoder to see the render"
-                out, decoder = nets.decoder.decode_next(z_0, decoder, render=rgb, opacity=alpha, clamp=False)
+            if self.settings.holes == "everywhere":
+                sources = list(noise)
             else:
-                out, decoder = nets.decoder.decode_next(z_0, decoder, clamp=False)
-        return out, z_0, z_map, encoder, decoder
+                sources = [z_render if mask is None else mixed_source(z_render, mask, eps) for eps in noise]
+            condition = condition_of(self.settings, z_map, z_render, opacity)
+        with self.stage("dit"):
+            z_0 = sample_block(nets.dit, sources, nets.text, condition, cache, self.schedule, "last-forward", commit=False)
+        with self.stage("decode"):
+            out, decoder = decode(nets, self.settings, z_0, rgb, alpha, decoder)
+        return out, z_0, condition, encoder, decoder
 
     def _finalise(self, cache: RollingCache, z_0: Tensor, eps: Tensor, z_map: Tensor) -> None:
         nets = self.networks

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
+from alpasim_plugin.fixers.devices import take_threads
 from alpasim_plugin.fixers.pixel_noise import content_key, pixel_noise
 from alpasim_plugin.fixers.pixel_pipeline import PixelInputs, fix_frame, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.views import DOING, HALF, Views, group_views
-from alpasim_plugin.nets.machine_probe import choose_threads
+from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
 from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
 from alpasim_plugin.nets.pixel_source import sparse_source
 from alpasim_plugin.types import F32, I64, U8, BlockRule, Fixer, Frame
@@ -53,11 +53,7 @@ class PixelFixer(Fixer):
         if not isinstance(settings, PixelFixerSettings):
             found = f"settings of type {type(settings).__name__}"
             raise InputError("making a fixer", settings.name, found, "take them from fixer_settings(name)")
-        self.chosen: dict[str, Any] = {}
-        if threads is not None:
-            number = choose_threads(threads)
-            torch.set_num_threads(number.number)
-            self.chosen["threads"] = number.as_dict()
+        self.chosen: dict[str, Any] = take_threads(threads)
         self.settings, self.scene_id = settings, scene_id
         self.generator = load_generator(settings, device)
         self.chosen["precision"] = self.generator.precision.as_dict()
@@ -155,20 +151,6 @@ class PixelFixer(Fixer):
                 state = net.start(inputs.render[b : b + 1])
             found.append((camera, view.index[b], CameraHistory(state, counts[b] + 1, view.t_us[b][0], raw, images[b]), event))
         return found
-
-
-def check_continues(view: Views, histories: Mapping[str, CameraHistory]) -> None:
-    """Raise `InputError` where a frame does not follow its camera's history in size and time."""
-    for camera, times in zip(view.cameras, view.t_us, strict=True):
-        past = histories.get(camera)
-        if past is None:
-            continue
-        if past.raw.shape[:2] != view.shape:
-            found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
-            raise InputError(DOING, f"camera {camera!r}", found, "keep a camera's image size for the whole rollout, or reset")
-        if times[0] <= past.t_us:
-            found = f"a frame at {times[0]} us after one at {past.t_us} us"
-            raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
 
 
 def to_inputs(view: Views, device: torch.device | str = "cpu") -> PixelInputs:

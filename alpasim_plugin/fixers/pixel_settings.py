@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from alpasim_plugin.fixers.settings import FixerSettings, Part, Positive, WeightsSettings, check_steps, counted_steps
+from alpasim_plugin.fixers.settings import FixerSettings, Part, Positive, Unit, WeightsSettings, check_no_blocks, check_steps, counted_steps
 
 
 class PixelSizesSettings(Part):
@@ -24,6 +24,7 @@ class PixelSizesSettings(Part):
 class PixelFixerSettings(FixerSettings):
     """A causal generator in pixels, one frame at a time."""
 
+    bundle_kind: ClassVar[str] = "per-frame"  # of `alpasim_plugin.fixers.bundle.KINDS`
     uses_map: bool = Field(default=True, description="Whether the semantic map is drawn and given to the fixer.")
     generator: PixelSizesSettings = Field(default=PixelSizesSettings(), description="Sizes where no weights say them.")
     weights: WeightsSettings = Field(default=WeightsSettings(), description="File with weights: `bundle` alone.")
@@ -50,6 +51,11 @@ class PixelFixerSettings(FixerSettings):
         """How the closed loop runs the fixer, in one word."""
         return "frame by frame"
 
+    @property
+    def unit(self) -> Unit:
+        """What a frame costs."""
+        return Unit(1, len(self.steps), 0, 0)
+
     @field_validator("steps", mode="before")
     @classmethod
     def _counted(cls, value: Any) -> Any:
@@ -58,10 +64,7 @@ class PixelFixerSettings(FixerSettings):
     @model_validator(mode="after")
     def _consistent(self) -> PixelFixerSettings:
         check_steps(self.steps)
-        blocks = {key: FixerSettings.model_fields[key].default for key in ("block_latents", "mode", "tolerance_m", "tolerance_deg")}
-        for key, value in blocks.items():
-            if getattr(self, key) != value:
-                raise ValueError(f"{key} = {getattr(self, key)} | one frame at a time has no blocks: leave it out, or take a onefixer-dit")
+        check_no_blocks(self)
         parts = [key for key in ("dit", "vae", "decoder", "prompt") if getattr(self.weights, key) is not None]
         if parts:
             raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")

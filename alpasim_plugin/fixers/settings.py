@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -24,6 +24,26 @@ class Part(BaseModel):
     """A section: frozen, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a fixer makes at a time, in the middle of a rollout.
+
+    Example:
+        >>> Unit(frames=8, network_calls=2, latents=2, lookahead_frames=7).calls_per_frame
+        0.25
+    """
+
+    frames: int  # new ones that leave at a time
+    network_calls: int  # forwards of the network, that of a cache write included
+    latents: int  # of one forward
+    lookahead_frames: int  # later frames that must be known before the first frame can leave
+
+    @property
+    def calls_per_frame(self) -> float:
+        """Network calls for a frame."""
+        return self.network_calls / self.frames
 
 
 class FixerSettings(Part):
@@ -44,6 +64,16 @@ class FixerSettings(Part):
     def loop_mode(self) -> str:
         """How the closed loop runs the fixer, in one word."""
         return self.mode
+
+    @property
+    def is_offline(self) -> bool:
+        """Whether the fixer needs whole clips, so that it cannot run in a closed loop."""
+        return False
+
+    @property
+    def unit(self) -> Unit | None:
+        """What the fixer makes at a time and what that costs, for tables; None where it does not say."""
+        return None
 
     @classmethod
     def load(cls, name: str, overrides: Sequence[str] = ()) -> Self:
@@ -135,9 +165,10 @@ def check_steps(steps: tuple[float, ...]) -> None:
         raise ValueError(f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
 
 
-class OneFixerSettings(FixerSettings):
-    """A causal latent fixer: autoencoder, transformer with history, flow steps."""
+class LatentFixerSettings(FixerSettings):
+    """Any fixer with an autoencoder and a transformer on its latents."""
 
+    bundle_kind: ClassVar[str]  # of `alpasim_plugin.fixers.bundle.KINDS`
     dit: DiTSettings = Field(description="Sizes of the transformer where no weights say them.")
     rope_ratios: tuple[float, float, float] = Field(default=(3.0, 3.0, 1.0), description="NTK stretch: height, width, time.")
     vae: CodecSettings = Field(description="The video autoencoder.")
@@ -146,6 +177,34 @@ class OneFixerSettings(FixerSettings):
     untrained: Literal["identity", "random", "refuse"] = Field(
         default="refuse", description="Initialisation without weights: an identity, random, or an error (refuse)."
     )
+    trained_by: str | None = Field(default=None, description="Command that trains the weights, for the error where there are none.")
+    precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
+    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
+    fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
+
+    @property
+    def network_times(self) -> tuple[float, ...]:
+        """Time inputs of the network's denoising steps, 0 to 1000."""
+        raise NotImplementedError
+
+    @property
+    def finalises(self) -> bool:
+        """Whether a further call of the network writes the history."""
+        return False
+
+    @model_validator(mode="after")
+    def _decodable(self) -> Self:
+        if self.decoder.kind == "render" and self.vae.kind != "tiny":
+            raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
+        if self.decoder.kind == "taehv" and self.vae.kind != "wan":
+            raise ValueError(f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan")
+        return self
+
+
+class OneFixerSettings(LatentFixerSettings):
+    """A causal latent fixer: autoencoder, transformer with history, flow steps."""
+
+    bundle_kind: ClassVar[str] = "block"
     window: Positive = Field(default=6, description="Attention window in latents, the block itself and the sink included.")
     sink: int = Field(default=0, ge=0, description="Attention sink: first latents of the rollout that stay in the window.")
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
@@ -154,13 +213,33 @@ class OneFixerSettings(FixerSettings):
         description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step. none: no history, "
         "every frame is fixed by itself.",
     )
-    holes: Literal["noise", "render"] = Field(
-        default="noise", description="Source of a block where the render is transparent: noise (Eq. 1), or the render."
+    holes: Literal["noise", "render", "everywhere"] = Field(
+        default="noise",
+        description="Source of a block where the render is transparent: noise (Eq. 1), or the render. everywhere: noise alone, which needs "
+        "render_input.",
     )
-    precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
-    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
+    no_map: Literal["nothing", "black"] = Field(
+        default="nothing", description="In the map's place where there is none: nothing is added to the tokens, or a black map is encoded."
+    )
+    render_input: bool = Field(default=False, description="Whether the render's latents are a condition beside the map's.")
+    opacity_input: bool = Field(default=False, description="Whether every block of the transformer embeds the opacity (ArtiFixer).")
     graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
-    fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
+
+    @property
+    def network_times(self) -> tuple[float, ...]:
+        """Time inputs of the network's denoising steps, 0 to 1000."""
+        return tuple(level.t for level in schedule.from_names(self.steps))
+
+    @property
+    def finalises(self) -> bool:
+        """Whether a further call of the network writes the history."""
+        return self.history == "finalise"
+
+    @property
+    def unit(self) -> Unit:
+        """What a block costs."""
+        frames = 1 if self.history == "none" else 4 * self.block_latents
+        return Unit(frames, len(self.steps) + self.finalises, self.block_latents, frames - 1)
 
     @field_validator("steps", mode="before")
     @classmethod
@@ -174,11 +253,20 @@ class OneFixerSettings(FixerSettings):
             raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
         if self.history == "none" and self.block_latents != 1:
             raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
-        if self.decoder.kind == "render" and self.vae.kind != "tiny":
-            raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
-        if self.decoder.kind == "taehv" and self.vae.kind != "wan":
-            raise ValueError(f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan")
+        if self.holes == "everywhere" and not self.render_input:
+            raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
         return self
+
+
+def check_no_blocks(settings: FixerSettings) -> None:
+    """Refuse settings of blocks for a fixer that has none.
+
+    Raises:
+        ValueError: With what to do, as pydantic's validators report it.
+    """
+    for key in ("block_latents", "mode", "tolerance_m", "tolerance_deg"):
+        if getattr(settings, key) != FixerSettings.model_fields[key].default:
+            raise ValueError(f"{key} = {getattr(settings, key)} | one frame at a time has no blocks: leave it out, or take a onefixer-dit")
 
 
 S = TypeVar("S", bound=FixerSettings)

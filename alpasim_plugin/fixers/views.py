@@ -5,8 +5,9 @@ A *view* is one camera's frames of a block. Views of one size form a batch.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -46,6 +47,20 @@ class Views:
     def equals(self, other: Views | None) -> bool:
         """Return whether two blocks are equal bit for bit."""
         return other is not None and all(_same(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+
+
+class Past(Protocol):
+    """What a camera's history says of its last frame."""
+
+    @property
+    def t_us(self) -> int:
+        """Its time."""
+        ...
+
+    @property
+    def raw(self) -> U8:
+        """Its render ``(H, W, 3)``."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -91,6 +106,20 @@ def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> 
     for camera, mine in index.items():
         sizes.setdefault(block[mine[0]].rgb.shape, []).append(camera)
     return tuple(_stack(block, maps, cameras, index) for cameras in sizes.values())
+
+
+def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
+    """Raise `InputError` where a frame does not follow its camera's history in size and time."""
+    for camera, times in zip(view.cameras, view.t_us, strict=True):
+        past = pasts.get(camera)
+        if past is None:
+            continue
+        if past.raw.shape[:2] != view.shape:
+            found = f"{view.shape} (height, width) after {past.raw.shape[:2]}"
+            raise InputError(DOING, f"camera {camera!r}", found, "keep a camera's image size for the whole rollout, or reset")
+        if times[0] <= past.t_us:
+            found = f"a frame at {times[0]} us after one at {past.t_us} us"
+            raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
 
 
 def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -> Clip:

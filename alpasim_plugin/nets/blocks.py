@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.nets.adaln import LowRankModulation, Modulation, fold_input, fold_output, residual, stack_rows
 from alpasim_plugin.nets.attention import Attend, CrossAttention, SelfAttention
-from alpasim_plugin.nets.layers import PATCH, layer_norm
+from alpasim_plugin.nets.layers import PATCH, PatchLinear, layer_norm
 from alpasim_plugin.nets.rope import RopeTable
 from alpasim_plugin.nets.sizes import DiTSizes
 
@@ -39,11 +39,14 @@ class Block(nn.Module):
         self.self_attn = SelfAttention(sizes.width, sizes.head_width)
         self.cross_attn = CrossAttention(sizes.width, sizes.context_width, sizes.head_width)
         self.mlp = Mlp(sizes.width, sizes.mlp_width)
+        self.opacity_embed = PatchLinear(sizes.opacity_channels, sizes.width) if sizes.opacity_channels else None
         self.adaln_modulation_self_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
         self.adaln_modulation_cross_attn: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
         self.adaln_modulation_mlp: LowRankModulation | None = LowRankModulation(sizes.width, sizes.adaln_rank, 3)
 
-    def forward(self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend) -> Tensor:
+    def forward(
+        self, x: Tensor, time: TimeSignal | None, text: KeysValues, table: RopeTable, attention: Attend, opacity: Tensor | None = None
+    ) -> Tensor:
         """Apply the block.
 
         Args:
@@ -52,8 +55,10 @@ class Block(nn.Module):
             text: Cross-attention keys and values of this block.
             table: Rotation of the block's tokens.
             attention: Self-attention with the cached past.
+            opacity: ``(B, opacity_channels, T, H, W)`` for a block that embeds it: added to the modulated input of self-attention.
         """
-        x = residual(x, lambda n: self.self_attn(n, table, attention), _modulation(self.adaln_modulation_self_attn, time))
+        seen = None if self.opacity_embed is None or opacity is None else self.opacity_embed.embed(opacity)
+        x = residual(x, lambda n: self.self_attn(n, table, attention, seen), _modulation(self.adaln_modulation_self_attn, time))
         x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
         return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
 
@@ -61,7 +66,10 @@ class Block(nn.Module):
         """Fold the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
         attn, cross, mlp = self.self_attn, self.cross_attn, self.mlp
         shift, scale, gate = _require(self.adaln_modulation_self_attn, time)
-        attn.fuse(fold_input(stack_rows([attn.q_proj, attn.k_proj, attn.v_proj]), shift, scale))
+        qkv = stack_rows([attn.q_proj, attn.k_proj, attn.v_proj])
+        if self.opacity_embed is not None:  # added after scale and shift, so it passes the projections as they are
+            self.opacity_embed.follow(qkv.weight)
+        attn.fuse(fold_input(qkv, shift, scale))
         attn.output_proj = fold_output(attn.output_proj, gate)
         shift, scale, gate = _require(self.adaln_modulation_cross_attn, time)
         cross.q_proj = fold_input(cross.q_proj, shift, scale)

@@ -134,7 +134,8 @@ class CosmosCausalDiT(nn.Module):
             x: ``(B, C, T, H, W)`` noised latents, H and W even.
             t: ``(B, T)`` time steps, 0 to 1000, or ``(B, 1)``, or one number for all.
             text: ``(B or 1, tokens, text_width)`` features, or a `TextContext`.
-            hdmap: ``(B, map_channels, T, H, W)`` latents of the semantic map.
+            hdmap: ``(B, condition_channels, T, H, W)`` latents of the semantic map; a network that embeds opacity takes its channels after
+                the map's.
             condition_mask: ``(B, 1, T, H, W)``, 1 where the latent is given; None is 0 everywhere.
             block_latents: Latents of a causal block (the last may be shorter); None for bidirectional attention, as in the teacher.
             padding_mask: ``(B, 1, h, w)`` at any resolution; None is 0 everywhere.
@@ -247,9 +248,11 @@ class CosmosCausalDiT(nn.Module):
         time = self._time(t)
         text = text if isinstance(text, TextContext) else self.encode_text(text)
         tokens = embed_latents(self.x_embedder.linear, x.to(self.dtype), condition_mask, padding_mask)
-        tokens = tokens + self.additional_patch_embedding.linear.embed(hdmap.to(self.dtype))
+        condition = hdmap.to(self.dtype)
+        tokens = tokens + self.additional_patch_embedding.linear.embed(condition[:, : self.sizes.map_channels])
+        opacity = condition[:, self.sizes.map_channels :] if self.sizes.opacity_channels else None
         for layer, block in enumerate(self.blocks):
-            tokens = block(tokens, time, text.keys_values[layer], table, attention(layer))
+            tokens = block(tokens, time, text.keys_values[layer], table, attention(layer), opacity)
         return unpatchify(self.final_layer(tokens, time), x.shape[3], x.shape[4]).to(x.dtype)
 
     def _time(self, t: Tensor | float) -> TimeSignal | None:
@@ -271,7 +274,7 @@ class CosmosCausalDiT(nn.Module):
         if x.ndim != 5 or x.shape[1] != sizes.latent_channels or x.shape[2] < 1 or x.shape[3] % 2 or x.shape[4] % 2 or 0 in x.shape:
             do = f"give (batch, {sizes.latent_channels}, latents, height, width) with even height and width (pixels in multiples of 16)"
             raise InputError(doing, "x", f"shape {list(x.shape)}", do)
-        expected = [x.shape[0], sizes.map_channels, *x.shape[2:]]
+        expected = [x.shape[0], sizes.condition_channels, *x.shape[2:]]
         if list(hdmap.shape) != expected:
             raise InputError(doing, "hdmap", f"shape {list(hdmap.shape)}", f"give {expected}, the map at the latents of x")
         if isinstance(t, Tensor) and (t.ndim != 2 or t.shape[0] not in (1, x.shape[0]) or t.shape[1] not in (1, x.shape[2])):

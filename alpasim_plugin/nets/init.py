@@ -16,7 +16,7 @@ def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> 
     """Draw a state dict.
 
     Every linear is truncated normal with deviation ``1 / sqrt(inputs)``, cut at three deviations; norm gains are one, the bias and the
-    final layer's second modulation are zero (the original's initialisation).
+    final layer's second modulation are zero (the original's initialisation), and so are the embeddings of the opacity (ArtiFixer's).
 
     Args:
         sizes: The network.
@@ -32,7 +32,7 @@ def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> 
         tensor = torch.zeros(shape)
         if key.endswith("norm.weight"):
             tensor.fill_(1.0)
-        elif len(shape) == 2 and key != "final_layer.adaln_modulation.2.weight":
+        elif len(shape) == 2 and key != "final_layer.adaln_modulation.2.weight" and not key.endswith("opacity_embed.weight"):
             std = 1 / math.sqrt(shape[1])
             nn.init.trunc_normal_(tensor, std=std, a=-CUT * std, b=CUT * std, generator=generator)
         out[key] = tensor

@@ -19,6 +19,7 @@ from alpasim_plugin.nets.schedule import NoiseLevel, context_level
 
 History = Literal["finalise", "last-forward", "none"]
 POOL = (4, 8, 8)  # frames, rows, columns of one latent
+OPACITY_CHANNELS = 16  # of `opacity_values`: 4 frames, 2 rows, 2 columns of a latent
 RANGE_SLACK = 1e-3  # opacity outside [0, 1] by rounding is clipped; more is an error
 
 
@@ -55,6 +56,29 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
     Raises:
         InputError: Wrong shape, NaN, or values outside [0, 1].
     """
+    return F.max_pool3d(_checked_opacity(opacity, first, nan_as), POOL, POOL)
+
+
+def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
+    """Average a renderer's opacity over 4 x 4 pixels, as channels of its latents: the input of a network that sees the opacity.
+
+    Args:
+        opacity, first: As for `opacity_mask`.
+
+    Returns:
+        ``(B, 16, latents, H / 8, W / 8)``, channels ordered (frame, row, column).
+
+    Raises:
+        InputError: As `opacity_mask`.
+    """
+    cells = F.avg_pool3d(_checked_opacity(opacity, first, None), (1, 4, 4))
+    b, _, frames, rows, columns = cells.shape
+    split = cells.view(b, frames // 4, 4, rows // 2, 2, columns // 2, 2)
+    return split.permute(0, 2, 4, 6, 1, 3, 5).flatten(1, 3)  # (B, frame row column, latents, H / 8, W / 8)
+
+
+def _checked_opacity(opacity: Tensor, first: bool, nan_as: float | None) -> Tensor:
+    """Return opacity in [0, 1], four frames a latent."""
     doing = "pooling opacity to latents"
     frames = opacity.shape[2] if opacity.ndim == 5 else 0
     if opacity.ndim != 5 or opacity.shape[1] != 1 or frames < 1 or (frames - first) % 4 or opacity.shape[3] % 8 or opacity.shape[4] % 8:
@@ -65,7 +89,7 @@ def opacity_mask(opacity: Tensor, first: bool = True, nan_as: float | None = Non
     video = opacity.clamp(0, 1)
     if first:
         video = torch.cat([video[:, :, :1].expand(-1, -1, 3, -1, -1), video], dim=2)
-    return F.max_pool3d(video, POOL, POOL)
+    return video
 
 
 def _without_nan(opacity: Tensor, nan_as: float | None, doing: str) -> Tensor:

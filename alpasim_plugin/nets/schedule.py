@@ -28,6 +28,43 @@ class NoiseLevel:
     sigma: float  # noise weight of the interpolant, 0 to 1
 
 
+@dataclass(frozen=True)
+class RenderLevel:
+    """The noise level that a render is taken to have: ``z_r = alpha z_0 + sigma eps``.
+
+    Example:
+        >>> harmonizer = RenderLevel(1.0, 0.25)
+        >>> harmonizer.t, harmonizer.scale, harmonizer.network_t
+        (0.2, 0.8, 200.0)
+
+    Raises:
+        InputError: Values that are not positive.
+    """
+
+    alpha: float
+    sigma: float
+
+    def __post_init__(self) -> None:
+        if not (self.alpha > 0 and self.sigma > 0):
+            found = f"alpha {self.alpha:g}, sigma {self.sigma:g}"
+            raise InputError("choosing the noise level of a render", "alpha and sigma", found, "give values above 0")
+
+    @property
+    def t(self) -> float:
+        """Time on the straight path, 0 to 1."""
+        return self.sigma / (self.alpha + self.sigma)
+
+    @property
+    def scale(self) -> float:
+        """Factor from the render's latents to the point on the path."""
+        return 1 / (self.alpha + self.sigma)
+
+    @property
+    def network_t(self) -> float:
+        """Time input of the network, a whole number of 0 to 1000."""
+        return float(round(TABLE * self.t))
+
+
 def shifted(u: float) -> float:
     """Return ``sigma`` for a uniform time.
 

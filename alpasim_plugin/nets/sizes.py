@@ -20,7 +20,10 @@ SUBLAYERS = (*ATTENTIONS, "mlp")
 
 @dataclass(frozen=True)
 class DiTSizes:
-    """Every size of a `CosmosCausalDiT`; the defaults are OmniDreams single view (2B)."""
+    """Every size of a `CosmosCausalDiT`; the defaults are OmniDreams single view (2B).
+
+    ``opacity_channels`` above 0 gives every block an embedding of the render's opacity (ArtiFixer), which OmniDreams does not have.
+    """
 
     width: int = 2048
     blocks: int = 28
@@ -31,6 +34,12 @@ class DiTSizes:
     context_width: int = 1024
     latent_channels: int = 16
     map_channels: int = 16
+    opacity_channels: int = 0
+
+    @property
+    def condition_channels(self) -> int:
+        """Channels of the condition: the map's, then the opacity's."""
+        return self.map_channels + self.opacity_channels
 
     @property
     def heads(self) -> int:
@@ -62,6 +71,8 @@ class DiTSizes:
                 for part, columns in (("q", d), ("k", context), ("v", context), ("output", d)):
                     out[f"blocks.{i}.{name}.{part}_proj.weight"] = (d, columns)
                 out[f"blocks.{i}.{name}.q_norm.weight"] = out[f"blocks.{i}.{name}.k_norm.weight"] = (hd,)
+            if self.opacity_channels:
+                out[f"blocks.{i}.opacity_embed.weight"] = (d, self.opacity_channels * AREA)
             out[f"blocks.{i}.mlp.layer1.weight"] = (f, d)
             out[f"blocks.{i}.mlp.layer2.weight"] = (d, f)
             for name in SUBLAYERS:
@@ -86,7 +97,8 @@ def read_sizes(shapes: Mapping[str, Shape], source: str) -> DiTSizes:
     depth = 1 + max((int(key.split(".")[1]) for key in shapes if _is_block(key)), default=-1)
     if depth == 0:
         raise _refusal(source, len(shapes), ["no key like blocks.0.self_attn.q_proj.weight"])
-    names = set(DiTSizes(blocks=depth).shapes())
+    embeds = [key for key in shapes if key.endswith("opacity_embed.weight")]
+    names = set(DiTSizes(blocks=depth, opacity_channels=bool(embeds)).shapes())
     missing, extra = sorted(names - set(shapes)), sorted(set(shapes) - names)
     if missing or extra:
         raise _refusal(source, len(shapes), [listed("missing", missing), listed("unexpected", extra)])
@@ -122,6 +134,7 @@ def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSize
     contexts = [f"blocks.{i}.cross_attn.{part}_proj.weight" for i in blocks for part in "kv"]
     context_width = max(mode([*shapes["crossattn_proj.0.bias"], *other_side(contexts, width)]), 1)
     ranks = [f"blocks.{i}.adaln_modulation_{name}.1.weight" for i in blocks for name in SUBLAYERS]
+    opacities = [key for key in shapes if key.endswith("opacity_embed.weight")]
     (of_output,) = other_side(["final_layer.linear.weight"], width * AREA)
     (of_input,) = other_side(["x_embedder.proj.1.weight"], width * AREA)
     return DiTSizes(
@@ -134,6 +147,7 @@ def _vote_sizes(shapes: Mapping[str, Shape], depth: int, source: str) -> DiTSize
         context_width=context_width,
         latent_channels=mode([of_output, of_input - MASK_CHANNELS]),
         map_channels=mode(other_side(["additional_patch_embedding.proj.1.weight"], width * AREA)),
+        opacity_channels=mode(other_side(opacities, width * AREA)) if opacities else 0,
     )
 
 

@@ -98,7 +98,7 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         overrides: ``KEY=VALUE`` of the fixer's settings; ignored where there is none.
 
     Raises:
-        InputError: As `resolve`; a step count without a fixer.
+        InputError: As `resolve`; a step count without a fixer; a fixer of whole clips.
     """
     front, plus, base = name.partition("+")
     if not plus:
@@ -109,7 +109,7 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         front, base = _steps_to_front(front, base)
     if not is_target(front):
         _require_fixer(name, front, bool(plus))
-    return RendererSpec(name, resolve("renderer", base), resolve("fixer", front, overrides))
+    return RendererSpec(name, resolve("renderer", base), _in_the_loop(resolve("fixer", front, overrides)))
 
 
 def split_steps(name: str) -> tuple[str, int | None]:
@@ -202,6 +202,17 @@ def _steps_to_front(front: str, base: str) -> tuple[str, str]:
     """Move ``@STEPS`` from the end of a composite name to the fixer, which it belongs to."""
     match = re.fullmatch(r"(.+)@([0-9]+)", base)
     return (front, base) if match is None or "@" in front else (f"{front}@{match[2]}", match[1])
+
+
+def _in_the_loop(fixer: PartSpec) -> PartSpec:
+    """Refuse a fixer that needs frames which a closed loop has not rendered yet."""
+    settings: Any = fixer.settings
+    if getattr(settings, "is_offline", False):
+        ahead = settings.unit.lookahead_frames
+        found = f"its first frame needs {ahead} frames after it, which a closed loop has not driven yet"
+        do = f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}"
+        raise InputError("choosing a renderer for a closed loop", f"fixer {fixer.name!r}", found, do)
+    return fixer
 
 
 def _is_fixer(target: str) -> bool:

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from alpasim_plugin.nets.clips import GROUP, SIDE
 from alpasim_plugin.nets.dit import CosmosCausalDiT
 from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
+from alpasim_plugin.training.clip_batches import shown_map
 from alpasim_plugin.training.latent_clips import LatentClip, LatentClips
 from alpasim_plugin.training.perceptual_term import Distance, flatten_frames
 from alpasim_plugin.training.shared_rollout import roll_out
@@ -56,8 +57,10 @@ class Rollouts:
 
     Args:
         clips: Training clips.
+        vae: Their autoencoder.
         net: Frozen generator.
-        block_latents, window, use_map: As at deployment.
+        block_latents, window: As at deployment.
+        map: The map that the generator sees, as `Seen.map`.
         folder: Cache of the rollouts.
         report: Called with the number of clips done and in all.
     """
@@ -65,18 +68,20 @@ class Rollouts:
     def __init__(
         self,
         clips: LatentClips,
+        vae: TinyVAE,
         net: CosmosCausalDiT,
         block_latents: int,
         window: int,
-        use_map: bool,
+        map: Literal["drawn", "black", "nothing"],
         folder: Path,
         report: Callable[[int, int], None] | None = None,
     ) -> None:
         self.clips = clips
-        self.digest = _digest(net.state_dict(), clips, f"{block_latents} {window} {use_map}")
+        self.digest = _digest(net.state_dict(), clips, f"{block_latents} {window} {map}")
         self._folder = folder / self.digest
         self._folder.mkdir(parents=True, exist_ok=True)
         text = torch.zeros(1, 1, net.sizes.text_width)
+        shown = shown_map(map, clips, vae)
         for index in range(len(clips)):
             path = self._path(index)
             if not path.exists():
@@ -86,8 +91,9 @@ class Rollouts:
                     torch.from_numpy(stream(name, 0, f"training.rollout.{what}").standard_normal((1, *clip.z_0.shape), dtype=np.float32))
                     for what in ("eps", "context")
                 )
-                z_r, m, z_map = (z[None] for z in (clip.z_r, clip.m, clip.z_map))
-                z = roll_out(net, z_r, z_map, m, eps, context, text, block_latents=block_latents, window=window, use_map=use_map)
+                z_map = clip.z_map if shown is None else shown
+                z_r, m, condition = (z[None] for z in (clip.z_r, clip.m, z_map))
+                z = roll_out(net, z_r, condition, m, eps, context, text, block_latents=block_latents, window=window)
                 write_array(path, z[0].half().numpy(), "writing training data")
             if report is not None:
                 report(index + 1, len(clips))

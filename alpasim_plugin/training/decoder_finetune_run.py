@@ -64,7 +64,8 @@ def finetune_decoder(
         return None if prepared is None else lambda done, count: prepared(what, done, count)
 
     clips = LatentClips(PairDataset(data, "train").sequences, vae, form, out.parent / "latents", tell("latents"))
-    rollouts = Rollouts(clips, net, settings.block_latents, settings.window, settings.uses_map, out.parent / "rollouts", tell("rollouts"))
+    shown = "drawn" if settings.uses_map else settings.no_map
+    rollouts = Rollouts(clips, vae, net, settings.block_latents, settings.window, shown, out.parent / "rollouts", tell("rollouts"))
     task = DecoderTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
@@ -103,7 +104,8 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
             (f"its history is {settings.history}", settings.history == "last-forward"),
             (f"it takes {len(settings.steps)} steps", len(settings.steps) != 1),
             (f"it keeps a sink of {settings.sink}", settings.sink != 0),
-            ("its source holds the render where that is transparent", settings.holes != "noise"),
+            ("its source is not that of Eq. 1", settings.holes != "noise"),
+            ("it takes the opacity as an input", settings.opacity_input),
         )
         if wrong
     ]

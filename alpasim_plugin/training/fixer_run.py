@@ -1,9 +1,16 @@
-"""Train a variant of the fixer in one run folder: pairs and a trained autoencoder in, bundle and model card out."""
+"""Train a recipe in one run folder: pairs and a trained autoencoder in, a bundle and a model card for every stage out.
+
+    OUT/STAGE/   a stage before the last: state.safetensors, log.jsonl, fixer.safetensors and its card
+    OUT/         the last stage, whose fixer.safetensors is the result
+
+Every stage resumes from its own checkpoint; a finished one makes no update. A later stage starts from the float16 bundles of earlier ones.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +19,22 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import load_tiny_vae, parts_of, save_bundle
+from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
+from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.seeding import derive_seed
-from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
+from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.perceptual_term import Distance
+from alpasim_plugin.training.recipes.recipe import GIVEN, Recipe, Stage, StageInputs, Task, Weights
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
-from alpasim_plugin.training.variants import Variant
 
 BUNDLE_FILE = "fixer.safetensors"
+BUNDLED = ("dit", "vae")
+TrainableSettings = OneFixerSettings | RenderStepSettings | NoiseWindowSettings
+Report = Callable[[int, Mapping[str, float]], None]
 
 
 @dataclass(frozen=True)
@@ -33,26 +42,60 @@ class FixerRun:
     """Definition of a training run; equal runs give equal weights.
 
     Args:
-        settings: Fixer to train: sizes, block, window.
-        variant: Objectives.
+        settings: Fixer to train: sizes, and what the recipe does not say.
+        recipe: Stages.
         data: Folder of pairs; its ``train`` split is used.
         vae: Trained autoencoder's weights, or a bundle that holds them.
-        init: Weights of a transformer or bundle to start from; None initialises a network that returns its source unchanged.
+        weights: Files by name: ``init`` and ``init-bi``, the initial weights (without a file, a network that returns its source
+            unchanged); or a stage's name, whose weights these are, so that it is not trained.
         form: Clips.
-        recipe: Batches.
-        schedule: Optimisation.
+        batches: Clips of a batch.
+        schedule: Optimisation of a stage of share 1; its updates are the unit U.
+        equal_channels: Whether flow matching weights all latent channels alike.
         precision: Of the forward passes: None is float32.
     """
 
-    settings: OneFixerSettings
-    variant: Variant
+    settings: TrainableSettings
+    recipe: Recipe
     data: Path
     vae: Path
-    init: Path | None
+    weights: Mapping[str, Path]
     form: ClipForm
-    recipe: GeneratorRecipe
+    batches: BatchForm
     schedule: Schedule
+    equal_channels: bool = False
     precision: torch.dtype | None = None
+
+    def __post_init__(self) -> None:
+        names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
+        if unknown := sorted(set(self.weights) - names):
+            found = f"no weights of that name in recipe {self.recipe.name}"
+            raise InputError("training a fixer", f"--weights {', '.join(unknown)}", found, f"name one of {', '.join(sorted(names))}")
+
+    def stages(self) -> list[Stage]:
+        """Return the stages to train: those that the last needs and whose weights are not given."""
+        needed, out = {self.recipe.stages[-1].name}, []
+        for stage in reversed(self.recipe.stages):
+            if stage.name in needed and stage.name not in self.weights:
+                out.append(stage)
+                needed |= set(stage.sources)
+        return out[::-1]
+
+    @property
+    def updates(self) -> int:
+        """Updates of all stages to train."""
+        return sum(stage.updates(self.schedule.steps) for stage in self.stages())
+
+    @property
+    def perceptual(self) -> bool:
+        """Whether any stage to train has a perceptual term."""
+        return any(stage.objective.perceptual for stage in self.stages())
+
+    def schedule_of(self, stage: Stage) -> Schedule:
+        """Return a stage's schedule."""
+        steps = stage.updates(self.schedule.steps)
+        warmup = min(self.schedule.warmup, steps)
+        return replace(self.schedule, steps=steps, warmup=warmup, decay_from=steps if stage.constant_rate else self.schedule.decay_from)
 
 
 def train_fixer(
@@ -60,66 +103,119 @@ def train_fixer(
     out: Path,
     distance: tuple[str, Distance] | None = None,
     encoded: Callable[[int, int], None] | None = None,
-    report: Callable[[int, Mapping[str, float]], None] | None = None,
+    report: Report | None = None,
     stop_at: int | None = None,
 ) -> Path:
-    """Train to the schedule's end or to ``stop_at``, from the last checkpoint if any; write OUT/fixer.safetensors and its card.
+    """Train to the end of the last stage or to ``stop_at``, from the last checkpoints if any; write OUT/fixer.safetensors and its card.
 
     Args:
         run: Definition of the run.
         out: Folder of the run; the latents of the clips are cached in its parent folder, in ``latents``.
         distance: Name and function of the perceptual term.
         encoded: Called with the number of encoded sequences and the total.
-        report: Called after every update with its number and the logged values.
-        stop_at: Update after which to stop and write the weights; a later call continues.
+        report: Called after every update with its number, counted over all stages, and the logged values.
+        stop_at: Update, counted over all stages, after which to stop and write the weights; a later call continues.
+
+    Returns:
+        The bundle of the stage that was trained last.
 
     Raises:
         InputError: Invalid data, weights or recipe.
         InfrastructureError: The loss is not finite.
     """
-    if run.recipe.steps != run.schedule.steps or run.recipe.accumulate != run.schedule.accumulate:
-        found = f"recipe {run.recipe.steps} x {run.recipe.accumulate}, schedule {run.schedule.steps} x {run.schedule.accumulate}"
-        raise InputError("training a fixer", str(out), found, "give both the same updates and batches an update")
     vae = load_tiny_vae(run.vae)
-    dataset = PairDataset(run.data, "train")
-    clips = LatentClips(dataset.sequences, vae, run.form, out.parent / "latents", encoded)
-    net = CosmosCausalDiT.from_state_dict(start_weights(run), run.settings.rope_ratios, source=str(run.init or "initial weights"))
-    task = GeneratorTask(net, vae, clips, run.variant, run.recipe, distance)
-    facts = {**task.facts, "init": file_sha256(run.init) if run.init else None, "precision": str(run.precision)}
-    trainer = Trainer(net, out, run.schedule, task.batch, task.loss, facts, run.precision)
-    trainer.run(report, stop_at)
-    return write_bundle(run, out, trainer.averaged(), vae, facts, trainer.step)
-
-
-def start_weights(run: FixerRun) -> dict[str, Tensor]:
-    """Return the transformer's initial weights; a variant conditioned on the render gets zero weights for that input."""
-    settings = run.settings
-    if run.init is None:
-        sizes = DiTSizes(**settings.dit.model_dump())
-        weights = initial_weights(sizes, derive_seed("training", run.recipe.seed, "generator"), zero_velocity=True)
-    else:
-        tensors = load_weights(run.init, dtype=torch.float32)
-        weights = parts_of(tensors).get("dit", tensors)
-    return weights if run.variant.mixed else widen_map(weights, 32)
-
-
-def write_bundle(run: FixerRun, out: Path, dit: Mapping[str, Tensor], vae: TinyVAE, facts: Mapping[str, Any], updates: int) -> Path:
-    """Write the weights after ``updates`` updates as one float16 bundle, with its card."""
-    path = out / BUNDLE_FILE
-    parts = {"dit": {k: half(v) for k, v in dit.items()}, "vae": {k: half(v) for k, v in vae.state_dict().items()}}
-    history = run.settings.history if run.variant.history else "none"
-    block = run.settings.block_latents if run.variant.history else 1
-    settings = run.settings.model_copy(
-        update={"holes": "noise", "history": history, "block_latents": block, "uses_map": run.variant.use_map}
-    )  # fmt: skip
-    planned = "" if updates == run.schedule.steps else f" of {run.schedule.steps}"
-    note = f"{run.variant.name}, {updates}{planned} updates"
-    save_bundle(path, parts, settings, trained=True, note=note)
-    rows, hours = curves(out / LOG_FILE)
-    training = {"variant": run.variant.name, "about": run.variant.about, "schedule": asdict(run.schedule), **facts}
-    data = {"pairs": "rendered scenes, split train", "sequences": len(PairDataset(run.data, "train").sequences), "form": asdict(run.form)}
-    ModelCard(f"OneFixer weights, variant {run.variant.name}: {run.variant.about}", data, training, rows, hours).write(path)
+    clips = LatentClips(PairDataset(run.data, "train").sequences, vae, run.form, out.parent / "latents", encoded)
+    files, before, path = dict(run.weights), 0, out / BUNDLE_FILE
+    for stage in run.stages():
+        if stop_at is not None and stop_at <= before:
+            break
+        last = stage is run.recipe.stages[-1]
+        path = _train_stage(run, stage, out if last else out / stage.name, clips, files, distance, _from(report, before), stop_at, before)
+        files[stage.name] = path
+        before += stage.updates(run.schedule.steps)
     return path
+
+
+def _train_stage(
+    run: FixerRun,
+    stage: Stage,
+    folder: Path,
+    clips: LatentClips,
+    files: Mapping[str, Path],
+    distance: tuple[str, Distance] | None,
+    report: Report | None,
+    stop_at: int | None,
+    before: int,
+) -> Path:
+    """Train one stage and write its bundle."""
+    inputs = stage_inputs(run, stage, clips, files, distance)
+    task = stage.objective.task(inputs)
+    for name, parameter in task.parts.named_parameters():
+        parameter.requires_grad_(any(f"{name}.".startswith(f"{part}.") for part in stage.trained))
+    schedule = run.schedule_of(stage)
+    facts = {
+        **task.facts, "recipe": run.recipe.name, "stage": stage.name, "clips": len(clips), "latents": clips.digest,
+        "batches": asdict(inputs.form), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
+        "attention": asdict(inputs.attention), "distance": distance[0] if distance else "none",
+        "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
+        "vae": file_sha256(run.vae), "precision": str(run.precision),
+    }  # fmt: skip
+    trainer = Trainer(task.parts, folder, schedule, task.batch, task.loss, facts, run.precision, parts=stage.trained)
+    trainer.run(report, None if stop_at is None else stop_at - before)
+    return write_bundle(run, stage, folder, trainer.averaged(), facts, trainer.step, schedule)
+
+
+def clip_latents(run: FixerRun, stage: Stage) -> int:
+    """Return the latents of a stage's clips."""
+    return min(run.form.latents, run.batches.latents or run.form.latents, stage.latents or run.form.latents)
+
+
+def stage_inputs(
+    run: FixerRun, stage: Stage, clips: LatentClips, files: Mapping[str, Path], distance: tuple[str, Distance] | None
+) -> StageInputs:
+    """Return what a stage's objective makes its task of."""
+    weights = {part: tensors for part, source in stage.start.items() if (tensors := _weights(files, source)) is not None}
+    vae = load_tiny_vae(run.vae) if "vae" not in weights else TinyVAE.from_state_dict(weights["vae"], source=stage.start["vae"])
+    latents = clip_latents(run, stage)
+    return StageInputs(
+        run.settings.dit, run.settings.rope_ratios, stage.attention(latents), stage.seen, weights, vae, clips,
+        replace(run.batches, latents=latents), stage.updates(run.schedule.steps), run.schedule.accumulate, run.equal_channels, distance,
+        run.settings,
+    )  # fmt: skip
+
+
+def write_bundle(
+    run: FixerRun, stage: Stage, folder: Path, averaged: Weights, facts: Mapping[str, Any], updates: int, schedule: Schedule
+) -> Path:
+    """Write a stage's weights after ``updates`` updates as one float16 bundle, with its card."""
+    recipe, path = run.recipe, folder / BUNDLE_FILE
+    parts = {name: {k: half(v) for k, v in part.items()} for name, part in parts_of(averaged).items() if name in BUNDLED}
+    settings = deployed_settings(run, stage)
+    planned = "" if updates == schedule.steps else f" of {schedule.steps}"
+    name = recipe.name if stage is recipe.stages[-1] else f"{recipe.name}, stage {stage.name}"
+    save_bundle(path, parts, settings, trained=True, note=f"{name}, {updates}{planned} updates")
+    rows, hours = curves(folder / LOG_FILE)
+    trained = {part: asdict(own) for part, own in stage.trained.items()}
+    training = {"about": recipe.about, "schedule": asdict(schedule), "trained": trained, **facts}
+    data = {"pairs": "rendered scenes, split train", "sequences": len(PairDataset(run.data, "train").sequences), "form": asdict(run.form)}
+    ModelCard(f"OneFixer weights, recipe {name}: {recipe.about}", data, training, rows, hours).write(path)
+    return path
+
+
+def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
+    """Return the settings that a stage's weights are deployed with.
+
+    Raises:
+        InputError: Settings that do not fit together.
+    """
+    if isinstance(run.settings, OneFixerSettings):
+        said = run.recipe.settings(stage, clip_latents(run, stage))
+    else:
+        said = run.recipe.own_settings(stage)
+    try:
+        return type(run.settings).model_validate({**run.settings.model_dump(), **said})
+    except ValueError as error:
+        raise InputError("deploying a recipe", f"{run.recipe.name}, stage {stage.name}", str(error), "correct the recipe") from error
 
 
 def half(tensor: Tensor) -> Tensor:
@@ -135,3 +231,39 @@ def half(tensor: Tensor) -> Tensor:
         found = f"values up to {float(tensor.abs().max()):.3g}"
         raise InputError("rounding weights to float16", f"shape {list(tensor.shape)}", found, "train with a smaller learning rate")
     return rounded
+
+
+def _weights(files: Mapping[str, Path], source: str) -> Weights | None:
+    """Return the tensors of ``SOURCE.PART``; None where a run is not given its source.
+
+    Raises:
+        InputError: A file without that part.
+    """
+    name, _, part = source.partition(".")
+    if name not in files:
+        return None
+    tensors = load_weights(files[name], dtype=torch.float32)
+    parts = parts_of(tensors)
+    if part == "dit" and "dit" not in parts:
+        return tensors  # a transformer alone
+    if part not in parts:
+        do = f"give a bundle of 'simrun train fixer' as {name}"
+        raise InputError("starting a stage of training", str(files[name]), f"no part {part!r}", do)
+    return parts[part]
+
+
+def _digest(weights: Weights | None) -> str | None:
+    """Return a digest of tensors. A file's would not do: the order of its header is not fixed, and a stage's bundle is written again."""
+    if weights is None:
+        return None
+    out = hashlib.blake2b(digest_size=16)
+    for key, value in sorted(weights.items()):
+        out.update(key.encode() + value.contiguous().numpy().tobytes())
+    return out.hexdigest()
+
+
+def _from(report: Report | None, before: int) -> Report | None:
+    return None if report is None else lambda step, numbers: report(before + step, numbers)
+
+
+__all__ = ["BUNDLE_FILE", "FixerRun", "Task", "deployed_settings", "half", "stage_inputs", "train_fixer", "write_bundle"]

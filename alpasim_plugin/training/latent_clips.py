@@ -72,14 +72,14 @@ class LatentClip(NamedTuple):
         """Render, clean frames, map and mask."""
         return self.z_r, self.z_0, self.z_map, self.m
 
-    def frames(self, end: int) -> tuple[Tensor, Tensor]:
-        """Return the render ``(3, end, H, W)`` in [-1, 1] and its opacity ``(1, end, H, W)`` of the clip's first frames."""
-        cut = self.sequence.clip.cut(self.start, end)
+    def frames(self, end: int, begin: int = 0) -> tuple[Tensor, Tensor]:
+        """Return the render ``(3, T, H, W)`` in [-1, 1] and its opacity ``(1, T, H, W)`` of the clip's frames ``begin`` to ``end``."""
+        cut = self.sequence.clip.cut(self.start + begin, end - begin)
         return to_tensor(cut.rgb_input, self.mirrored), (to_tensor(cut.opacity[..., None], self.mirrored) + 1) / 2
 
-    def clean(self, end: int) -> Tensor:
-        """Return the clean frames ``(3, end, H, W)`` in [-1, 1] of the clip's first ``end``."""
-        return to_tensor(self.sequence.clip.cut(self.start, end).rgb_gt, self.mirrored)
+    def clean(self, end: int, begin: int = 0) -> Tensor:
+        """Return the clean frames ``(3, T, H, W)`` in [-1, 1] of the clip's frames ``begin`` to ``end``."""
+        return to_tensor(self.sequence.clip.cut(self.start + begin, end - begin).rgb_gt, self.mirrored)
 
 
 class LatentClips:

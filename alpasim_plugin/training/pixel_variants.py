@@ -11,8 +11,8 @@ from itertools import accumulate
 from types import MappingProxyType
 from typing import Any
 
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.pixel_rollout import PixelObjectives
-from alpasim_plugin.training.variants import lookup
 
 FULL = PixelObjectives()
 FLOW_ALONE = PixelObjectives(picture=0.0, perceptual=0.0, temporal=0.0, flow=1.0, grid=0.0)
@@ -92,4 +92,7 @@ def pixel_variant(name: str) -> PixelVariant:
     Raises:
         InputError: No such variant.
     """
-    return lookup(name, PIXEL_VARIANTS)
+    if name not in PIXEL_VARIANTS:
+        do = f"choose one of {', '.join(PIXEL_VARIANTS)}"
+        raise InputError("choosing what to train", f"variant {name!r}", "no such variant", do)
+    return PIXEL_VARIANTS[name]

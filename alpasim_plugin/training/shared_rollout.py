@@ -5,8 +5,9 @@
     perceptual      d( D(z^w_0), D(clean^w) )                            at one sampled position w, through the last k predictions
 
 Names as in the paper: ``z_r`` render, ``z_0`` clean, ``z_1`` source, ``m`` mask, ``eps`` noise, ``sg`` stop-gradient. Latents are
-``(B, C, N, H, W)``, normalised. All random numbers are arguments. The history of a block holds the keys and values of its clean
-latents, slightly noised (`sampling.finalise`), as at deployment; their gradient reaches the weights, not the latents.
+``(B, C, N, H, W)``, normalised. All random numbers are arguments. A source of noise alone is Eq. 1 with m = 0. The history of a block holds
+the keys and values of its clean latents, slightly noised (`sampling.finalise`), as at deployment; their gradient reaches the weights, not
+the latents.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from alpasim_plugin.nets.kv_cache import GraphCache
 from alpasim_plugin.nets.sampling import finalise, flow_step, interpolant, mixed_source
 
 FlowHistory = Literal["own", "clean", "redenoised"]
+Predicted = Literal["own", "redenoised"]
 Perceptual = Callable[[Tensor, int], Tensor]  # predictions (B, C, N, H, W), position w -> scalar
 T_SOURCE = 1000.0  # time input of the network at t = 1
 
@@ -33,19 +35,17 @@ class Objectives:
     """Loss terms and the history they are computed on: the axes of the paper's ablation.
 
     Args:
-        flow: History of flow matching: the model's ``own`` predictions, the ``clean`` latents (diffusion forcing), clean latents that
+        flow: History of flow matching: the model's ``own`` predictions, the ``clean`` latents (teacher forcing), clean latents that
             the model noised and denoised again (``redenoised``), or None without flow matching.
         horizon: k, number of latent positions ending at w that the perceptual gradient passes through; 0 without a perceptual term.
         weight: lambda, of the perceptual term.
-        use_map: Whether the network is conditioned on the semantic map.
-        mixed: Whether the source is Eq. 1; otherwise it is noise, and the render's latents are concatenated to the map's channels.
+        predicted: Predictions that the perceptual term compares: the model's ``own`` rollout, or the ``redenoised`` clean latents.
     """
 
     flow: FlowHistory | None = "own"
     horizon: int = 4
     weight: float = 10.0
-    use_map: bool = True
-    mixed: bool = True
+    predicted: Predicted = "own"
 
     def __post_init__(self) -> None:
         if self.flow is None and not self.horizon:
@@ -61,7 +61,7 @@ class Sample:
 
     Args:
         z_r, z_0: Render and clean frames ``(B, C, N, H, W)``.
-        z_map: Semantic map, like ``z_0``.
+        condition: ``(B, channels, N, H, W)`` what the network sees besides its source: the semantic map, and what else its sizes name.
         m: ``(B, 1, N, H, W)`` mask of Eq. 1.
         eps: Noise of the source, like ``z_0``.
         eps_context: Noise of the cache write, like ``z_0``.
@@ -72,7 +72,7 @@ class Sample:
 
     z_r: Tensor
     z_0: Tensor
-    z_map: Tensor
+    condition: Tensor
     m: Tensor
     eps: Tensor
     eps_context: Tensor
@@ -89,7 +89,7 @@ class Losses:
         total: Weighted sum.
         flow: Mean over all elements; None if off.
         perceptual: Unweighted; None if off.
-        rollout: ``(B, C, N, H, W)`` the model's own predictions, detached; None if no objective needs them.
+        rollout: ``(B, C, N, H, W)`` the model's predictions, detached: those of the perceptual term if it is on; None if no term needs any.
         predictions: The predictions up to w of the perceptual term, block by block, before detaching at the horizon.
     """
 
@@ -152,7 +152,7 @@ def channel_weighted(squares: Tensor, channel_weights: Tensor | None) -> Tensor:
 def roll_out(
     net: CosmosCausalDiT,
     z_r: Tensor,
-    z_map: Tensor,
+    condition: Tensor,
     m: Tensor,
     eps: Tensor,
     eps_context: Tensor,
@@ -160,13 +160,11 @@ def roll_out(
     *,
     block_latents: int = 2,
     window: int | None = 12,
-    use_map: bool = True,
 ) -> Tensor:
     """Return the generator's own predictions of whole clips ``(B, C, N, H, W)``, as at deployment; see `Sample`."""
     t = torch.ones(z_r.shape[0], z_r.shape[2])
-    sample = Sample(z_r, z_r, z_map, m, eps, eps_context, t, t, z_r.shape[2] - 1)
-    rollout = _Rollout(net, sample, text, Objectives("own", 0, use_map=use_map), block_latents, window)
-    made = rollout.history()
+    sample = Sample(z_r, z_r, condition, m, eps, eps_context, t, t, z_r.shape[2] - 1)
+    made = _Rollout(net, sample, text, Objectives("own", 0), block_latents, window).history()
     assert made is not None, "own history"
     return made
 
@@ -181,25 +179,30 @@ class _Rollout:
         n = s.z_0.shape[2]
         self.blocks = [slice(i, min(i + block_latents, n)) for i in range(0, n, block_latents)]
         self.window = window
-        self.z_1 = mixed_source(s.z_r, s.m, s.eps) if objectives.mixed else s.eps
-        z_map = s.z_map if objectives.use_map else torch.zeros_like(s.z_map)
-        self.condition = z_map if objectives.mixed else torch.cat([z_map, s.z_r], dim=1)
+        self.z_1 = mixed_source(s.z_r, s.m, s.eps)
+        self.predict = self.generate if objectives.predicted == "own" else self.denoise_again
         self.first = max(s.w - objectives.horizon + 1, 0)  # first position whose prediction keeps its gradient
         self.predicted: Tensor | None = None
         self._before: GraphCache | None = None  # the rollout's cache before the block that holds ``first``
 
     def history(self) -> Tensor | None:
-        """Return the history of flow matching ``(B, C, N, H, W)`` without gradients, and compute the rollout if needed."""
+        """Return the history of flow matching ``(B, C, N, H, W)`` without gradients, and compute the rollouts that are needed."""
+        flow, compared = self.objectives.flow, self.objectives.predicted if self.objectives.horizon else None
         with torch.no_grad():
-            if self.objectives.flow == "own" or self.objectives.horizon:
-                self.predicted = self._roll(self.generate, fork_at=self.first)
-            if self.objectives.flow == "redenoised":
-                return self._roll(self._denoise_again)
-        return self.s.z_0 if self.objectives.flow == "clean" else self.predicted
+            if compared is not None:
+                self.predicted = self._roll(self.predict, fork_at=self.first)
+            if flow is None or flow == "clean":
+                return None if flow is None else self.s.z_0
+            if flow == compared:
+                return self.predicted
+            made = self._roll(self.generate if flow == "own" else self.denoise_again)
+            if self.predicted is None:
+                self.predicted = made
+            return made
 
     def generate(self, b: slice, cache: GraphCache) -> Tensor:
         """Predict a block in one step from its source (Eq. 2); leaves the block open."""
-        v = self.net.step(self.z_1[:, :, b], T_SOURCE, self.text, self.condition[:, :, b], cache, write=False)
+        v = self.net.step(self.z_1[:, :, b], T_SOURCE, self.text, self.s.condition[:, :, b], cache, write=False)
         return flow_step(self.z_1[:, :, b], v)
 
     def flow_matching(self, history: Tensor | None, channel_weights: Tensor | None = None) -> Tensor:
@@ -209,7 +212,7 @@ class _Rollout:
         t = s.t[:, None, :, None, None]
         z_t = interpolant(s.z_0, self.z_1, t)
         for b in self.blocks:
-            v = self.net.step(z_t[:, :, b], T_SOURCE * s.t[:, b], self.text, self.condition[:, :, b], cache, write=False)
+            v = self.net.step(z_t[:, :, b], T_SOURCE * s.t[:, b], self.text, self.s.condition[:, :, b], cache, write=False)
             errors.append(channel_weighted((v - (self.z_1 - s.z_0)[:, :, b]).square(), channel_weights).mean(dim=(0, 1, 3, 4)))
             self._write(history[:, :, b], b, cache)
         return torch.cat(errors).mean()
@@ -230,7 +233,7 @@ class _Rollout:
             if b.stop <= self.first:
                 out.append(self.predicted[:, :, b])
                 continue
-            out.append(self.generate(b, cache))
+            out.append(self.predict(b, cache))
             self._write(self.cut(out[-1], b), b, cache)
         return tuple(out)
 
@@ -249,15 +252,15 @@ class _Rollout:
             self._write(parts[-1], b, cache)
         return torch.cat(parts, dim=2)
 
-    def _denoise_again(self, b: slice, cache: GraphCache) -> Tensor:
+    def denoise_again(self, b: slice, cache: GraphCache) -> Tensor:
         """Noise the clean latents to a random level and denoise them, given previously denoised blocks."""
         t = self.s.t_redenoise[:, b]
         z_t = interpolant(self.s.z_0[:, :, b], self.z_1[:, :, b], t[:, None, :, None, None])
-        v = self.net.step(z_t, T_SOURCE * t, self.text, self.condition[:, :, b], cache, write=False)
+        v = self.net.step(z_t, T_SOURCE * t, self.text, self.s.condition[:, :, b], cache, write=False)
         return flow_step(z_t, v, t[:, None, :, None, None])
 
     def _write(self, z: Tensor, b: slice, cache: GraphCache) -> None:
-        finalise(self.net, z, self.s.eps_context[:, :, b], self.text, self.condition[:, :, b], cache)
+        finalise(self.net, z, self.s.eps_context[:, :, b], self.text, self.s.condition[:, :, b], cache)
 
     def _new_cache(self) -> GraphCache:
         b, _, _, h, w = self.s.z_0.shape

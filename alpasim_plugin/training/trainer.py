@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch
@@ -77,6 +78,24 @@ class Schedule:
         return facts
 
 
+@dataclass(frozen=True)
+class PartSchedule:
+    """Optimisation of one part of a module, where it differs from the whole's.
+
+    Args:
+        rate: Learning rate over the schedule's.
+        betas: Of AdamW.
+        clip: Largest gradient norm of the part; None for the schedule's.
+    """
+
+    rate: float = 1.0
+    betas: tuple[float, float] = (0.9, 0.99)
+    clip: float | None = None
+
+
+WHOLE: Mapping[str, PartSchedule] = MappingProxyType({"": PartSchedule()})
+
+
 class Carried(Protocol):
     """What a task carries from one batch to the next, such as the state of a recurrent network."""
 
@@ -102,9 +121,11 @@ class Trainer(Generic[Batch]):
         autocast: Precision of the forward pass, or None.
         carried: What the task carries from batch to batch, or None.
         ranks: The processes that share the batches; ``batch`` and ``carried`` are this one's rows.
+        parts: Schedules of the module's parts, by the first names of their parameters (``dit``, ``vae.decoder``; the empty name is the
+            whole). A part without a gradient in an update keeps its weights, moments and average.
 
     Raises:
-        InputError: The folder holds another run, or one whose decay has begun under another schedule.
+        InputError: The folder holds another run, or one whose decay has begun under another schedule; or a parameter of no part.
     """
 
     def __init__(
@@ -118,19 +139,23 @@ class Trainer(Generic[Batch]):
         autocast: torch.dtype | None = None,
         carried: Carried | None = None,
         ranks: Ranks = ALONE,
+        parts: Mapping[str, PartSchedule] = WHOLE,
     ) -> None:
         self.ranks = ranks
         self.module, self.folder, self.schedule = module, folder, schedule
         self._batch, self._loss, self._autocast, self._carried = batch, loss, autocast, carried
         self.parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
-        decayed = [p for p in self.parameters.values() if p.ndim > 1]
-        plain = [p for p in self.parameters.values() if p.ndim <= 1]
-        groups = [{"params": decayed, "weight_decay": schedule.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-        self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr, betas=(0.9, 0.99))
+        self._parts = [(name, part, _parameters_of(name, self.parameters)) for name, part in parts.items()]
+        if nobodys := sorted(set(self.parameters) - {key for _, _, own in self._parts for key in own}):
+            found = listed("trained without a schedule", nobodys)
+            raise InputError("setting up a training run", str(folder), found, "freeze them, or name their part")
+        groups = [group for _, part, own in self._parts for group in _groups(part, own, schedule)]
+        self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr)
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
         self.step = 0
         self._kept: dict[str, Tensor] = {}
-        self._facts = json.dumps({**facts, "schedule": schedule.identity}, sort_keys=True, default=str)
+        several = {} if parts == WHOLE else {"parts": {name: asdict(part) for name, part in parts.items()}}
+        self._facts = json.dumps({**facts, **several, "schedule": schedule.identity}, sort_keys=True, default=str)
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
@@ -175,8 +200,8 @@ class Trainer(Generic[Batch]):
         """Write the checkpoint."""
         tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
-        for name, p in self.parameters.items():
-            tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state[p].items()}
+        for name, p in self.parameters.items():  # a part that has had no gradient yet has no moments
+            tensors |= {f"moment.{key}.{name}": value for key, value in self.optimiser.state.get(p, {}).items()}
         tensors |= {f"{CARRIED}{name}": value.contiguous() for name, value in self.ranks.joined(self._kept).items()}
         if not self.ranks.is_first:
             return
@@ -200,17 +225,27 @@ class Trainer(Generic[Batch]):
             for name, value in {"loss": float(loss.detach()), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / n
         self._average_ranks(sums)
-        norm = float(nn.utils.clip_grad_norm_(list(self.parameters.values()), self.schedule.clip))
-        if not math.isfinite(norm):
-            self._stop(batch, f"gradient norm {norm} at update {self.step}")
+        norms = self._clip()
+        if not all(map(math.isfinite, norms.values())):
+            self._stop(batch, f"gradient norm {norms} at update {self.step}")
         lr = self.schedule.lr(self.step)
         for group in self.optimiser.param_groups:
-            group["lr"] = lr
+            group["lr"] = lr * group["rate"]
         self.optimiser.step()
         self.step += 1
         self._kept = {} if self._carried is None else dict(self._carried.carried())  # only now: a failed update leaves the last one's
         self._update_average()
-        return {**sums, "grad_norm": norm, "lr": lr, "s": time.perf_counter() - began}
+        return {**sums, **norms, "lr": lr, "s": time.perf_counter() - began}
+
+    def _clip(self) -> dict[str, float]:
+        """Clip the gradients of every part that has any, and return their norms."""
+        norms = {}
+        for name, part, own in self._parts:
+            if any(p.grad is not None for p in own.values()):
+                clip = self.schedule.clip if part.clip is None else part.clip
+                key = f"grad_norm.{name}" if len(self._parts) > 1 else "grad_norm"
+                norms[key] = float(nn.utils.clip_grad_norm_(list(own.values()), clip))
+        return norms
 
     def _average_ranks(self, numbers: dict[str, float]) -> None:
         """Replace gradients and logged values by their means over the ranks."""
@@ -224,7 +259,8 @@ class Trainer(Generic[Batch]):
         decay = min(self.schedule.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for name, p in self.parameters.items():
-                self.average[name].lerp_(p, 1 - decay)
+                if p.grad is not None:
+                    self.average[name].lerp_(p, 1 - decay)
 
     def _stop(self, batch: Batch, found: str) -> None:
         path = self.folder / (BAD_FILE if self.ranks.is_first else f"{self.ranks.rank}-{BAD_FILE}")
@@ -282,3 +318,17 @@ class Trainer(Generic[Batch]):
             with parsing(doing, path, f"remove {path}; only the curves are lost", "not a training log"):
                 kept = [line for line in lines if parse_json(line, path, doing)["step"] <= self.step]
             write_text(path, "".join(line + "\n" for line in kept))
+
+
+def _parameters_of(part: str, parameters: Mapping[str, nn.Parameter]) -> dict[str, nn.Parameter]:
+    """Return a part's parameters; the empty name is the whole."""
+    return {name: p for name, p in parameters.items() if not part or f"{name}.".startswith(f"{part}.")}
+
+
+def _groups(part: PartSchedule, own: Mapping[str, nn.Parameter], schedule: Schedule) -> list[dict[str, Any]]:
+    """Return the optimiser's groups of a part: matrices and kernels decay, gains and biases do not."""
+    shared = {"rate": part.rate, "betas": part.betas}
+    return [
+        {"params": [p for p in own.values() if p.ndim > 1], "weight_decay": schedule.weight_decay, **shared},
+        {"params": [p for p in own.values() if p.ndim <= 1], "weight_decay": 0.0, **shared},
+    ]

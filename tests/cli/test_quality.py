@@ -63,6 +63,8 @@ def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_pa
     assert "ms_per_frame" not in variants["3dgs"]
     assert summary["run"]["fixers"]["small"]["settings"]["window"] == 3
     assert summary["run"]["fixers"]["small"]["trained"] is True
+    unit = {"frames": 8, "network_calls": 1, "latents": 2, "lookahead_frames": 7, "calls_per_frame": 0.125}
+    assert summary["run"]["units"] == {"3dgs": None, "identity": None, "small": unit}
     for name in ("quality.json", "quality.md", "by-frame.png", "speed.png", "sheets/a.png"):
         assert (out / name).stat().st_size > 0
     laid = cv2.imread(str(out / "sheets" / "a.png"))

@@ -178,4 +178,4 @@ def test_former_names_of_a_verb_and_an_option_are_accepted_and_hidden() -> None:
     assert "recolour" not in run.invoke(app, ["fixer", "--help"]).output
     refused = run.invoke(app, ["fixer", "absent", "--vae", "absent", "--out", "absent", "--no-recolour", "--variant", "V0"])
     assert isinstance(refused.exception, InputError)
-    assert "no such variant" in str(refused.exception)
+    assert "no such recipe" in str(refused.exception)

@@ -44,7 +44,8 @@ def small_settings(*overrides: str, name: str = "onefixer-dit-tiny") -> OneFixer
 def busy_settings(folder: Path, *overrides: str) -> OneFixerSettings:
     """Return settings whose weights make every layer count, which an identity's do not."""
     settings = small_settings("holes=noise", *overrides)
-    path = folder / f"blocks_of_{settings.block_latents}_{settings.decoder.kind}.safetensors"  # what a bundle must match
+    must_match = settings.block_latents, settings.decoder.kind, settings.render_input, settings.opacity_input
+    path = folder / f"blocks_of_{'_'.join(map(str, must_match))}.safetensors"
     if not path.exists():
         save_stand_in(path, settings)
     return small_settings("holes=noise", *overrides, f"weights.bundle={path}")

@@ -22,7 +22,7 @@ def clip(frames: int, sizes: DiTSizes = SMALL, batch: int = 1, height: int = 4, 
     x = torch.randn(batch, sizes.latent_channels, frames, height, width, generator=g)
     t = (1000 * torch.rand(batch, -(-frames // 2), generator=g)).repeat_interleave(2, 1)[:, :frames]
     text = torch.randn(batch, tokens, sizes.text_width, generator=g)
-    hdmap = torch.randn(batch, sizes.map_channels, frames, height, width, generator=g)
+    hdmap = torch.randn(batch, sizes.condition_channels, frames, height, width, generator=g)
     return x, t, text, hdmap
 
 

@@ -88,7 +88,9 @@ def velocity(sd, x, t, text, hdmap, condition_mask=None, block=2, ratios=(3.0, 3
     padding = torch.zeros(b, 1, frames, height, width).double() if padding_mask is None else padding_mask.double()
     cut = "b c t (h p) (w q) -> b (t h w) (c p q)"
     stream = rearrange(torch.cat([x, condition, padding], 1), cut, p=2, q=2) @ sd["x_embedder.proj.1.weight"].T
-    stream = stream + rearrange(hdmap, cut, p=2, q=2) @ sd["additional_patch_embedding.proj.1.weight"].T
+    maps = sd["additional_patch_embedding.proj.1.weight"].shape[1] // 4
+    stream = stream + rearrange(hdmap[:, :maps], cut, p=2, q=2) @ sd["additional_patch_embedding.proj.1.weight"].T
+    opacity = rearrange(hdmap[:, maps:], cut, p=2, q=2)  # of no channels where the network embeds none
     d = stream.shape[-1]
 
     angle = (t * 0.001)[..., None] * torch.exp(-math.log(10000) * torch.arange(d // 2).double() / (d // 2))
@@ -116,6 +118,8 @@ def velocity(sd, x, t, text, hdmap, condition_mask=None, block=2, ratios=(3.0, 3
             shift, scale, gate = modulation(f"blocks.{i}.adaln_modulation_{sub}", 3)
             y = norm(stream) * (1 + scale) + shift
             name = f"blocks.{i}.{sub}"
+            if sub == "self_attn" and opacity.shape[-1]:
+                y = y + opacity @ sd[f"blocks.{i}.opacity_embed.weight"].T
             if sub == "mlp":
                 y = gelu(y @ sd[f"{name}.layer1.weight"].T) @ sd[f"{name}.layer2.weight"].T
             else:

@@ -21,6 +21,7 @@ SIZES = [
     DiTSizes(96, 3, 8, 64, 96, 11, 6, 16, 1),  # many heads of the smallest useful width, square AdaLN, map of one channel
     DiTSizes(64, 2, 64, 256, 16, 48, 40, 16, 16),
     DiTSizes(20, 2, 10, 33, 4, 3, 2, 5, 7),  # no power of two anywhere
+    DiTSizes(24, 2, 12, 40, 5, 7, 9, 4, 3, 6),  # every block sees the opacity
 ]
 
 

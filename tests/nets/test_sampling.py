@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sample_block, sources_needed
+from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, opacity_values, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names, named, shifted, steps
 from tests.nets.cache_history import history
 from tests.nets.dit_cases import clip, furthest, network
@@ -34,6 +34,20 @@ def test_streamed_masks_are_the_whole_one():
     opacity = torch.rand(1, 1, 13, 8, 8, generator=torch.Generator().manual_seed(2))
     parts = [opacity_mask(opacity[:, :, :5]), opacity_mask(opacity[:, :, 5:], first=False)]
     assert torch.equal(torch.cat(parts, 2), opacity_mask(opacity))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_opacity_values_are_means_of_four_by_four_pixels_of_every_frame(first):
+    opacity = torch.rand(2, 1, 5 if first else 8, 16, 24, generator=torch.Generator().manual_seed(1))
+    values = opacity_values(opacity, first)
+    assert values.shape == (2, 16, 2, 2, 3)
+    for channel in range(16):
+        frame, row, column = channel // 4, channel // 2 % 2, channel % 2
+        at = 1 + frame if first else 4 + frame  # of the second latent
+        cell = opacity[:, 0, at, 8 + 4 * row : 12 + 4 * row, 16 + 4 * column : 20 + 4 * column]
+        assert furthest(values[:, channel, 1, 1, 2], cell.mean((1, 2))) < 1e-6
+    if first:
+        assert torch.equal(values[:, 0:4, 0], values[:, 12:16, 0]), "the first frame stands for those before it"
 
 
 def test_opaque_render_is_kept_and_empty_one_is_noise_bit_for_bit():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.bundle import load_tiny_vae
 from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
@@ -30,6 +31,10 @@ def bundle(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noq
     return train_fixer(run_of(data, "V9"), tmp_path_factory.mktemp("run") / "v9", ("brightness", brightness))
 
 
+def vae_of(bundle: Path) -> TinyVAE:
+    return load_tiny_vae(bundle)
+
+
 def net_of(bundle: Path) -> CosmosCausalDiT:
     tensors = load_weights(bundle, dtype=torch.float32)
     return CosmosCausalDiT.from_state_dict({key[4:]: value for key, value in tensors.items() if key.startswith("dit.")})
@@ -37,24 +42,24 @@ def net_of(bundle: Path) -> CosmosCausalDiT:
 
 def test_rollouts_are_those_of_the_shared_rollout_and_are_made_once(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
-    rollouts = Rollouts(clips, net, 2, 4, True, tmp_path / "r")
+    rollouts = Rollouts(clips, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")
     assert len(rollouts) == len(clips)
     clip, z = rollouts[2]
     assert z.shape == clip.z_0.shape
     assert torch.isfinite(z).all()
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "r").rglob("*.npy")}
-    Rollouts(clips, net, 2, 4, True, tmp_path / "r")
+    Rollouts(clips, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "r").rglob("*.npy")} == files
     other = net_of(bundle)
     with torch.no_grad():
         other.final_layer.linear.weight.add_(0.1)
-    assert Rollouts(clips, other, 2, 4, True, tmp_path / "r").digest != rollouts.digest
+    assert Rollouts(clips, vae_of(bundle), other, 2, 4, "drawn", tmp_path / "r").digest != rollouts.digest
 
 
 @pytest.mark.slow
 def test_a_generator_without_a_map_is_rolled_out_without_one(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
     clips, net = clips_of(data, tmp_path / "z"), net_of(bundle)
-    with_map, without = (Rollouts(clips, net, 2, 4, use_map, tmp_path / "r") for use_map in (True, False))
+    with_map, without = (Rollouts(clips, vae_of(bundle), net, 2, 4, shown, tmp_path / "r") for shown in ("drawn", "nothing"))
     assert not torch.equal(with_map[0][1], without[0][1])
     blind = Path(copytree(data, tmp_path / "blind")) / "train"
     for name in ("a", "b"):  # the same pairs, but for their maps
@@ -62,8 +67,10 @@ def test_a_generator_without_a_map_is_rolled_out_without_one(data: Path, bundle:
         info = blind / name / "sequence.json"
         info.write_text(json.dumps({k: v for k, v in json.loads(info.read_text()).items() if k != "content"}))
     unmapped = clips_of(blind.parent, tmp_path / "z")
-    assert torch.equal(Rollouts(unmapped, net, 2, 4, False, tmp_path / "r")[0][1], without[0][1])
-    assert not torch.equal(Rollouts(unmapped, net, 2, 4, True, tmp_path / "r")[0][1], with_map[0][1]), "other pairs, other rollouts"
+    assert torch.equal(Rollouts(unmapped, vae_of(bundle), net, 2, 4, "nothing", tmp_path / "r")[0][1], without[0][1])
+    assert not torch.equal(Rollouts(unmapped, vae_of(bundle), net, 2, 4, "drawn", tmp_path / "r")[0][1], with_map[0][1]), (
+        "other pairs, other rollouts"
+    )
 
 
 def test_roll_out_equals_the_rollout_of_the_losses(bundle: Path) -> None:
@@ -102,7 +109,7 @@ def test_only_the_decoder_learns_and_pictures_get_nearer(data: Path, bundle: Pat
 
 
 def test_batches_are_functions_of_their_number_and_crops_fit(data: Path, bundle: Path, tmp_path: Path) -> None:  # noqa: F811
-    rollouts = Rollouts(clips_of(data, tmp_path / "z"), net_of(bundle), 2, 4, True, tmp_path / "r")
+    rollouts = Rollouts(clips_of(data, tmp_path / "z"), vae_of(bundle), net_of(bundle), 2, 4, "drawn", tmp_path / "r")
     one, two = (DecoderTask(TinyVAE.load(data / "vae.safetensors"), rollouts, RECIPE) for _ in range(2))
     two.batch(0)
     a, b = one.batch(3), two.batch(3)

@@ -1,10 +1,11 @@
-"""Training a fixer of any variant: latents on disk, equal draws, budgets, and a bundle that drives."""
+"""Training a row of the ablation: latents on disk, equal draws, budgets, and a bundle that drives."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,17 +14,26 @@ from torch import Tensor
 
 from alpasim_plugin.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.headers import read_metadata
+from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
-from alpasim_plugin.training.fixer_run import FixerRun, start_weights, train_fixer
-from alpasim_plugin.training.generator import GeneratorRecipe, GeneratorTask, widen_map
+from alpasim_plugin.training.clip_batches import BatchForm, ClipBatches, Seen
+from alpasim_plugin.training.fixer_run import FixerRun, stage_inputs, train_fixer
+from alpasim_plugin.training.generator import SharedRollout
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.pair_store import PairDataset, write_sequence
+from alpasim_plugin.training.recipes.ablation import ABLATION
+from alpasim_plugin.training.recipes.recipe import Recipe
+from alpasim_plugin.training.recipes.registry import recipe_of, with_attention, with_perceptual_weight, with_source_share
+from alpasim_plugin.training.recipes.start import widen_map
+from alpasim_plugin.training.shared_rollout import Objectives
 from alpasim_plugin.training.trainer import Schedule
-from alpasim_plugin.training.variants import VARIANTS, variant_of
 from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 
 from .pair_files import make, pair
@@ -45,11 +55,23 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def run_of(data: Path, variant: str, *, steps: int = 2, init: Path | None = None) -> FixerRun:
-    recipe = GeneratorRecipe(clips=2, columns=4, block_latents=2, window=4, steps=steps, accumulate=1)
+def run_of(data: Path, recipe: str, *, steps: int = 2, init: Path | None = None) -> FixerRun:
     schedule = Schedule(steps, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
     settings = small_settings("window=4", "history=finalise", "holes=noise")
-    return FixerRun(settings, variant_of(variant), data, data / "vae.safetensors", init, FORM, recipe, schedule)
+    weights = {} if init is None else {"init": init}
+    chosen = with_attention(recipe_of(recipe), window=4)
+    return FixerRun(settings, chosen, data, data / "vae.safetensors", weights, FORM, BatchForm(clips=2, columns=4), schedule)
+
+
+def task_of(run: FixerRun, clips: LatentClips, distance: object = ("b", brightness)) -> Any:
+    stage = run.recipe.stages[0]
+    return stage.objective.task(stage_inputs(run, stage, clips, run.weights, distance))
+
+
+def objectives_of(recipe: Recipe) -> tuple[Objectives, ...]:
+    objective = recipe.stages[0].objective
+    assert isinstance(objective, SharedRollout)
+    return objective.objectives
 
 
 def clips_of(data: Path, folder: Path) -> LatentClips:
@@ -95,23 +117,24 @@ def test_too_short_sequences_and_no_sequences_are_refused(data: Path, tmp_path: 
         LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
 
 
-QUICK = ("base", "image", "V5", "V6", "V7", "V8")  # between them every branch; V9 is trained below
+QUICK = ("base", "base-bi", "image", "V5", "V6", "V7", "V8")  # between them every branch; V9 is trained below
 
 
-@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in VARIANTS])
-def test_every_variant_trains_by_one_function(data: Path, tmp_path: Path, name: str) -> None:
-    run = run_of(data, name)
+@pytest.mark.parametrize("name", [r.name if r.name in QUICK else pytest.param(r.name, marks=pytest.mark.slow) for r in ABLATION])
+def test_every_row_trains_by_one_function(data: Path, tmp_path: Path, name: str) -> None:
+    steps = 3 if name == "V7" else 2  # the last of three is its perceptual term's
+    run = run_of(data, name, steps=steps)
     path = train_fixer(run, tmp_path / "run", ("brightness", brightness))
     card = json.loads(path.with_suffix(".card.json").read_text())
-    assert card["training"]["variant"] == name
-    assert card["training"]["schedule"]["steps"] == 2
-    assert card["curves"][-1]["step"] == 2
-    start, rows = start_weights(run), [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert len(rows) == 2
-    has_flow = any(stage.flow is not None for stage in run.variant.stages)
-    assert any("flow" in row for row in rows) == has_flow
-    assert any("perceptual" in row for row in rows) == any(stage.horizon for stage in run.variant.stages)
-    assert start["additional_patch_embedding.proj.1.weight"].shape[1] == (64 if run.variant.mixed else 128)
+    assert card["training"]["recipe"] == name
+    assert card["training"]["schedule"]["steps"] == steps
+    assert card["curves"][-1]["step"] == steps
+    rows = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert len(rows) == steps
+    asked = objectives_of(run.recipe) if name not in ("base", "base-bi") else (Objectives("own", 0),)
+    assert any("flow" in row for row in rows) == any(o.flow is not None for o in asked)
+    assert any("perceptual" in row for row in rows) == any(o.horizon for o in asked)
+    assert load_weights(path)["dit.additional_patch_embedding.proj.1.weight"].shape[1] == (128 if name == "V6" else 64)
 
 
 @pytest.mark.slow
@@ -123,17 +146,23 @@ def test_a_run_can_be_stopped_for_what_there_is_and_goes_on(data: Path, tmp_path
     assert all(torch.equal(value, load_weights(whole)[key]) for key, value in load_weights(again).items())
 
 
-def test_the_perceptual_terms_weight_can_be_chosen() -> None:
-    assert [stage.weight for stage in variant_of("V7").stages] == [10.0, 10.0]
-    assert [stage.weight for stage in variant_of("V7").with_perceptual_weight(2.5).stages] == [2.5, 2.5]
+def test_terms_can_be_weighted_and_shared_from_outside() -> None:
+    assert [o.weight for o in objectives_of(recipe_of("V7"))] == [10.0, 10.0]
+    assert [o.weight for o in objectives_of(with_perceptual_weight(recipe_of("V7"), 2.5))] == [2.5, 2.5]
     with pytest.raises(InputError, match="weight -1"):
-        variant_of("V9").with_perceptual_weight(-1.0)
+        with_perceptual_weight(recipe_of("V9"), -1.0)
+    assert with_source_share(recipe_of("base"), 0.0).stages[0].objective.source_share == 0
+    assert with_source_share(recipe_of("V9"), 0.0) == recipe_of("V9")
 
 
-def test_v7_divides_its_updates_between_its_two_terms() -> None:
-    kinds = [variant_of("V7").objectives(step, 5) for step in range(5)]
-    assert [k.flow for k in kinds] == ["own", "own", "own", None, None]
-    assert [k.horizon for k in kinds] == [0, 0, 0, 4, 4]
+def test_v7_gives_five_eighths_of_its_updates_to_flow_matching() -> None:
+    objective = recipe_of("V7").stages[0].objective
+    assert isinstance(objective, SharedRollout)
+    kinds = [objective.at(update, 400) for update in range(400)]
+    assert [sum(k.flow == "own" for k in kinds), sum(k.flow is None for k in kinds)] == [250, 150]
+    assert [kinds[249].horizon, kinds[250].horizon] == [0, 4]
+    with pytest.raises(InputError, match="their shares"):
+        SharedRollout((Objectives(), Objectives()), (0.5, 0.6))
 
 
 @pytest.mark.slow
@@ -165,10 +194,40 @@ def test_trained_weights_serve_the_streaming_fixer(data: Path, tmp_path: Path, v
     assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
 
 
-def test_weights_that_take_the_render_as_a_condition_are_refused_before_they_drive(data: Path, tmp_path: Path) -> None:
+def test_a_generator_from_noise_drives_with_the_render_as_its_condition(data: Path, tmp_path: Path) -> None:
     path = train_fixer(run_of(data, "V6"), tmp_path / "run", ("brightness", brightness))
-    with pytest.raises(InputError, match="32 channels, streaming gives 16"):
+    with pytest.raises(InputError, match="render_input is False for True"):
         load_networks(small_settings("window=4", "holes=noise", "history=finalise", f"weights.bundle={path}"))
+    name, overrides = bundle_fixer(path)
+    settings = fixer_settings(name, overrides)
+    assert isinstance(settings, OneFixerSettings)
+    assert (settings.holes, settings.render_input) == ("everywhere", True)
+    frames = moving_picture(5)
+    dark = [replace(frame, rgb=frame.rgb // 2) for frame in frames]
+    one, other = (pixels(run_blocks(fixer(settings), clip, maps_of(frames))) for clip in (frames, dark))
+    assert (one != other).any()
+
+
+def test_a_black_map_is_encoded_in_training_and_on_the_road(data: Path, tmp_path: Path) -> None:
+    path = train_fixer(run_of(data, "V5"), tmp_path / "run", ("brightness", brightness))
+    settings = fixer_settings(*bundle_fixer(path))
+    assert isinstance(settings, OneFixerSettings)
+    assert (settings.uses_map, settings.no_map) == (False, "black")
+    clips = clips_of(data, tmp_path)
+    vae = TinyVAE.load(data / "vae.safetensors")
+    shown = ClipBatches(clips, vae, BatchForm(clips=2, columns=4), Seen(map="black"))[0].sample.condition
+    with torch.inference_mode():
+        black = vae.encode(torch.full((1, 3, 13, 32, 48), -1.0))
+    assert float(black.abs().mean()) > 0.1
+    torch.testing.assert_close(shown[:, :, :, :, 2:], black[..., 2:4].expand_as(shown[:, :, :, :, 2:]), atol=1e-5, rtol=0)
+    frames = moving_picture(5)
+    fixed, nothing = (
+        pixels(run_blocks(fixer(s), frames, maps_of(frames))) for s in (settings, settings.model_copy(update={"no_map": "nothing"}))
+    )
+    given = settings.model_copy(update={"uses_map": True})
+    blacked = pixels(run_blocks(fixer(given), frames, [np.zeros_like(frame.rgb) for frame in frames]))
+    np.testing.assert_array_equal(fixed, blacked)
+    assert (fixed != nothing).any()
 
 
 def test_without_history_a_frame_does_not_depend_on_those_before(data: Path, tmp_path: Path) -> None:
@@ -185,9 +244,7 @@ def test_without_history_a_frame_does_not_depend_on_those_before(data: Path, tmp
 
 def test_draws_are_functions_of_their_number(data: Path, tmp_path: Path) -> None:
     run, clips = run_of(data, "V9"), clips_of(data, tmp_path)
-    net = CosmosCausalDiT.from_state_dict(start_weights(run), run.settings.rope_ratios)
-    vae = TinyVAE.load(data / "vae.safetensors")
-    one, two = (GeneratorTask(net, vae, clips, run.variant, run.recipe, ("b", brightness)) for _ in range(2))
+    one, two = task_of(run, clips), task_of(run, clips)
     two.batch(0)
     a, b = one.batch(5), two.batch(5)
     assert all(torch.equal(getattr(a.sample, key), getattr(b.sample, key)) for key in ("z_0", "z_r", "m", "eps", "t"))
@@ -195,13 +252,13 @@ def test_draws_are_functions_of_their_number(data: Path, tmp_path: Path) -> None
     assert a.sample.z_0.shape == (2, 16, 4, 4, 4)  # cropped to 4 of 6 columns
     assert not torch.equal(a.sample.eps, one.batch(6).sample.eps)
     with pytest.raises(InputError, match="half a token"):
-        GeneratorTask(net, vae, clips, run.variant, replace(run.recipe, columns=3), ("b", brightness))
+        BatchForm(columns=3)
     with pytest.raises(InputError, match="without a distance"):
-        GeneratorTask(net, vae, clips, run.variant, run.recipe)
+        task_of(run, clips, None)
 
 
-def test_a_widened_map_input_changes_nothing_at_first(data: Path) -> None:
-    weights = start_weights(run_of(data, "V9"))
+def test_a_widened_map_input_changes_nothing_at_first() -> None:
+    weights = initial_weights(DiTSizes(**small_settings().dit.model_dump()), 0, zero_velocity=True)
     wide = widen_map(weights, 32)
     narrow_net, wide_net = (CosmosCausalDiT.from_state_dict(w) for w in (weights, wide))
     generator = torch.Generator().manual_seed(0)

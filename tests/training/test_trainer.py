@@ -1,5 +1,6 @@
 """The training loop: resuming gives equal weights, and a non-finite loss or a full disk loses nothing."""
 
+import json
 import os
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.errors import InfrastructureError, InputError
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.trainer import BAD_FILE, Schedule, Trainer
+from alpasim_plugin.training.trainer import BAD_FILE, PartSchedule, Schedule, Trainer
 
 
 class Linear(nn.Module):
@@ -121,3 +122,58 @@ def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(tmp
         t.run()
     monkeypatch.undo()
     assert trainer(tmp_path, Schedule(steps=4, save_every=2)).step == 2
+
+
+class Two(nn.Module):
+    """Two parts, of which one is trained in every third update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.student, self.critic = Linear(), Linear()
+
+
+def two_parts(folder: Path, schedule: Schedule, parts: dict[str, PartSchedule]) -> Trainer[Tensor]:
+    model = Two()
+
+    def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
+        trained = (model.critic, model.student) if index % 3 == 0 else (model.critic,)
+        return torch.stack([((x @ part.weight.T + part.bias - x @ TRUTH.T) ** 2).mean() for part in trained]).sum(), {}
+
+    return Trainer(model, folder, schedule, batch, loss, {}, parts=parts)
+
+
+PARTS = {"student": PartSchedule(rate=0.5), "critic": PartSchedule(betas=(0.0, 0.9), clip=1e-3)}
+
+
+def test_parts_have_rates_and_clips_of_their_own_and_rest_without_a_gradient(tmp_path: Path) -> None:
+    schedule = Schedule(steps=6, peak_lr=0.01, warmup=1, weight_decay=0.0, clip=100.0)
+    t = two_parts(tmp_path, schedule, PARTS)
+    t.run(until=1)
+    first = {name: p.detach().clone() for name, p in t.parameters.items()}
+    assert float(first["student.weight"].abs().max()) == pytest.approx(0.005, rel=1e-3), "Adam's first step is the rate"
+    assert float(first["critic.weight"].abs().max()) == pytest.approx(0.01, rel=1e-3)
+    average = t.average["student.weight"].clone()
+    t.run(until=3)
+    assert torch.equal(first["student.weight"], t.parameters["student.weight"])
+    assert torch.equal(average, t.average["student.weight"])
+    assert not torch.equal(first["critic.weight"], t.parameters["critic.weight"])
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert ["grad_norm.student" in row for row in rows] == [True, False, False]
+    assert [group["weight_decay"] for group in t.optimiser.param_groups] == [0.0] * 4
+
+
+def test_parts_resume_bit_for_bit_also_before_their_first_gradient(tmp_path: Path) -> None:
+    schedule = Schedule(steps=6, save_every=1)
+    whole = two_parts(tmp_path / "whole", schedule, PARTS)
+    whole.run()
+    two_parts(tmp_path / "cut", schedule, PARTS).run(until=2)
+    again = two_parts(tmp_path / "cut", schedule, PARTS)
+    again.run()
+    assert all(torch.equal(p, again.averaged()[name]) for name, p in whole.averaged().items())
+    with pytest.raises(InputError, match="begun as"):
+        two_parts(tmp_path / "cut", schedule, {**PARTS, "student": PartSchedule(rate=1.0)})
+
+
+def test_a_trained_parameter_of_no_part_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"trained without a schedule: critic\.bias"):
+        two_parts(tmp_path, Schedule(steps=1), {"student": PartSchedule()})

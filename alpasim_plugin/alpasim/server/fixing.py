@@ -34,8 +34,11 @@ def resolve_served(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         return resolve_renderer(name, [*overrides, "noise=content"])
     if spec.fixer.name == "identity":
         return RendererSpec(spec.name, spec.base)
+    settings: Any = spec.fixer.settings
     found = f"{spec.fixer.name} works on blocks of frames, whose poses are not part of a render request"
-    raise InputError(DOING, f"renderer {name!r}", found, "serve a fixer of single frames, such as onefixer")
+    if settings.loop_mode == "frame by frame":
+        found = f"{spec.fixer.name} has one history a camera, and requests of several drives come over one connection"
+    raise InputError(DOING, f"renderer {name!r}", found, "serve a fixer with an explicit past, such as onefixer")
 
 
 class FixerShelf:

@@ -1,0 +1,125 @@
+"""Settings of the fixers without map and history in the transformer: image models, and windows from noise."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from alpasim_plugin.fixers.settings import LatentFixerSettings, Part, Positive, Unit, check_no_blocks, check_steps, counted_steps
+from alpasim_plugin.nets.schedule import RenderLevel
+
+LATENT_FRAMES = 4  # of every latent but a clip's first
+
+
+class RenderLevelSettings(Part):
+    """The noise level that a render is taken to have: ``z_r = alpha z_0 + sigma eps``."""
+
+    alpha: float = Field(gt=0, description="Share of the clean latents.")
+    sigma: float = Field(gt=0, description="Share of noise.")
+
+
+class MaplessSettings(LatentFixerSettings):
+    """Attention over all latents of one call, no map, no cache."""
+
+    opacity_to_decoder: bool = Field(
+        default=False, description="Whether a decoder that sees the render is told where it is opaque; without it, opaque everywhere."
+    )
+
+    @property
+    def loop_mode(self) -> str:
+        """How the closed loop runs the fixer, in one word."""
+        return "frame by frame"
+
+    @model_validator(mode="after")
+    def _no_blocks(self) -> MaplessSettings:
+        check_no_blocks(self)
+        if self.uses_map:
+            raise ValueError("uses_map true | this fixer has no input for a map: leave it out")
+        return self
+
+
+class RenderStepSettings(MaplessSettings):
+    """One deterministic step from the render, at a fixed time: DiFix3D+, DiffusionHarmonizer."""
+
+    bundle_kind: ClassVar[str] = "render-step"
+    render_level: RenderLevelSettings = Field(description="The noise level that the render is taken to have.")
+    references: Literal[0, 4] = Field(
+        default=0, description="Last outputs that the network looks at; a camera's first frames, which have fewer, are fixed without."
+    )
+    steps: Literal[1] = Field(default=1, description="The method takes one step.")
+
+    @property
+    def level(self) -> RenderLevel:
+        """The render's noise level."""
+        return RenderLevel(self.render_level.alpha, self.render_level.sigma)
+
+    @property
+    def network_times(self) -> tuple[float, ...]:
+        """Time input of the network's one step, 0 to 1000."""
+        return (self.level.network_t,)
+
+    @property
+    def unit(self) -> Unit:
+        """What a frame costs."""
+        return Unit(1, 1, 1 + self.references // LATENT_FRAMES, 0)
+
+
+class NoiseWindowSettings(MaplessSettings):
+    """Windows of frames sampled from noise by Euler steps, with the render as a condition: GSFix3D, 3DGS-Enhancer."""
+
+    bundle_kind: ClassVar[str] = "noise-window"
+    opacity_to_decoder: bool = Field(default=True, description=MaplessSettings.model_fields["opacity_to_decoder"].description)
+    steps: tuple[float, ...] = Field(min_length=1, description="Times of the network's calls, falling from 1000, without a shift.")
+    window_frames: Positive = Field(default=1, description="Frames of a window, 1 + 4 n. More than one: whole clips only.")
+    stride_frames: Positive = Field(default=1, description="Frames from the start of a window to that of the next.")
+    stitch: Literal["fade", "cut"] = Field(
+        default="fade", description="Where windows overlap: the later one fades in linearly, or takes over at once."
+    )
+    noise: Literal["fresh", "fixed"] = Field(
+        default="fresh", description="Noise of a window: its own, or the first window's in all of them, which flickers less."
+    )
+
+    @property
+    def latents(self) -> int:
+        """Latents of a window."""
+        return 1 + (self.window_frames - 1) // LATENT_FRAMES
+
+    @property
+    def fade_frames(self) -> int:
+        """Frames over which a window fades in."""
+        return self.window_frames - self.stride_frames if self.stitch == "fade" else 0
+
+    @property
+    def network_times(self) -> tuple[float, ...]:
+        """Time inputs of the network's steps, 0 to 1000."""
+        return self.steps
+
+    @property
+    def is_offline(self) -> bool:
+        """Whether the fixer needs whole clips, so that it cannot run in a closed loop."""
+        return self.window_frames > 1
+
+    @property
+    def loop_mode(self) -> str:
+        """How the closed loop runs the fixer, in one word."""
+        return "whole clips" if self.is_offline else "frame by frame"
+
+    @property
+    def unit(self) -> Unit:
+        """What a window costs."""
+        return Unit(self.stride_frames, len(self.steps), self.latents, self.window_frames - 1)
+
+    @field_validator("steps", mode="before")
+    @classmethod
+    def _counted(cls, value: Any) -> Any:
+        return counted_steps(value)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> NoiseWindowSettings:
+        check_steps(self.steps)
+        if (self.window_frames - 1) % LATENT_FRAMES:
+            raise ValueError(f"window_frames {self.window_frames} | give 1 + 4 n, whole latents")
+        if self.stride_frames > self.window_frames:
+            raise ValueError(f"stride_frames {self.stride_frames} with windows of {self.window_frames} | frames between would be missing")
+        return self

@@ -1,0 +1,54 @@
+"""Small image and window fixers for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import save_bundle
+from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
+from alpasim_plugin.fixers.networks import Parts
+from alpasim_plugin.nets.codec_weights import fill_random
+
+SMALL = (
+    "vae.widths=[16,16,16,16,16]", "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5",
+    "dit.text_width=7", "dit.context_width=9",
+)  # fmt: skip
+DAMPED = 0.3  # of the velocity and of the autoencoder's corrections: the guard finds nothing
+
+
+def image_settings(name: str, *overrides: str) -> RenderStepSettings | NoiseWindowSettings:
+    """Return a shipped arm's settings at a few thousand parameters."""
+    settings = fixer_settings(name, (*SMALL, *overrides))
+    assert isinstance(settings, RenderStepSettings | NoiseWindowSettings)
+    return settings
+
+
+def busy_settings(folder: Path, name: str, *overrides: str) -> RenderStepSettings | NoiseWindowSettings:
+    """Return settings whose weights make every layer count."""
+    kind = image_settings(name, *overrides).decoder.kind
+    path = folder / f"{name}_{kind}.safetensors"
+    if not path.exists():
+        parts = Parts(image_settings(name, "untrained=random", f"decoder.kind={kind}"))
+        dit, vae = parts.dit(), parts.vae()
+        fill_random(vae.encoder, 1, "tests.encoder")
+        fill_random(vae.decoder, 1, "tests.decoder")
+        damp(dit.final_layer.linear.weight, vae.encoder.head.weight, vae.decoder.head.weight)  # type: ignore[union-attr]
+        save(path, {"dit": dit.state_dict(), "vae": vae.state_dict()}, parts.settings)  # type: ignore[arg-type]
+    return image_settings(name, f"weights.bundle={path}", *overrides)
+
+
+def damp(*weights: Tensor) -> None:
+    """Make weights small, in place."""
+    with torch.no_grad():
+        for weight in weights:
+            weight.mul_(DAMPED)
+
+
+def save(path: Path, parts: Mapping[str, Mapping[str, Tensor]], settings: RenderStepSettings | NoiseWindowSettings) -> None:
+    """Write a bundle."""
+    save_bundle(path, parts, settings, trained=True, note="3 updates")
