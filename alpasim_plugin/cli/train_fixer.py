@@ -20,7 +20,14 @@ from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.fixer_run import FixerRun, TrainableSettings, train_fixer
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.recipes.recipe import INIT
-from alpasim_plugin.training.recipes.registry import RECIPES, recipe_of, with_attention, with_perceptual_weight, with_source_share
+from alpasim_plugin.training.recipes.registry import (
+    RECIPES,
+    recipe_of,
+    with_attention,
+    with_objective,
+    with_perceptual_weight,
+    with_source_share,
+)
 from alpasim_plugin.training.trainer import Schedule
 
 PRECISIONS: Mapping[str, torch.dtype | None] = {"fp32": None, "bf16": torch.bfloat16}
@@ -74,6 +81,10 @@ def train_fixer_command(
     source_share: Annotated[
         float, typer.Option("--source-share", min=0.0, max=0.8, help="Recipe base: share of positions at t = 1, the start of sampling.")
     ] = 0.35,
+    objective: Annotated[
+        list[str] | None,
+        typer.Option("--objective", help="KEY=VALUE or STAGE.KEY=VALUE of the recipe's objectives, repeatable, such as dmd.steps=4."),
+    ] = None,
     block: Annotated[int | None, typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's.")] = None,
     window: Annotated[int | None, typer.Option("--window", min=1, help="Attention window in latents, instead of the recipe's.")] = None,
     sink: Annotated[int | None, typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's.")] = None,
@@ -102,7 +113,7 @@ def train_fixer_command(
     del debug
     options.use_threads(threads)
     chosen = with_perceptual_weight(with_source_share(recipe_of(recipe), source_share), perceptual)
-    chosen = with_attention(chosen, block, window, sink)
+    chosen = with_attention(with_objective(chosen, objective or []), block, window, sink)
     settings = trainable_settings(fixer or chosen.fixer)
     if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
         do = "leave out --block, --window and --sink"

@@ -255,8 +255,6 @@ class OneFixerSettings(LatentFixerSettings):
             raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
         if self.holes == "everywhere" and not self.render_input:
             raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
-        if self.opacity_input and self.fold:
-            raise ValueError("fold with opacity_input | blocks that embed the opacity cannot be folded: set fold false")
         return self
 
 

@@ -97,21 +97,30 @@ class SelfAttention(nn.Module):
         self.qkv_proj = qkv
         del self.q_proj, self.k_proj, self.v_proj
 
-    def project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads, head_width)``."""
-        parts = (self.q_proj(x), self.k_proj(x), self.v_proj(x)) if self.qkv_proj is None else self.qkv_proj(x).chunk(3, dim=-1)
+    def project(self, x: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads, head_width)``.
+
+        ``added (B, L, width)`` is added to the tokens; once the projections are fused it is ``(B, L, 3 * width)``, already projected.
+        """
+        if self.qkv_proj is None:
+            x = x if added is None else x + added
+            parts = self.q_proj(x), self.k_proj(x), self.v_proj(x)
+        else:
+            qkv = self.qkv_proj(x)
+            parts = (qkv if added is None else qkv + added).chunk(3, dim=-1)
         q, k, v = (part.unflatten(-1, (-1, self.head_width)) for part in parts)
         return self.q_norm(q), self.k_norm(k), v
 
-    def forward(self, x: Tensor, table: RopeTable, attention: Attend) -> Tensor:
+    def forward(self, x: Tensor, table: RopeTable, attention: Attend, added: Tensor | None = None) -> Tensor:
         """Apply self-attention.
 
         Args:
             x: ``(B, T, N, width)``.
             table: Rotation of the ``T * N`` tokens.
             attention: Attention of the block's q, k, v and the cached past.
+            added: See `project`, ``(B, T, N, ...)``.
         """
-        q, k, v = self.project(x.flatten(1, 2))
+        q, k, v = self.project(x.flatten(1, 2), None if added is None else added.flatten(1, 2))
         out: Tensor = self.output_proj(attention(rotate(q, table), rotate(k, table), v))
         return out.view(x.shape)
 

@@ -58,12 +58,7 @@ class Block(nn.Module):
             opacity: ``(B, opacity_channels, T, H, W)`` for a block that embeds it: added to the modulated input of self-attention.
         """
         seen = None if self.opacity_embed is None or opacity is None else self.opacity_embed.embed(opacity)
-
-        def attend(n: Tensor) -> Tensor:
-            out: Tensor = self.self_attn(n if seen is None else n + seen, table, attention)
-            return out
-
-        x = residual(x, attend, _modulation(self.adaln_modulation_self_attn, time))
+        x = residual(x, lambda n: self.self_attn(n, table, attention, seen), _modulation(self.adaln_modulation_self_attn, time))
         x = residual(x, lambda n: self.cross_attn(n, text), _modulation(self.adaln_modulation_cross_attn, time))
         return residual(x, self.mlp, _modulation(self.adaln_modulation_mlp, time))
 
@@ -71,7 +66,10 @@ class Block(nn.Module):
         """Fold the modulation of one time step into the weights, in place; queries, keys and values become one linear."""
         attn, cross, mlp = self.self_attn, self.cross_attn, self.mlp
         shift, scale, gate = _require(self.adaln_modulation_self_attn, time)
-        attn.fuse(fold_input(stack_rows([attn.q_proj, attn.k_proj, attn.v_proj]), shift, scale))
+        qkv = stack_rows([attn.q_proj, attn.k_proj, attn.v_proj])
+        if self.opacity_embed is not None:  # added after scale and shift, so it passes the projections as they are
+            self.opacity_embed.follow(qkv.weight)
+        attn.fuse(fold_input(qkv, shift, scale))
         attn.output_proj = fold_output(attn.output_proj, gate)
         shift, scale, gate = _require(self.adaln_modulation_cross_attn, time)
         cross.q_proj = fold_input(cross.q_proj, shift, scale)

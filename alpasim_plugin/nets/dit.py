@@ -224,9 +224,6 @@ class CosmosCausalDiT(nn.Module):
         """
         if self.folded_t is not None:
             raise InputError("folding a time step", f"t={t}", f"already folded for t={self.folded_t}", "fold the original network")
-        if self.sizes.opacity_channels:
-            # The opacity is added after scale and shift, so the scale cannot move into the weights that multiply both.
-            raise InputError("folding a time step", f"t={t}", "blocks that embed the opacity", "run it unfolded: --set fixer.fold=false")
         net = copy.deepcopy(self).requires_grad_(False)
         with torch.no_grad():
             time = self._time(t)

@@ -81,6 +81,11 @@ class PatchLinear(nn.Linear):
     def __init__(self, channels: int, width: int) -> None:
         super().__init__(channels * PATCH * PATCH, width, bias=False)
 
+    def follow(self, weight: Tensor) -> None:
+        """Become the embedding followed by a linear with this weight ``(outputs, width)``, in place; product in float64."""
+        self.weight = nn.Parameter((weight.double() @ self.weight.double()).to(self.weight.dtype), requires_grad=False)
+        self.out_features = len(weight)
+
     def embed(self, video: Tensor, first_channel: int = 0) -> Tensor:
         """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B, T, N, width)``."""
         patches = patchify(video)

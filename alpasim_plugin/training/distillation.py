@@ -25,7 +25,7 @@ from alpasim_plugin.training.causal_rollout import causal_rollout
 from alpasim_plugin.training.clip_batches import ClipBatches
 from alpasim_plugin.training.dmd import Score, critic_loss, direction, generator_loss, noised, score_levels
 from alpasim_plugin.training.recipes.recipe import StageInputs
-from alpasim_plugin.training.recipes.start import transformer_of
+from alpasim_plugin.training.recipes.start import channel_weights_of, transformer_of
 from alpasim_plugin.training.shared_rollout import T_SOURCE, Sample
 from alpasim_plugin.training.tail_drop import TailDrop
 from alpasim_plugin.training.trainer import Loss
@@ -101,6 +101,7 @@ class DistillationTask:
             parts["head"] = AdversarialHead(self.student.sizes.width, len(a.taps), a.heads, a.inner, seed)
         self.parts = nn.ModuleDict(parts)
         self.schedule = steps(config.steps)
+        self.channel_weights = channel_weights_of(inputs)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -167,7 +168,7 @@ class DistillationTask:
 
     def _critic_loss(self, z: Tensor, s: Sample, noise: RolloutNoise) -> tuple[Tensor, dict[str, float]]:
         n, sigma, term = mixed_source(s.z_r, s.m, noise.score), noise.sigma, self.config.adversarial
-        loss = critic_loss(self.fake.given(s.condition), z, n, sigma)
+        loss = critic_loss(self.fake.given(s.condition), z, n, sigma, self.channel_weights)
         numbers = {"critic": float(loss.detach())}
         if term is None:
             return loss, numbers

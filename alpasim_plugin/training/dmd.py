@@ -19,6 +19,7 @@ from torch import Tensor
 
 from alpasim_plugin.nets.sampling import flow_step, interpolant
 from alpasim_plugin.nets.schedule import SHIFT, TABLE
+from alpasim_plugin.training.shared_rollout import channel_weighted
 
 Score = Callable[[Tensor, Tensor], Tensor]  # x (B, C, N, H, W), sigma (B,) -> velocity like x
 NORMALISER_FLOOR = 1e-6
@@ -52,10 +53,18 @@ def noised(z: Tensor, n: Tensor, sigma: Tensor) -> Tensor:
     return interpolant(z, n, _per_clip(sigma))
 
 
-def critic_loss(fake: Score, z: Tensor, n: Tensor, sigma: Tensor) -> Tensor:
-    """Return the flow-matching error of the fake score on the student's latents, which get no gradient."""
+def critic_loss(fake: Score, z: Tensor, n: Tensor, sigma: Tensor, channel_weights: Tensor | None = None) -> Tensor:
+    """Return the flow-matching error of the fake score on the student's latents, which get no gradient.
+
+    Args:
+        fake: Trained score.
+        z: ``(B, C, N, H, W)`` the student's latents.
+        n: Source like ``z``.
+        sigma: ``(B,)`` noise levels.
+        channel_weights: ``(C,)`` of the error, mean 1, as in the training of the scores; None for equal weights.
+    """
     z = z.detach()
-    return (fake(noised(z, n, sigma), sigma) - (n - z)).square().mean()
+    return channel_weighted((fake(noised(z, n, sigma), sigma) - (n - z)).square(), channel_weights).mean()
 
 
 @torch.no_grad()

@@ -210,7 +210,6 @@ def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
     """
     if isinstance(run.settings, OneFixerSettings):
         said = run.recipe.settings(stage, clip_latents(run, stage))
-        said |= {"fold": False} if said["opacity_input"] else {}
     else:
         said = run.recipe.own_settings(stage)
     try:

@@ -28,8 +28,8 @@ CASES = [
     ("block_latents=3", "window=3"),
     ("decoder.kind=latent",),
     ("uses_map=false",),
-    ("opacity_input=true", "fold=false"),
-    ("opacity_input=true", "fold=false", "history=finalise", "steps=[1000,500]"),
+    ("opacity_input=true",),
+    ("opacity_input=true", "history=finalise", "steps=[1000,500]"),
     ("uses_map=false", "no_map=black"),
     ("render_input=true", "holes=everywhere"),
 ]

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import DiTSizes
 from alpasim_plugin.nets.attention import block_causal_attention
 from tests.examples import examples
@@ -158,7 +157,7 @@ def test_a_number_is_a_time_step_for_every_latent():
         assert furthest(net(x, torch.full((1, 1), 357.0), text, hdmap), by_latent) < 1e-5
 
 
-@pytest.mark.parametrize("sizes", [s for s in SIZES if not s.opacity_channels], ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
+@pytest.mark.parametrize("sizes", SIZES, ids=lambda s: f"{s.width}x{s.blocks}x{s.head_width}")
 @pytest.mark.parametrize("t", [1000.0, 803.5714, 128.0])
 def test_folded_network_is_an_exact_rewrite(sizes, t):
     net = network(sizes)
@@ -167,11 +166,6 @@ def test_folded_network_is_an_exact_rewrite(sizes, t):
     with torch.no_grad():
         assert furthest(folded(x, t, text, hdmap), net(x, t, text, hdmap)) < 1e-5
     assert not any("adaln" in name for name, _ in folded.named_parameters())
-
-
-def test_a_network_that_embeds_the_opacity_is_not_folded():
-    with pytest.raises(InputError, match="embed the opacity"):
-        network(SIZES[-1]).folded(1000.0)
 
 
 def test_folded_and_plain_network_share_a_cache():

@@ -23,7 +23,8 @@ from alpasim_plugin.training.distillation import Distillation
 from alpasim_plugin.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.training.recipes.causal_arms import CAUSAL_ARMS
 from alpasim_plugin.training.recipes.recipe import Recipe, Stage
-from alpasim_plugin.training.recipes.registry import by_name, recipe_of
+from alpasim_plugin.training.recipes.registry import by_name, recipe_of, with_objective
+from alpasim_plugin.training.tail_drop import TailDrop
 from alpasim_plugin.training.trainer import STATE_FILE, Schedule
 from tests.fixers.fixer_cases import SMALL_DIT, fixer, maps_of, moving_picture, pixels, run_blocks
 
@@ -86,7 +87,7 @@ def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) ->
     recipe = replace(recipe_of("artifixer-pre"), stages=(replace(recipe_of("artifixer-pre").stages[0], name="only"),))
     session = deployed(train_fixer(run_of(data, recipe), tmp_path / "run"))
     settings = session.settings
-    assert (settings.uses_map, settings.no_map, settings.opacity_input, settings.fold) == (False, "nothing", True, False)
+    assert (settings.uses_map, settings.no_map, settings.opacity_input) == (False, "nothing", True)
     assert (settings.block_latents, settings.window, settings.history) == (4, 4, "last-forward")
     assert session.networks.dit.sizes.opacity_channels == 16
     frames = moving_picture(13)
@@ -164,6 +165,20 @@ def test_a_head_that_no_longer_teaches_stops_its_run(data: Path, student: Path, 
 def test_without_weights_an_arm_says_what_trains_it(name: str) -> None:
     with pytest.raises(InputError, match=f"simrun train fixer .* --recipe {name}"):
         load_networks(arm_settings(name))
+
+
+def test_objectives_can_be_changed_by_field() -> None:
+    four = with_objective(recipe_of("one-forcing"), ["steps=4", "dmd.gradient_latents=null", "teacher.shift=5"])
+    teacher, student, dmd = (stage.objective for stage in four.stages)
+    assert (dmd.steps, dmd.gradient_latents, dmd.adversarial) == (4, None, AdversarialTerm())
+    assert (teacher.shift, student.shift) == (5.0, 1.0)
+    shown = with_objective(recipe_of("artifixer"), ["tail_drop=null", "causal.tail_drop={whole: 0.2}"])
+    assert [stage.objective.tail_drop for stage in shown.stages] == [None, TailDrop(0.2), None]
+    for text in ("steps", "step=4", "student.steps=4"):
+        with pytest.raises(InputError, match=r"no such field[\s\S]*dmd\.steps"):
+            with_objective(recipe_of("self-forcing"), [text])
+    with pytest.raises(InputError, match="not a value of steps"):
+        with_objective(recipe_of("self-forcing"), ["steps=many"])
 
 
 def test_recipes_that_do_not_fit_together_are_refused() -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
+from typing import get_type_hints
+
+import yaml
+from pydantic import TypeAdapter
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.flow_matching import FlowMatching
@@ -64,6 +68,38 @@ def with_source_share(recipe: Recipe, share: float) -> Recipe:
         return replace(objective, source_share=share) if isinstance(objective, FlowMatching) and objective.source_share else objective
 
     return _with_objectives(recipe, shared)
+
+
+def with_objective(recipe: Recipe, texts: Sequence[str]) -> Recipe:
+    """Return a recipe with other fields of its objectives: ``KEY=VALUE`` in every stage that has it, ``STAGE.KEY=VALUE`` in one.
+
+    Example:
+        >>> with_objective(recipe_of("self-forcing"), ["dmd.steps=4"]).stages[-1].objective.steps
+        4
+
+    Raises:
+        InputError: Not KEY=VALUE, a field that no stage has, or a value of another type.
+    """
+    for text in texts:
+        recipe = _with_field(recipe, text)
+    return recipe
+
+
+def _with_field(recipe: Recipe, text: str) -> Recipe:
+    path, equals, value = text.partition("=")
+    stage_name, dot, key = path.rpartition(".")
+    fields = {stage.name: get_type_hints(type(stage.objective)) for stage in recipe.stages}
+    chosen = [name for name, known in fields.items() if key in known and (not dot or name == stage_name)]
+    doing, given = "changing an objective", f"--objective {text}"
+    if not equals or not chosen:
+        known = sorted({f"{name}.{field}" for name, types in fields.items() for field in types})
+        raise InputError(doing, given, f"no such field in recipe {recipe.name}", f"write KEY=VALUE with one of {', '.join(known)}")
+    try:
+        read = TypeAdapter(fields[chosen[0]][key]).validate_python(yaml.safe_load(value))
+    except (ValueError, yaml.YAMLError) as error:
+        raise InputError(doing, given, f"not a value of {key}: {str(error).splitlines()[-1].strip()}", "write it as YAML") from error
+    stages = (replace(s, objective=replace(s.objective, **{key: read})) if s.name in chosen else s for s in recipe.stages)  # type: ignore[type-var]
+    return replace(recipe, stages=tuple(stages))
 
 
 def with_attention(recipe: Recipe, block: int | None = None, window: int | None = None, sink: int | None = None) -> Recipe:
