@@ -39,6 +39,8 @@ Examples:
 
 - `simrun decide --renderer clean,onefixer --metric lateral_distance_m=0.1,progress=0.05 suites/all --budget 200`
 
+- `simrun decide --renderer clean,3dgs --population suite --order stratified suites/all`: about the mean of this suite, family by family
+
 - `simrun decide --renderer 3dgs,onefixer --ask better --metric lateral_distance_m=0.05 suites/all`: at least 5 cm better?
 
 - `simrun decide --renderer clean,3dgs --population suite --control family --control runs/last-week suites/all`
@@ -77,7 +79,11 @@ def decide(
         list[str] | None,
         typer.Option("--control", metavar="family|RUN", help="With --population suite: take out known variance. Repeatable."),
     ] = None,
-    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Key of the random order of scenes.")] = 0,
+    order: Annotated[
+        Literal["random", "stratified"],
+        typer.Option("--order", help="With --population suite, stratified: between looks every family of scenes in proportion."),
+    ] = "random",
+    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Key of the order of scenes.")] = 0,
     look_every: Annotated[int, typer.Option("--look-every", min=1, help="Scenes between looks.")] = 5,
     first_look: Annotated[
         int, typer.Option("--first-look", min=5, help="Scenes before the first look of asymptotic metrics.")
@@ -123,16 +129,16 @@ def decide(
         raise InputError(DOING, f"--ask {ask}" if ask != "non-inferior" else "--expect", "no metric is named", "name it with --metric")
     asked = questions_of(metric, ask, expect, method) if metric else questions_of_gate(spec)  # type: ignore[arg-type]
     least = min_scenes or (spec.min_scenes if spec is not None else 2)
-    question = Question(asked, alpha, population_of(population, max_missing), first_look, least)
+    question = Question(asked, alpha, population_of(population, max_missing, f"--max-missing {max_missing:g}"), first_look, least)
     is_auto = seeds.startswith(AUTO)
     if is_auto and population == "suite":
         raise InputError(DOING, f"--seeds {seeds}", "the suite's mean is over the same seeds in every scene", "give a number of seeds")
-    design = Design(order_seed, look_every, budget, is_auto, scene_cost, max_missing=max_missing)
+    design = Design(order, order_seed, look_every, budget, is_auto, scene_cost, max_missing=max_missing)
     of_scene, of_fixer = split_overrides(overrides or ())
     options = RunOptions(preset, images, "none", device, baseline, of_fixer)
     plan = plan_of(What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene))
     decided = decide_into(
-        plan, question, design, controls_of(control or (), plan, question), out, quiet or as_json,
+        plan, question, design, controls_of(control or (), plan, question, order), out, quiet or as_json,
         workers=workers, certificate=certify, report=report, wait=wait, limit_s=time_limit, executor=where, store=store,
     )  # fmt: skip
     if as_json:

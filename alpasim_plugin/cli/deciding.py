@@ -20,7 +20,7 @@ from evaluators.report.run_folder import read_run
 from evaluators.sequential import control
 from evaluators.sequential.control import Control
 from evaluators.sequential.decision import State
-from evaluators.sequential.question import Method, MetricQuestion, Population, Question, metric_question
+from evaluators.sequential.question import Method, MetricQuestion, Order, Population, Question, metric_question
 from scenarios.suite import ScenarioRef, expand
 
 DOING = "planning a decision"
@@ -148,17 +148,20 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
     return found
 
 
-def controls_of(texts: Sequence[str], plan: RunPlan, question: Question) -> dict[str, Control]:
+def controls_of(texts: Sequence[str], plan: RunPlan, question: Question, order: Order = "random") -> dict[str, Control]:
     """Read ``--control``: ``family``, or run folders.
 
     Raises:
-        InputError: Controls for the population ``scenes``, or one that cannot be had.
+        InputError: Controls for the population ``scenes``, families that the order takes out already, or one that cannot be had.
     """
     if not texts:
         return {}
     if question.population != "suite":
         found = "the mean of a control over a population of scenes is not known"
         raise InputError(DOING, f"--control {texts[0]}", found, "ask about the suite itself with --population suite, or leave it out")
+    if "family" in texts and order == "stratified":
+        found = "with --order stratified, families are taken out by the order"
+        raise InputError(DOING, "--control family", found, "leave out one of the two")
     scenes, baseline = list(plan.scenarios), str(plan.options.baseline)
     candidate = next(spec.name for spec in plan.renderers if spec.name != baseline)
     paths = {cell.scene: cell.ref.path for cell in plan.cells}
@@ -210,15 +213,20 @@ def decide_into(
         raise
 
 
-def population_of(text: Population, max_missing: float) -> Population:
+def population_of(text: Population, max_missing: float, allowed_by: str) -> Population:
     """Check that a suite is asked about only where all its scenes count.
+
+    Args:
+        text: Which population.
+        max_missing: Share of pairs that may lack.
+        allowed_by: What says so, for the error.
 
     Raises:
         InputError: Pairs may be missing.
     """
     if text == "suite" and max_missing > 0.0:
         found = "scenes without a pair would be left out of the suite that is asked about"
-        raise InputError(DOING, f"--max-missing {max_missing:g}", found, "leave it out, or ask with --population scenes")
+        raise InputError(DOING, allowed_by, found, "leave it out, or ask with --population scenes")
     return text
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from typing_extensions import TypedDict
+from typing_extensions import NotRequired, TypedDict
 
 from alpasim_plugin.reading.json_files import as_shape
 from alpasim_plugin.vouched import read_sealed, write_sealed
@@ -76,6 +76,7 @@ class Decision(TypedDict):
     ceiling: dict[str, int]  # scenes, rollouts
     seeds: dict[str, Any]  # how many a scene and why
     controls: dict[str, Any]  # what takes out variance, by metric
+    drawn: NotRequired[dict[str, Any]]  # order: random (where absent) or stratified, then the number of scenes of each family
     order: list[str]  # scenes driven, in their order
     looks: list[Look]
     verdict: str

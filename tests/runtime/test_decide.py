@@ -83,6 +83,25 @@ def test_the_order_depends_on_the_seed_and_the_names_alone() -> None:
     assert sorted(drawing_order(names, 3)) == sorted(names)
 
 
+def test_in_stratified_order_every_batch_has_both_families_and_the_record_names_them(tmp_path: Path) -> None:
+    listed = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT)]
+    refs = [ScenarioRef(ref.path, seed, ref.overrides) for ref in listed for seed in (1, 2)]
+    plan = make_plan(refs, (GREY, DARKER), (BY_GREY,), (0,), RunOptions(images="none", baseline=GREY))
+    suite = replace(SAME, population="suite", alpha=0.02)
+    decided, heard = decide(tmp_path / "run", suite, plan, Design("stratified", look_every=2))
+    file_of = {cell.scene: cell.ref.path for cell in plan.cells}
+    order = decided.record["order"]
+    assert [len({file_of[scene] for scene in order[at : at + 2]}) for at in (0, 2)] == [2, 2]
+    assert (heard.looks[-1], decided.record["stopped"]) == ((4, "good"), "decided")  # of all scenes the answer is exact
+    assert list(decided.record["drawn"]["families"].values()) == [2, 2]
+    assert "in stratified order of 2 families" in render_report(read_run(tmp_path / "run"))
+    with pytest.raises(InputError, match="shares of families in a population"):
+        decide(tmp_path / "scenes", SAME, plan, Design("stratified"))
+    with pytest.raises(InputError, match="of one family, .*straight"):
+        decide(tmp_path / "one", suite, plan_of(4), Design("stratified"))
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 def test_an_interrupted_decision_continues_and_decides_the_same(worse, tmp_path: Path) -> None:
     before = told(worse[0])
     root = tmp_path / "again"
@@ -187,6 +206,11 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
             ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--population", "suite", "--seeds", "auto:3"],
             "same seeds in every scene",
         ),
+        (["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--order", "stratified"], "--population suite"),
+        (
+            "--metric progress --population suite --order stratified --control family --renderer".split() + [f"{GREY},{DARKER}"],
+            "taken out by the order",
+        ),
     ],
 )
 def test_questions_that_cannot_be_asked_are_refused(more, found, tmp_path: Path, capsys) -> None:
@@ -221,6 +245,8 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
     assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().err
     assert run_command([*words, "--baseline-file", str(tmp_path / "run")]) == 2
     assert "2 renderers beside a stored baseline" in capsys.readouterr().err
+    assert run_command([*words, "--order", "stratified"]) == 2
+    assert "shares of families in a population" in capsys.readouterr().err
     assert run_command(["gate", str(tmp_path / "run"), "--scenes", "smoke/curve"]) == 2
     assert run_command(["gate", str(tmp_path / "run"), "--until-decided"]) == 2
     capsys.readouterr()
