@@ -19,6 +19,7 @@ from alpasim_plugin.cli.deciding import (
     print_end,
     questions_of,
     questions_of_gate,
+    side_of_baseline,
 )
 from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.report import report_line
@@ -45,6 +46,8 @@ Examples:
 
 - `simrun decide --renderer clean,3dgs --population suite --control family --control runs/last-week suites/all`
 
+- `simrun decide --renderer 3dgs --baseline-file runs/last-week suites/all`: drives the change alone, against the same renderer last week
+
 - `simrun decide --renderer clean,3dgs --executor ray --look-every 50 --store s3://bucket/night suites/all`: 100 rollouts at a time
 
 Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or a broken policy, 3 undecided at the ceiling,
@@ -54,7 +57,10 @@ Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or 
 
 def decide(
     scenarios: Annotated[list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")],
-    renderer: Annotated[str, typer.Option("--renderer", help="Two renderers, comma-separated: the baseline and the one in question.")],
+    renderer: Annotated[
+        str,
+        typer.Option("--renderer", help="Baseline and renderer in question, comma-separated; with --baseline-file the latter alone."),
+    ],
     policy: Annotated[str, typer.Option("--policy", help="The policy, as for `simrun run`.")] = "lane-camera",
     metric: Annotated[
         list[str] | None,
@@ -97,7 +103,13 @@ def decide(
         float, typer.Option("--scene-cost", min=0.0, help="What a new scene costs (a reconstruction, say), in pairs of rollouts.")
     ] = 0.0,
     max_missing: Annotated[float, typer.Option("--max-missing", min=0.0, max=0.99, help="Share of pairs that may lack a value.")] = 0.0,
-    baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option("--baseline", help="Renderer to compare against; by default the first, or with --baseline-file the one in question."),
+    ] = None,
+    baseline_file: Annotated[
+        Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline, or this earlier run.")
+    ] = None,
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on them.")] = None,
@@ -136,9 +148,11 @@ def decide(
     design = Design(order, order_seed, look_every, budget, is_auto, scene_cost, max_missing=max_missing)
     of_scene, of_fixer = split_overrides(overrides or ())
     options = RunOptions(preset, images, "none", device, baseline, of_fixer)
-    plan = plan_of(What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene))
+    what = What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene)
+    plan = plan_of(what, stored=baseline_file is not None)
+    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, baseline, max_missing)
     decided = decide_into(
-        plan, question, design, controls_of(control or (), plan, question, order), out, quiet or as_json,
+        plan, question, design, controls_of(control or (), plan, question, order, stored), out, quiet or as_json, stored,
         workers=workers, certificate=certify, report=report, wait=wait, limit_s=time_limit, executor=where, store=store,
     )  # fmt: skip
     if as_json:

@@ -98,8 +98,14 @@ def _refs(what: What) -> list[ScenarioRef]:
     return [ref for item in what.scenarios for ref in expand(item, what.overrides)]
 
 
-def side_of_baseline(path: Path, plan: RunPlan, spec: GateSpec) -> StoredSide:
+def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missing: float) -> StoredSide:
     """Read a stored baseline, or an earlier run's folder, and check it against what is about to be driven.
+
+    Args:
+        path: The baseline's file or folder.
+        plan: What may be driven, of one renderer.
+        baseline: Renderer whose rollouts are taken; None: the one that is driven.
+        max_missing: Share of the plan's scenes and seeds that it may lack.
 
     Raises:
         InputError: It was made with another preset, other weights or other scenes, or lacks rollouts that may be driven.
@@ -108,7 +114,7 @@ def side_of_baseline(path: Path, plan: RunPlan, spec: GateSpec) -> StoredSide:
     weights = {file: sha for part in plan.parts for file, sha in part.files.items()}
     check_made_alike(stored, plan.options.preset, {name: one.content_hash for name, one in plan.scenarios.items()}, weights, path)
     planned = {(cell.scene, cell.seed) for cell in plan.cells}
-    return stored_side(stored.rows, spec.baseline or plan.renderers[0].name, plan.policies[0].name, planned, spec.max_missing, path)
+    return stored_side(stored.rows, baseline or plan.renderers[0].name, plan.policies[0].name, planned, max_missing, path)
 
 
 def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None) -> tuple[MetricQuestion, ...]:
@@ -148,8 +154,17 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
     return found
 
 
-def controls_of(texts: Sequence[str], plan: RunPlan, question: Question, order: Order = "random") -> dict[str, Control]:
+def controls_of(
+    texts: Sequence[str], plan: RunPlan, question: Question, order: Order, stored: StoredSide | None = None
+) -> dict[str, Control]:
     """Read ``--control``: ``family``, or run folders.
+
+    Args:
+        texts: What was given.
+        plan: What may be driven.
+        question: What is to be decided.
+        order: Of the scenes.
+        stored: The baseline's side, where it was driven earlier.
 
     Raises:
         InputError: Controls for the population ``scenes``, families that the order takes out already, or one that cannot be had.
@@ -162,8 +177,8 @@ def controls_of(texts: Sequence[str], plan: RunPlan, question: Question, order: 
     if "family" in texts and order == "stratified":
         found = "with --order stratified, families are taken out by the order"
         raise InputError(DOING, "--control family", found, "leave out one of the two")
-    scenes, baseline = list(plan.scenarios), str(plan.options.baseline)
-    candidate = next(spec.name for spec in plan.renderers if spec.name != baseline)
+    scenes, baseline = list(plan.scenarios), str(plan.options.baseline) if stored is None else stored.renderer
+    candidate = next(spec.name for spec in plan.renderers if stored is not None or spec.name != baseline)
     paths = {cell.scene: cell.ref.path for cell in plan.cells}
     out: dict[str, Control] = {}
     for text in texts:

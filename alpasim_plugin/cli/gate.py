@@ -156,7 +156,7 @@ def _until_decided(
     spec, source = load_gate(gate_file)
     options = replace(what.options, preset=spec.preset or what.options.preset, baseline=spec.baseline)
     plan = plan_of(replace(what, options=options), stored=baseline_file is not None)
-    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec)
+    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec.baseline, spec.max_missing)
     population = population_of(population, spec.max_missing, f"max_missing {spec.max_missing:g} of {source}")
     question = Question(questions_of_gate(spec), alpha, population, min_scenes=spec.min_scenes)
     design = replace(design, max_failed=spec.max_failed, max_missing=spec.max_missing)
