@@ -258,7 +258,7 @@ def family_ends(runs: int, sizes: Sequence[int], between: float, way: Way, on_th
         case = Case("", shape("normal", 0.0), float(x.mean()) + (0.0 if on_threshold else distance), distance, bounded)
         if way == "stratified":
             order = np.array([int(name) for name in strata.order(generator)])
-            draws = stratified(x[order], -bound, bound, strata.numbers([f"{i:04}" for i in order]), strata.begins(size))
+            draws = stratified(x[order], -bound, bound, family[order], strata.begins(size), less_means=not bounded)
         else:
             order = generator.permutation(size)
             known = predictions(x[order], np.eye(len(sizes))[family[order]]) if way == "control" else (None, None)

@@ -317,7 +317,8 @@ class _Drawing:
             "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},
             "seeds": {"most": len(self.plan.seeds), "chosen_by": self._seeds_by(), "scene_cost": self.design.scene_cost},
             "controls": {name: one.facts for name, one in self.controls.items()},
-            "drawn": {"order": self.design.order} | ({} if self.strata is None else {"families": dict(Counter(self.strata.family_of.values()))}),
+            "drawn": {"order": self.design.order}
+            | ({} if self.strata is None else {"families": dict(Counter(self.strata.family_of.values()))}),
             "order": self.scenes,
             "looks": self.looks,
             "verdict": words.get(outcome.cause, "undecided"),

@@ -153,7 +153,9 @@ def suites(runs: int) -> str:
 
 def families(runs: int) -> str:
     """Return scenes and errors for suites of families: random order, families as control, and stratified order."""
-    return _by_family(runs, {"60, five equal": [12] * 5, "120, five equal": [24] * 5, "120, five unequal": UNEQUAL, "120, twelve": [10] * 12}, False)
+    return _by_family(
+        runs, {"60, five equal": [12] * 5, "120, five equal": [24] * 5, "120, five unequal": UNEQUAL, "120, twelve": [10] * 12}, False
+    )
 
 
 def family_rates(runs: int) -> str:

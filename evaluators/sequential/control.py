@@ -3,7 +3,8 @@
 For a finite suite the mean of anything known of its scenes is known, over all of them and over those that are left. So a prediction of a
 scene's difference may be taken off, and the mean prediction over the scenes left put back: the expectation given all earlier scenes stays,
 whatever the prediction is worth. Its coefficients come from earlier scenes alone (a control variate with predictable coefficients; families
-as control give what stratified order gives (`strata.py`), once their means are learnt). A poor control costs a little speed, never the guarantee.
+as control give what stratified order gives, `strata.py`, once their means are learnt). A poor control costs a little speed, never the
+guarantee.
 """
 
 from __future__ import annotations
@@ -103,9 +104,7 @@ def of_rows(rows: Sequence[Row], metric: str, scenes: Sequence[str], candidate: 
     return Control({s: tuple(values.get(s, middle[name]) for name, values in found.items()) for s in scenes}, tuple(found))
 
 
-def adjusted_draws(
-    values: F64, one: MetricQuestion, order: Sequence[str], control: Control | None, strata: Strata | None = None
-) -> Draws:
+def adjusted_draws(values: F64, one: MetricQuestion, order: Sequence[str], control: Control | None, strata: Strata | None = None) -> Draws:
     """Return the draws of a finite suite, less what a control predicts.
 
     Args:
@@ -120,12 +119,11 @@ def adjusted_draws(
     at = np.flatnonzero(known)
     begin = np.arange(len(at)) if strata is None else np.searchsorted(at, strata.begins(len(values))[at])
     kept = [scene for i, scene in enumerate(order) if i >= len(values) or known[i]]
-    x, off = values[known], (None, None)
-    if control is not None:
-        off = predictions(x, np.array([control.features[scene] for scene in kept]), begin)
+    x = values[known]
+    off = (None, None) if control is None else predictions(x, np.array([control.features[scene] for scene in kept]), begin)
     if strata is None:
         return without_replacement(x, low, high, len(kept), *off)
-    return stratified(x, low, high, strata.numbers(kept), begin, *off)
+    return stratified(x, low, high, strata.numbers(kept), begin, *off, less_means=one.method == "asymptotic")
 
 
 def predictions(x: F64, z: F64, begin: I64 | None = None) -> tuple[F64, F64]:

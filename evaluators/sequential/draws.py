@@ -69,7 +69,9 @@ def independent(x: F64, low: float, high: float) -> Draws:
     """
     x = np.asarray(x, dtype=np.float64)
     n = np.arange(x.shape[-1])
-    return Draws(x, np.full_like(x, low), np.full_like(x, high), np.zeros_like(x), np.ones_like(x), n, sample_spread(x), n.astype(np.float64))
+    return Draws(
+        x, np.full_like(x, low), np.full_like(x, high), np.zeros_like(x), np.ones_like(x), n, sample_spread(x), n.astype(np.float64)
+    )
 
 
 def without_replacement(

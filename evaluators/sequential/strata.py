@@ -17,7 +17,7 @@ expected to be at most 1 if the hypothesis holds:
    g(a) = E prod a_i over the batch is therefore stable (partial symmetrisation keeps stability: Borcea, Branden and Liggett, Negative
    dependence and the geometry of polynomials, J. AMS 22, 2009), and homogeneous of degree B.
 2. So g^(1/B) is concave where all a_i are above 0 (Garding, An inequality for hyperbolic polynomials, J. Math. Mech. 8, 1959). Its
-   tangent at (1, ..., 1), where g is 1 and the derivatives are the chances B / L, lies above it: g(a) <= (mean of a over the scenes left)^B.
+   tangent at (1, ..., 1), where g is 1 and the derivatives are the chances B / L, lies above it: g(a) <= (mean of a over scenes left)^B.
 3. Under the hypothesis that mean is at most 1.
 
 For one scene of every family this is the inequality of the arithmetic and geometric means. The capital at the ends of batches is thus a
@@ -37,6 +37,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.types import F64, I64
 from evaluators.sequential.draws import Draws, without_replacement
 
+SHRINKAGE = 1.0  # scenes' worth
 DOING = "drawing scenes by family"
 
 
@@ -115,7 +116,16 @@ def pivotal_sample(left: int, wanted: int, generator: np.random.Generator) -> li
     return sorted([*chosen, carried] if chance == left else chosen)
 
 
-def stratified(x: F64, low: float, high: float, family: I64, begin: I64, removed: F64 | None = None, reach: F64 | None = None) -> Draws:
+def stratified(
+    x: F64,
+    low: float,
+    high: float,
+    family: I64,
+    begin: I64,
+    removed: F64 | None = None,
+    reach: F64 | None = None,
+    less_means: bool = False,
+) -> Draws:
     """Return draws of a finite suite in stratified random order; their spread is that within families.
 
     Args:
@@ -125,32 +135,45 @@ def stratified(x: F64, low: float, high: float, family: I64, begin: I64, removed
         family: ``(size,)`` numbers of the families of all scenes, those drawn first.
         begin: ``(n,)`` as in `Draws`.
         removed, reach: ``(n,)`` as for `without_replacement`.
+        less_means: Take off the families' means in earlier batches too. Sums gain where a stretch has several families; bets do not.
     """
-    size = len(family)
-    draws = without_replacement(x, low, high, size, removed, reach, begin)
-    n, rest = draws.n, draws.x
-    members = np.eye(int(family.max()) + 1)[family]  # (size, F)
+    n, size = len(x), len(family)
+    off, wide = (np.zeros(n), np.zeros(n)) if removed is None or reach is None else (removed, reach)
+    rest, members = x - off, np.eye(int(family.max()) + 1)[family]  # (n,), (size, F)
     drawn, sums = np.cumsum(members[:n], axis=0), np.cumsum(members[:n] * rest[:, None], axis=0)
-    means = sums / np.maximum(drawn, 1.0)
+    before, sums_before = (drawn - members[:n])[begin], (sums - members[:n] * rest[:, None])[begin]
+    share = (members.sum(axis=0) - before) / (size - begin)[:, None]  # of the scenes left, by family
+    known = _shrunken(before, sums_before) * float(less_means)
+    known = np.where(share > 0.0, known - np.sum(share * known, axis=1)[:, None], 0.0)
+    off, wide = off + known[np.arange(n), family[:n]], wide + np.abs(known).max(axis=1)
     freedom = np.sum(np.maximum(drawn - 1.0, 0.0), axis=1)
+    means = sums / np.maximum(drawn, 1.0)
     within = np.maximum(np.cumsum(rest**2) - np.sum(sums * means, axis=1), 0.0) / np.maximum(freedom, 1.0)
-    left = (members.sum(axis=0) - drawn + members[:n])[begin]
-    between = _between(left / (size - begin)[:, None], begin, means)
+    between = _between(share, begin, means, known)
+    draws = without_replacement(x, low, high, size, off, wide, begin)
     return replace(draws, spread=np.sqrt(within + between / np.arange(1, n + 1)), freedom=freedom)
 
 
-def _between(share: F64, begin: I64, means: F64) -> F64:
+def _shrunken(count: F64, sums: F64) -> F64:
+    """Return the families' means ``(n, F)``, drawn to the mean of all scenes by `SHRINKAGE`."""
+    overall = sums.sum(axis=1, keepdims=True) / np.maximum(count.sum(axis=1, keepdims=True), 1.0)
+    return np.asarray((sums + SHRINKAGE * overall) / (count + SHRINKAGE))
+
+
+def _between(share: F64, begin: I64, means: F64, known: F64) -> F64:
     """Return the variance between families that is left in the sum of the first scenes ``(n,)``: of stretches that have several.
 
     Args:
         share: ``(n, F)`` of the scenes left before each scene's batch.
         begin: ``(n,)`` first scenes of batches.
         means: ``(n, F)`` of the families, after each scene.
+        known: ``(n, F)`` what is taken off of each family's scenes.
     """
     found = np.zeros(len(begin))
     for start, size in zip(*np.unique(begin, return_counts=True), strict=True):
         ends = np.concatenate([[0.0], np.cumsum(share[start])]) * size  # of the families, along stretches of length 1
         stretch = np.arange(size)[:, None]
         mix = np.maximum(np.minimum(ends[1:], stretch + 1.0) - np.maximum(ends[:-1], stretch), 0.0)  # (B, F), rows sum to 1
-        found[start:] += means[start:] ** 2 @ mix.sum(axis=0) - np.sum((means[start:] @ mix.T) ** 2, axis=1)
+        off = means[start:] - known[start]
+        found[start:] += off**2 @ mix.sum(axis=0) - np.sum((off @ mix.T) ** 2, axis=1)
     return np.maximum(found, 0.0)

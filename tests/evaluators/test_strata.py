@@ -95,22 +95,25 @@ def courses(left: tuple[int, ...], sizes: tuple[int, ...]) -> Iterator[tuple[lis
             yield [left[i] for i in found] + later, chance * then
 
 
-def all_draws(control: np.ndarray | None = None) -> list[tuple[list[int], float, Draws]]:
+def all_draws(control: np.ndarray | None = None, less_means: bool = False) -> list[tuple[list[int], float, Draws]]:
     """Return every course with its chance and draws, given the order within families."""
     begin = Strata({}, SIZES).begins(7)
     found = []
     for order, chance in courses(tuple(range(7)), SIZES):
         off = (None, None) if control is None else predictions(SUITE[order], control[order], begin)
-        found.append((order, float(chance), stratified(SUITE[order], -1.0, 1.0, FAMILY[order], begin, *off)))
+        found.append((order, float(chance), stratified(SUITE[order], -1.0, 1.0, FAMILY[order], begin, *off, less_means=less_means)))
     return found
 
 
-@pytest.mark.parametrize("control", [None, np.array([[0.3], [-1.0], [0.2], [0.9], [0.0], [0.4], [1.0]])])
-def test_the_capital_at_the_ends_of_batches_is_a_supermartingale_over_all_courses(control):
+KNOWN = np.array([[0.3], [-1.0], [0.2], [0.9], [0.0], [0.4], [1.0]])
+
+
+@pytest.mark.parametrize(("control", "less_means"), [(None, False), (KNOWN, True)])
+def test_the_capital_at_the_ends_of_batches_is_a_supermartingale_over_all_courses(control, less_means):
     for side in (1.0, -1.0):
         mean = side * float(SUITE.mean())
         now: dict[tuple[int, ...], float] = {(): 1.0}
-        at, everything = 0, all_draws(control)
+        at, everything = 0, all_draws(control, less_means)
         for size in SIZES[:2]:
             at += size
             expected, chance_of, capital_at = Counter[tuple[int, ...]](), Counter[tuple[int, ...]](), dict[tuple[int, ...], float]()
@@ -128,10 +131,11 @@ def test_the_capital_at_the_ends_of_batches_is_a_supermartingale_over_all_course
             now = capital_at
 
 
-def test_sums_are_martingales_and_their_spread_is_that_within_families():
+@pytest.mark.parametrize("less_means", [False, True])
+def test_sums_are_martingales_and_their_spread_is_that_within_families(less_means):
     ends = [2, 4]
     total, chance_of = np.zeros(2), 0.0
-    for _, chance, draws in all_draws():
+    for _, chance, draws in all_draws(less_means=less_means):
         total += chance * np.cumsum(draws.x - draws.offset - draws.slope * SUITE.mean())[ends]
         chance_of += chance
     assert (total / chance_of).tolist() == pytest.approx([0.0, 0.0], abs=1e-12)
@@ -140,7 +144,7 @@ def test_sums_are_martingales_and_their_spread_is_that_within_families():
     order = strata.order(generator)
     number = strata.numbers(order)
     x = 10.0 * number + generator.normal(0.0, 0.5, 200)
-    draws = stratified(x[:100], -np.inf, np.inf, number, strata.begins(100))
+    draws = stratified(x[:100], -np.inf, np.inf, number, strata.begins(100), less_means=less_means)
     pooled = np.concatenate([x[:100][number[:100] == one] - x[:100][number[:100] == one].mean() for one in range(5)])
     assert draws.spread[99] == pytest.approx(np.sqrt(np.sum(pooled**2) / 95))
     assert draws.freedom[[4, 9, 99]].tolist() == [0.0, 5.0, 95.0]
