@@ -120,10 +120,11 @@ def adjusted_draws(values: F64, one: MetricQuestion, order: Sequence[str], contr
     begin = np.arange(len(at)) if strata is None else np.searchsorted(at, strata.begins(len(values))[at])
     kept = [scene for i, scene in enumerate(order) if i >= len(values) or known[i]]
     x = values[known]
-    off = (None, None) if control is None else predictions(x, np.array([control.features[scene] for scene in kept]), begin)
+    features = None if control is None else np.array([control.features[scene] for scene in kept])
+    removed, reach = (None, None) if features is None else predictions(x, features, begin)
     if strata is None:
-        return without_replacement(x, low, high, len(kept), *off)
-    return stratified(x, low, high, strata.numbers(kept), begin, *off, less_means=one.method == "asymptotic")
+        return without_replacement(x, low, high, len(kept), removed, reach)
+    return stratified(x, low, high, strata.numbers(kept), begin, removed, reach, less_means=one.method == "asymptotic")
 
 
 def predictions(x: F64, z: F64, begin: I64 | None = None) -> tuple[F64, F64]:
