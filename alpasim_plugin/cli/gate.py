@@ -21,7 +21,17 @@ from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
-from evaluators.gate import GateVerdict, check_matches, judge, judge_decided, load_gate, read_baseline, rows_of_run, write_baseline
+from evaluators.gate import (
+    GateVerdict,
+    check_matches,
+    judge_decided,
+    judge_table,
+    load_gate,
+    read_baseline,
+    rows_of_run,
+    table_of_run,
+    write_baseline,
+)
 from evaluators.report.gate import write_gate_files
 from evaluators.report.run_folder import read_run
 from evaluators.sequential.question import Population, Question
@@ -131,7 +141,7 @@ def gate(
     if baseline_file is not None:
         stored = read_baseline(baseline_file)
         check_matches(stored, found, baseline_file)
-    verdict = judge(rows_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""))
+    verdict = judge_table(table_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""))
     files = write_gate_files(verdict, source, found, out or run)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "files": [str(path) for path in files]}))
