@@ -251,7 +251,7 @@ class RendererColumns(Side):
     def first_row(self, cell: Cell) -> int | None:
         """Return the first rollout of a cell."""
         at = self.cells.find(cell)
-        return None if at is None else int(np.argmax(self.cell == at))
+        return None if at is None else int(self._first_rows[at])
 
     def reason(self, row: int, metric: str) -> str:
         """Return why a metric of the renderer is not valid; see `RolloutTable.reasons`."""
@@ -264,6 +264,11 @@ class RendererColumns(Side):
     @cached_property
     def _places(self) -> dict[int, I64]:
         return {}
+
+    @cached_property
+    def _first_rows(self) -> I64:
+        """Give the first rollout of each cell ``(C,)``."""
+        return np.asarray(np.unique(self.cell, return_index=True)[1])
 
 
 def _codes(column: Any, names: dict[str, int]) -> I64:
