@@ -1,4 +1,4 @@
-"""Name a process so that another can tell whether it still runs, and end workers with the process that started them."""
+"""Name a process so that another can tell whether it still runs; end workers with the process that started them; this one's memory."""
 
 from __future__ import annotations
 
@@ -118,3 +118,10 @@ def end_with_parent() -> None:
         os._exit(ORPHANED)
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+
+def resident_mb(key: str) -> float | None:
+    """Return an entry of ``/proc/self/status`` in 1e6 bytes, None where the system has no such file."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((float(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(f"{key}:")), None)

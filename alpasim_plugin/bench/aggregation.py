@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -18,8 +16,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import evaluators.video.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
-from alpasim_plugin.processes import end_with_parent
-from evaluators.aggregate.summary import aggregate
+from alpasim_plugin.processes import end_with_parent, resident_mb
+from evaluators.aggregate.columns import RolloutTable
+from evaluators.aggregate.summary import aggregate, aggregate_sides
 from evaluators.metrics import METRICS
 
 RENDERERS = ("clean", "3dgs")
@@ -28,14 +27,15 @@ FAILED, INVALID = 0.01, 0.02  # shares of rollouts that failed, and of values th
 
 @dataclass(frozen=True)
 class TableRow:
-    """One aggregation, in a process of its own, from a ``rollouts.parquet``; CPU seconds."""
+    """One aggregation, in a process of its own, from a ``rollouts.parquet``, in columns as a run does it; CPU seconds."""
 
     rollouts: int
     scenes: int
     metrics: int
     read_s: float
     aggregate_s: float
-    peak_mb: float  # of the whole process, interpreter and libraries included
+    rows_s: float  # the same from rows in memory, the readable reference, in the same process afterwards
+    peak_mb: float | None  # of the whole process before that, interpreter and libraries included
     mean_error: float  # largest difference of a mean from an exactly rounded sum over the same cells, relative to the metric's spread
     count_errors: int  # entries whose number of rollouts differs from a plain count
 
@@ -46,9 +46,9 @@ def bench_table(rollouts: int = 100_000, scenes: int = 1_000) -> TableRow:
         path = Path(folder) / "rollouts.parquet"
         write_random_table(path, rollouts, scenes)
         with multiprocessing.get_context("spawn").Pool(1, end_with_parent) as pool:
-            read_s, aggregate_s, peak_mb, found = pool.apply(_measured, (path,))
+            read_s, aggregate_s, rows_s, peak_mb, found = pool.apply(_measured, (path,))
         mean_error, count_errors = compared(found, path)
-    return TableRow(rollouts, scenes, len(METRICS), read_s, aggregate_s, peak_mb, mean_error, count_errors)
+    return TableRow(rollouts, scenes, len(METRICS), read_s, aggregate_s, rows_s, peak_mb, mean_error, count_errors)
 
 
 def write_random_table(path: Path, rollouts: int, scenes: int) -> None:
@@ -70,14 +70,15 @@ def write_random_table(path: Path, rollouts: int, scenes: int) -> None:
     pq.write_table(pa.table(columns), path, compression="zstd")
 
 
-def _measured(path: Path) -> tuple[float, float, float, dict[str, dict[str, dict[str, Any]]]]:
+def _measured(path: Path) -> tuple[float, float, float, float | None, dict[str, dict[str, dict[str, Any]]]]:
     began = time.process_time()
-    rows = pq.read_table(path).to_pylist()
+    table = RolloutTable.of_files([path])
     read = time.process_time()
-    found = aggregate(rows)
+    found = aggregate_sides(table.sides(table.policies[0]), table.metrics)
     done = time.process_time()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
-    return read - began, done - read, peak, found
+    peak = resident_mb("VmHWM")
+    aggregate(pq.read_table(path).to_pylist())
+    return read - began, done - read, time.process_time() - done, peak, found
 
 
 def compared(found: Mapping[str, Mapping[str, Mapping[str, Any]]], path: Path) -> tuple[float, int]:

@@ -7,34 +7,31 @@ Scene differences come from the model of `interval_study` (rates), or from distr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import special
 
 from alpasim_plugin.bench.interval_study import RATES, SHARED_NOISE, Design, pairs
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
 from evaluators.aggregate.power import scenes_needed
-from evaluators.sequential import asymptotic, betting, line
-from evaluators.sequential.asymptotic import FIRST_LOOK
+from evaluators.sequential import asymptotic, betting
 from evaluators.sequential.control import predictions
 from evaluators.sequential.differences import SceneDifferences
 from evaluators.sequential.draws import Draws, independent, without_replacement
 from evaluators.sequential.multiplicity import closed
 from evaluators.sequential.plan import Plan
 from evaluators.sequential.seeds import next_seeds
+from evaluators.sequential.strata import Strata, stratified
 
 ALPHA = 0.05
 GAP = RATES[0] - RATES[1]  # the difference of docs/experiments/interval-coverage.md
 LOOK_EVERY = 5
 BLOCK = 250  # runs at a time, so that memory stays small
 NEVER = 1 << 40
-
-FAMILIES = 5
 
 Way = Literal["random", "control", "stratified"]
 Draw = Callable[[int, int, np.random.Generator], F64]  # (runs, scenes, generator) -> differences (runs, scenes)
@@ -231,58 +228,44 @@ def suite_ends(runs: int, size: int, explained: float | None, on_threshold: bool
     return Ends(*(np.concatenate(side) for side in zip(*times, strict=True)))
 
 
-def family_ends(runs: int, size: int, between: float, way: Way, on_threshold: bool) -> Ends:
-    """Return when decisions about finite suites of five families of scenes end; `NEVER` before all scenes are driven.
+def family_ends(runs: int, sizes: Sequence[int], between: float, way: Way, on_threshold: bool, bounded: bool = False) -> Ends:
+    """Return when decisions about finite suites of families of scenes end; `NEVER` before all scenes are driven.
 
     Args:
         runs: Simulated runs, each with a suite of its own.
-        size: Scenes of the suite, a multiple of five, with normal differences of variance 1.
-        between: Share of the variance that is between families.
-        way: ``random`` order; ``control``: random order with the families as control; ``stratified``: one scene of every family, in random
-            order within families, then the next of every family, and so on.
-        on_threshold: The suite's mean is the threshold; otherwise the planned 0.4 below it.
+        sizes: Scenes of each family.
+        between: Share of the variance that is between families; where bounded, of that of a share that worsens.
+        way: ``random`` order; ``control``: random order with the families as control; ``stratified`` order.
+        on_threshold: The suite's mean is the threshold; otherwise the planned distance below it.
+        bounded: Differences are -1, 0 or 1, about a quarter and a tenth of them not 0, and are bet on; otherwise normal with variance 1.
     """
-    distance = 0.4
+    size, distance, bound = sum(sizes), *((0.2, 1.0) if bounded else (0.4, math.inf))
+    family, weight = np.repeat(np.arange(len(sizes)), sizes), np.array(sizes) / size
+    batches = [min(LOOK_EVERY, size - begun) for begun in range(0, size, LOOK_EVERY)]
+    strata = Strata({f"{i:04}": f"{own:02}" for i, own in enumerate(family)}, tuple(batches))
     plan = Plan(distance, size, ALPHA)
-    case = Case("", shape("normal", 0.0), 0.0, distance, False)
-    family = np.tile(np.arange(FAMILIES), size // FAMILIES)  # in blocks of one scene each
     times: list[tuple[I64, I64]] = []
     for run in range(runs):
-        generator = stream(f"families {size} {between} {way} {on_threshold}", run, "decide/study")
-        effect = generator.standard_normal(FAMILIES)
-        x = math.sqrt(between) * ((effect - effect.mean()) / effect.std())[family] + math.sqrt(1.0 - between) * generator.standard_normal(
-            size
-        )
-        x = x - x.mean() + (0.0 if on_threshold else -distance)
+        generator = stream(f"families {sizes} {between} {way} {on_threshold} {bounded}", run, "decide/study")
+        effect = generator.standard_normal(len(sizes))
+        effect = effect - weight @ effect
+        effect = math.sqrt(between) * (effect / math.sqrt(weight @ effect**2))[family]
+        if bounded:
+            worse = generator.random(size) < np.clip(0.25 + 0.25 * effect, 0.0, 0.9)
+            x = worse.astype(np.float64) - (generator.random(size) < 0.1)
+        else:
+            x = effect + math.sqrt(1.0 - between) * generator.standard_normal(size)
+        case = Case("", shape("normal", 0.0), float(x.mean()) + (0.0 if on_threshold else distance), distance, bounded)
         if way == "stratified":
-            good, bad = stratified_log_evidence(-x, family, plan), stratified_log_evidence(x, family, plan)
+            order = np.array([int(name) for name in strata.order(generator)])
+            draws = stratified(x[order], -bound, bound, family[order], strata.begins(size), less_means=not bounded)
         else:
             order = generator.permutation(size)
-            known = predictions(x[order], np.eye(FAMILIES)[family[order]]) if way == "control" else (None, None)
-            good, bad = logs(case, without_replacement(x[order], -math.inf, math.inf, size, *known), plan)
+            known = predictions(x[order], np.eye(len(sizes))[family[order]]) if way == "control" else (None, None)
+            draws = without_replacement(x[order], -bound, bound, size, *known)
+        good, bad = logs(case, draws, plan)
         times.append((_when(good[None], plan.log_bar, LOOK_EVERY), _when(bad[None], plan.log_bar, LOOK_EVERY)))
     return Ends(*(np.concatenate(side) for side in zip(*times, strict=True)))
-
-
-def stratified_log_evidence(x: F64, family: I64, plan: Plan) -> F64:
-    """Return the log e-process ``(size,)`` against "the suite's mean is at most 0", of scenes drawn in blocks of one of every family.
-
-    Given the blocks before, the mean of a block is expected to be that of all scenes left, since every family has equally many left. The
-    spread is that within families, with a degree of freedom less for each. Something is said at the ends of blocks only.
-    """
-    size, n = len(x), np.arange(1, len(x) + 1)
-    begin = n - 1 - (n - 1) % FAMILIES  # scenes before the block
-    drawn = np.concatenate([[0.0], np.cumsum(x)])
-    total = np.cumsum(x + drawn[begin] / (size - begin))
-    members = np.cumsum(np.eye(FAMILIES)[family], axis=0)
-    sums = np.cumsum(np.eye(FAMILIES)[family] * x[:, None], axis=0)
-    square = np.cumsum(x * x) - np.sum(sums**2 / np.maximum(members, 1), axis=1)
-    spread = np.sqrt(np.maximum(square, 1e-12) / np.maximum(n - FAMILIES, 1))
-    is_look = (n % FAMILIES == 0) & (n >= FIRST_LOOK)
-    t = total / (spread * np.sqrt(n))
-    z = special.ndtri(special.stdtr(np.maximum(n - FAMILIES, 1), t))
-    w = np.where(is_look, z * np.sqrt(n / plan.horizon), -np.inf)
-    return line.log_evidence(w, n / plan.horizon, plan.slope(spread[FIRST_LOOK - 1 : FIRST_LOOK]), plan.alpha)
 
 
 def hidden_suites(runs: int, share: float, bounded: bool, scenes: int = 300) -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from alpasim_plugin.fixers.onefixer import OneFixer
 from alpasim_plugin.fixers.pipeline import no_clock
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
+from alpasim_plugin.processes import resident_mb
 from alpasim_plugin.types import F32, I64, U8, Bool, Frame
 
 MB = 1e6
@@ -137,10 +137,3 @@ def measure(
             timing.peak_mb = None if peak_mb is None or before_mb is None else peak_mb - before_mb
     timing.images, timing.guarded = np.stack(images), np.array(guarded)
     return timing
-
-
-def resident_mb(key: str) -> float | None:
-    """Return an entry of ``/proc/self/status`` in 1e6 bytes, None where the system has no such file."""
-    status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    return next((float(line.split()[1]) * 1024 / MB for line in lines if line.startswith(f"{key}:")), None)

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from alpasim_plugin.bench.fixer_rows import SCENE, BenchOptions, Case, Row, difference, in_own_process, p50_p95
-from alpasim_plugin.bench.fixer_speed import MB, Clip, Timing, resident_mb
+from alpasim_plugin.bench.fixer_speed import MB, Clip, Timing
 from alpasim_plugin.errors import SimrunError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.processes import resident_mb
 from alpasim_plugin.types import U8
 
 CASES = (

@@ -18,8 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import pyarrow.parquet as pq
-
 from alpasim_plugin.bench.aggregation import write_random_table
 from alpasim_plugin.bench.evaluators import PAPER, busy_road
 from alpasim_plugin.bench.raster import SKY, driving_camera, driving_like_scene
@@ -28,7 +26,8 @@ from alpasim_plugin.gaussians.raster import rasterize_cpu
 from alpasim_plugin.gaussians.raster.prepared import prepare
 from alpasim_plugin.runtime.cell import run_cell
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from evaluators.aggregate.summary import aggregate
+from evaluators.aggregate.columns import RolloutTable
+from evaluators.aggregate.overall import numbers
 from evaluators.base import score
 from scenarios.suite import expand
 
@@ -166,7 +165,7 @@ def _evaluators(_: Path) -> Callable[[], object]:
 def _aggregation(folder: Path) -> Callable[[], object]:
     path = folder / "rollouts.parquet"
     write_random_table(path, 20_000, 1_000)
-    return lambda: aggregate(pq.read_table(path).to_pylist())
+    return lambda: numbers(RolloutTable.of_files([path]))
 
 
 _MAKERS: dict[Part, Callable[[Path], Callable[[], object]]] = {

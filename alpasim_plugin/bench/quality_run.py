@@ -174,7 +174,8 @@ class QualityRun:
             "input": self.given, "frames": self.frames, "seed": self.seed, "device": self.device, "jobs": self.jobs,
             "threads": self.used_threads,
             "fixers": {variant.label: variant.spec and variant.spec.as_dict() for variant in self.variants},
-            "networks": dict(self.networks), "units": {variant.label: unit_of(variant) for variant in self.variants}, "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
+            "units": {variant.label: unit_of(variant) for variant in self.variants}, "networks": dict(self.networks),
+            "load": os.getloadavg()[0], "hardware": hardware(), "versions": versions(),
         }  # fmt: skip
 
 

@@ -64,7 +64,7 @@ HEADS = (
 )
 
 
-TABLE_HEADS = ("rollouts", "scenes", "metrics", "read s", "aggregate s", "peak MB", "mean error", "wrong counts")
+TABLE_HEADS = ("rollouts", "scenes", "metrics", "read s", "aggregate s", "by rows s", "peak MB", "mean error", "wrong counts")
 
 
 def _print(heads: tuple[str, ...], lines: list[list[str]], markdown: bool) -> None:

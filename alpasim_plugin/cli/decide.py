@@ -19,6 +19,7 @@ from alpasim_plugin.cli.deciding import (
     print_end,
     questions_of,
     questions_of_gate,
+    side_of_baseline,
 )
 from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.report import report_line
@@ -39,9 +40,13 @@ Examples:
 
 - `simrun decide --renderer clean,onefixer --metric lateral_distance_m=0.1,progress=0.05 suites/all --budget 200`
 
+- `simrun decide --renderer clean,3dgs --population suite --order stratified suites/all`: about the mean of this suite, family by family
+
 - `simrun decide --renderer 3dgs,onefixer --ask better --metric lateral_distance_m=0.05 suites/all`: at least 5 cm better?
 
 - `simrun decide --renderer clean,3dgs --population suite --control family --control runs/last-week suites/all`
+
+- `simrun decide --renderer 3dgs --baseline-file runs/last-week suites/all`: drives the change alone, against the same renderer last week
 
 - `simrun decide --renderer clean,3dgs --executor ray --look-every 50 --store s3://bucket/night suites/all`: 100 rollouts at a time
 
@@ -52,7 +57,10 @@ Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or 
 
 def decide(
     scenarios: Annotated[list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")],
-    renderer: Annotated[str, typer.Option("--renderer", help="Two renderers, comma-separated: the baseline and the one in question.")],
+    renderer: Annotated[
+        str,
+        typer.Option("--renderer", help="Baseline and renderer in question, comma-separated; with --baseline-file the latter alone."),
+    ],
     policy: Annotated[str, typer.Option("--policy", help="The policy, as for `simrun run`.")] = "lane-camera",
     metric: Annotated[
         list[str] | None,
@@ -77,7 +85,11 @@ def decide(
         list[str] | None,
         typer.Option("--control", metavar="family|RUN", help="With --population suite: take out known variance. Repeatable."),
     ] = None,
-    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Key of the random order of scenes.")] = 0,
+    order: Annotated[
+        Literal["random", "stratified"],
+        typer.Option("--order", help="With --population suite, stratified: between looks every family of scenes in proportion."),
+    ] = "random",
+    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Key of the order of scenes.")] = 0,
     look_every: Annotated[int, typer.Option("--look-every", min=1, help="Scenes between looks.")] = 5,
     first_look: Annotated[
         int, typer.Option("--first-look", min=5, help="Scenes before the first look of asymptotic metrics.")
@@ -91,7 +103,13 @@ def decide(
         float, typer.Option("--scene-cost", min=0.0, help="What a new scene costs (a reconstruction, say), in pairs of rollouts.")
     ] = 0.0,
     max_missing: Annotated[float, typer.Option("--max-missing", min=0.0, max=0.99, help="Share of pairs that may lack a value.")] = 0.0,
-    baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first.")] = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option("--baseline", help="Renderer to compare against; by default the first, or with --baseline-file the one in question."),
+    ] = None,
+    baseline_file: Annotated[
+        Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline, or this earlier run.")
+    ] = None,
     preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on them.")] = None,
@@ -123,16 +141,18 @@ def decide(
         raise InputError(DOING, f"--ask {ask}" if ask != "non-inferior" else "--expect", "no metric is named", "name it with --metric")
     asked = questions_of(metric, ask, expect, method) if metric else questions_of_gate(spec)  # type: ignore[arg-type]
     least = min_scenes or (spec.min_scenes if spec is not None else 2)
-    question = Question(asked, alpha, population_of(population, max_missing), first_look, least)
+    question = Question(asked, alpha, population_of(population, max_missing, f"--max-missing {max_missing:g}"), first_look, least)
     is_auto = seeds.startswith(AUTO)
     if is_auto and population == "suite":
         raise InputError(DOING, f"--seeds {seeds}", "the suite's mean is over the same seeds in every scene", "give a number of seeds")
-    design = Design(order_seed, look_every, budget, is_auto, scene_cost, max_missing=max_missing)
+    design = Design(order, order_seed, look_every, budget, is_auto, scene_cost, max_missing=max_missing)
     of_scene, of_fixer = split_overrides(overrides or ())
     options = RunOptions(preset, images, "none", device, baseline, of_fixer)
-    plan = plan_of(What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene))
+    what = What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene)
+    plan = plan_of(what, stored=baseline_file is not None)
+    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, baseline, max_missing)
     decided = decide_into(
-        plan, question, design, controls_of(control or (), plan, question), out, quiet or as_json,
+        plan, question, design, controls_of(control or (), plan, question, order, stored), out, quiet or as_json, stored,
         workers=workers, certificate=certify, report=report, wait=wait, limit_s=time_limit, executor=where, store=store,
     )  # fmt: skip
     if as_json:

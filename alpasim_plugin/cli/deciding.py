@@ -20,7 +20,7 @@ from evaluators.report.run_folder import read_run
 from evaluators.sequential import control
 from evaluators.sequential.control import Control
 from evaluators.sequential.decision import State
-from evaluators.sequential.question import Method, MetricQuestion, Population, Question, metric_question
+from evaluators.sequential.question import Method, MetricQuestion, Order, Population, Question, metric_question
 from scenarios.suite import ScenarioRef, expand
 
 DOING = "planning a decision"
@@ -98,8 +98,14 @@ def _refs(what: What) -> list[ScenarioRef]:
     return [ref for item in what.scenarios for ref in expand(item, what.overrides)]
 
 
-def side_of_baseline(path: Path, plan: RunPlan, spec: GateSpec) -> StoredSide:
+def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missing: float) -> StoredSide:
     """Read a stored baseline, or an earlier run's folder, and check it against what is about to be driven.
+
+    Args:
+        path: The baseline's file or folder.
+        plan: What may be driven, of one renderer.
+        baseline: Renderer whose rollouts are taken; None: the one that is driven.
+        max_missing: Share of the plan's scenes and seeds that it may lack.
 
     Raises:
         InputError: It was made with another preset, other weights or other scenes, or lacks rollouts that may be driven.
@@ -108,7 +114,7 @@ def side_of_baseline(path: Path, plan: RunPlan, spec: GateSpec) -> StoredSide:
     weights = {file: sha for part in plan.parts for file, sha in part.files.items()}
     check_made_alike(stored, plan.options.preset, {name: one.content_hash for name, one in plan.scenarios.items()}, weights, path)
     planned = {(cell.scene, cell.seed) for cell in plan.cells}
-    return stored_side(stored.rows, spec.baseline or plan.renderers[0].name, plan.policies[0].name, planned, spec.max_missing, path)
+    return stored_side(stored.rows, baseline or plan.renderers[0].name, plan.policies[0].name, planned, max_missing, path)
 
 
 def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None) -> tuple[MetricQuestion, ...]:
@@ -148,19 +154,31 @@ def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
     return found
 
 
-def controls_of(texts: Sequence[str], plan: RunPlan, question: Question) -> dict[str, Control]:
+def controls_of(
+    texts: Sequence[str], plan: RunPlan, question: Question, order: Order, stored: StoredSide | None = None
+) -> dict[str, Control]:
     """Read ``--control``: ``family``, or run folders.
 
+    Args:
+        texts: What was given.
+        plan: What may be driven.
+        question: What is to be decided.
+        order: Of the scenes.
+        stored: The baseline's side, where it was driven earlier.
+
     Raises:
-        InputError: Controls for the population ``scenes``, or one that cannot be had.
+        InputError: Controls for the population ``scenes``, families that the order takes out already, or one that cannot be had.
     """
     if not texts:
         return {}
     if question.population != "suite":
         found = "the mean of a control over a population of scenes is not known"
         raise InputError(DOING, f"--control {texts[0]}", found, "ask about the suite itself with --population suite, or leave it out")
-    scenes, baseline = list(plan.scenarios), str(plan.options.baseline)
-    candidate = next(spec.name for spec in plan.renderers if spec.name != baseline)
+    if "family" in texts and order == "stratified":
+        found = "with --order stratified, families are taken out by the order"
+        raise InputError(DOING, "--control family", found, "leave out one of the two")
+    scenes, baseline = list(plan.scenarios), str(plan.options.baseline) if stored is None else stored.renderer
+    candidate = next(spec.name for spec in plan.renderers if stored is not None or spec.name != baseline)
     paths = {cell.scene: cell.ref.path for cell in plan.cells}
     out: dict[str, Control] = {}
     for text in texts:
@@ -210,15 +228,20 @@ def decide_into(
         raise
 
 
-def population_of(text: Population, max_missing: float) -> Population:
+def population_of(text: Population, max_missing: float, allowed_by: str) -> Population:
     """Check that a suite is asked about only where all its scenes count.
+
+    Args:
+        text: Which population.
+        max_missing: Share of pairs that may lack.
+        allowed_by: What says so, for the error.
 
     Raises:
         InputError: Pairs may be missing.
     """
     if text == "suite" and max_missing > 0.0:
         found = "scenes without a pair would be left out of the suite that is asked about"
-        raise InputError(DOING, f"--max-missing {max_missing:g}", found, "leave it out, or ask with --population scenes")
+        raise InputError(DOING, allowed_by, found, "leave it out, or ask with --population scenes")
     return text
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from alpasim_plugin.cli.deciding import What, decide_into, plan_of, print_end, questions_of_gate, side_of_baseline
+from alpasim_plugin.cli.deciding import What, decide_into, plan_of, population_of, print_end, questions_of_gate, side_of_baseline
 from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.progress import make_progress, warn
 from alpasim_plugin.cli.run import parse_seeds
@@ -21,10 +21,20 @@ from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
-from evaluators.gate import GateVerdict, check_matches, judge, judge_decided, load_gate, read_baseline, rows_of_run, write_baseline
+from evaluators.gate import (
+    GateVerdict,
+    check_matches,
+    judge_decided,
+    judge_table,
+    load_gate,
+    read_baseline,
+    rows_of_run,
+    table_of_run,
+    write_baseline,
+)
 from evaluators.report.gate import write_gate_files
 from evaluators.report.run_folder import read_run
-from evaluators.sequential.question import Question
+from evaluators.sequential.question import Population, Question
 from evaluators.sequential.record import stopping_note
 
 EPILOG = """
@@ -63,6 +73,13 @@ def gate(
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Until decided: frames in rollout.asl.")] = "jpeg",
     overrides: Annotated[list[str] | None, typer.Option("--set", help="Until decided: override a scenario key.")] = None,
     alpha: Annotated[float, typer.Option("--alpha", min=1e-6, max=0.5, help="Until decided: chance of a wrong decision.")] = 0.05,
+    population: Annotated[
+        Literal["scenes", "suite"],
+        typer.Option("--population", help="Until decided: the population that the scenes were drawn from, or the suite itself."),
+    ] = "scenes",
+    order: Annotated[
+        Literal["random", "stratified"], typer.Option("--order", help="Until decided: the order of scenes, as for `simrun decide`.")
+    ] = "random",
     order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Until decided: key of the order of scenes.")] = 0,
     budget: Annotated[int | None, typer.Option("--budget", min=2, help="Until decided: most rollouts.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Where gate.md and gate.junit.xml go; by default the run folder.")] = None,
@@ -105,8 +122,8 @@ def gate(
             )
         what = What(scenes, renderer, policy, parse_seeds(seeds), RunOptions(images=images), tuple(overrides or ()))
         how = {"workers": workers, "executor": where, "store": store}
-        design = Design(order_seed, budget=budget)
-        raise typer.Exit(_until_decided(run, gate_file, what, alpha, design, baseline_file, out, as_json, how))
+        design = Design(order, order_seed, budget=budget)
+        raise typer.Exit(_until_decided(run, gate_file, what, alpha, population, design, baseline_file, out, as_json, how))
     use_run(run, warn)
     found = read_run(run)
     if approve is not None:
@@ -124,7 +141,7 @@ def gate(
     if baseline_file is not None:
         stored = read_baseline(baseline_file)
         check_matches(stored, found, baseline_file)
-    verdict = judge(rows_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""))
+    verdict = judge_table(table_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""))
     files = write_gate_files(verdict, source, found, out or run)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "files": [str(path) for path in files]}))
@@ -138,6 +155,7 @@ def _until_decided(
     gate_file: str,
     what: What,
     alpha: float,
+    population: Population,
     design: Design,
     baseline_file: Path | None,
     out: Path | None,
@@ -148,8 +166,9 @@ def _until_decided(
     spec, source = load_gate(gate_file)
     options = replace(what.options, preset=spec.preset or what.options.preset, baseline=spec.baseline)
     plan = plan_of(replace(what, options=options), stored=baseline_file is not None)
-    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec)
-    question = Question(questions_of_gate(spec), alpha, min_scenes=spec.min_scenes)
+    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec.baseline, spec.max_missing)
+    population = population_of(population, spec.max_missing, f"max_missing {spec.max_missing:g} of {source}")
+    question = Question(questions_of_gate(spec), alpha, population, min_scenes=spec.min_scenes)
     design = replace(design, max_failed=spec.max_failed, max_missing=spec.max_missing)
     decided = decide_into(plan, question, design, {}, run, as_json, stored, **how)
     found = read_run(run)

@@ -2,19 +2,20 @@
 
 Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor multiplies matrices of it, about as
 fast where it only converts, and several times slower where it is emulated; and a second thread that shares a core may cost more than it
-brings.
+brings. Within a run each node is asked once, for all of its workers (`alpasim_plugin.measured`).
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from alpasim_plugin.measured import measured
 
 REPEATS = 5
 LONG_ENOUGH_S = 0.1  # no further turn after this: what takes so long has lost
@@ -51,9 +52,12 @@ class Threads:
         return {"number": self.number, "why": self.why, "ms": {str(n): round(ms, 3) for n, ms in self.ms.items()}}
 
 
-@cache
 def probe_precision() -> Probe:
-    """Time the convolution in float32 and bfloat16 with torch's present number of threads; the machine is asked once per process."""
+    """Time the convolution in float32 and bfloat16 with torch's present number of threads, unless the run has done so on this node."""
+    return Probe(**measured("precision", lambda: asdict(_time_precisions())))
+
+
+def _time_precisions() -> Probe:
     exact = _convolve(*_operands(torch.float64))
     operands = {dtype: _operands(dtype) for dtype in (torch.float32, torch.bfloat16)}
     ms = dict.fromkeys(operands, float("inf"))
@@ -69,9 +73,8 @@ def probe_precision() -> Probe:
     return Probe(ms[torch.float32], ms[torch.bfloat16], error[torch.float32], error[torch.bfloat16])
 
 
-@cache
 def choose_threads(most: int) -> Threads:
-    """Return the number of torch threads that pays, at most ``most``; the machine is asked once per process.
+    """Return the number of torch threads that pays, at most ``most``, as it was found on this node by the run's first process.
 
     One thread is taken unless all of them together are faster by a tenth. Torch's own setting is as before afterwards.
 
@@ -81,6 +84,11 @@ def choose_threads(most: int) -> Threads:
     """
     if most == 1:
         return Threads(1, "one is all there is", {})
+    found = measured(f"threads-{most}", lambda: _time_threads(most).as_dict())
+    return Threads(found["number"], found["why"], {int(n): ms for n, ms in found["ms"].items()})
+
+
+def _time_threads(most: int) -> Threads:
     pair, before = _operands(torch.float32), torch.get_num_threads()
     ms = {1: float("inf"), most: float("inf")}
     began = time.perf_counter()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -41,9 +40,8 @@ class Choice:
         return out
 
 
-@cache
 def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu") -> Choice:
-    """Return the precision of convolutions that pays on this machine; the machine is asked once per process.
+    """Return the precision of convolutions that pays on this machine.
 
     ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at most two thirds of the time that it takes
     in float32 (`alpasim_plugin.nets.machine_probe`). Where bfloat16 is emulated it takes several times as long.

@@ -73,8 +73,8 @@ def _is(type_: Any, kind: Kind) -> bool:
     return bool(t.is_boolean(type_))
 
 
-def check_parquet(path: Path | str, doing: str, columns: Mapping[str, Kind], do_this: str = FETCH_AGAIN) -> None:
-    """Check the header of a parquet file that is read in parts later; see `read_parquet` for what is refused."""
+def check_parquet(path: Path | str, doing: str, columns: Mapping[str, Kind], do_this: str = FETCH_AGAIN) -> list[str]:
+    """Check the header of a parquet file that is read in parts later, and return its columns; see `read_parquet` for what is refused."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -84,6 +84,7 @@ def check_parquet(path: Path | str, doing: str, columns: Mapping[str, Kind], do_
         empty = pq.read_schema(str(path)).empty_table()
     assert isinstance(empty, pa.Table)
     check_columns(empty, columns, path, doing, do_this)
+    return list(empty.column_names)
 
 
 def _read(source: Any, where: Path | str, doing: str, columns: Mapping[str, Kind] | None, do_this: str, only: bool) -> Any:

@@ -1,4 +1,4 @@
-"""Drive scenes in random order until a question is decided, into an ordinary run folder.
+"""Drive scenes in random or stratified order until a question is decided, into an ordinary run folder.
 
 Scenes are driven in batches. After each, the state follows from the scenes so far and their order alone (`evaluators.sequential`), and so
 does what is driven next: never from workers, times or interruptions. The same command therefore reaches the same decision after any kill.
@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.child import end_children
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import digest
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.contents import find_contents, read_run_json, write_run_json
@@ -31,11 +33,13 @@ from evaluators.gate.stored import StoredSide
 from evaluators.sequential.control import Control, adjusted_draws
 from evaluators.sequential.decision import State, outcome_of, state_after
 from evaluators.sequential.differences import SceneDifferences, scene_differences
-from evaluators.sequential.question import OPPOSITE, Question
+from evaluators.sequential.question import OPPOSITE, Order, Question
 from evaluators.sequential.record import SCHEMA_VERSION, Decision, look_as_dict, question_as_dict, write_decision
 from evaluators.sequential.seeds import next_seeds
+from evaluators.sequential.strata import Strata, families_of
 
 KIND = "decide"  # of run.json
+DOING = "planning a decision"
 
 
 class DecisionProgress(Progress, Protocol):
@@ -51,7 +55,8 @@ class Design:
     """How scenes are drawn.
 
     Attributes:
-        order_seed: Key of the random order.
+        order: ``random``, or ``stratified``: every batch holds the families of scenes in proportion (`evaluators.sequential.strata`).
+        order_seed: Key of the order.
         look_every: Scenes between looks.
         budget: Most rollouts; None: as many as the plan has.
         auto_seeds: Choose the seeds of a scene by cost against variance; otherwise all of the plan are driven.
@@ -60,6 +65,7 @@ class Design:
         max_missing: Share of pairs of a metric that may lack.
     """
 
+    order: Order = "random"
     order_seed: int = 0
     look_every: int = 5
     budget: int | None = None
@@ -89,6 +95,27 @@ def drawing_order(scenes: Sequence[str], order_seed: int) -> list[str]:
     """Return scenes in random order; it depends on their names and the seed, not on how they were listed."""
     names = sorted(scenes)
     return [names[i] for i in stream("decide", order_seed, "decide/order").permutation(len(names))]
+
+
+def strata_of(plan: RunPlan, question: Question, design: Design, most: int) -> Strata | None:
+    """Return families and batches of a stratified order, None for a random one.
+
+    Args:
+        plan: All cells that may be driven.
+        question: What is to be decided.
+        design: How scenes are drawn.
+        most: Scenes that can be driven: a batch ends there.
+
+    Raises:
+        InputError: The guarantee would not hold, or there is only one family.
+    """
+    if design.order == "random":
+        return None
+    if question.population != "suite":
+        found = "the shares of families in a population of scenes are not known"
+        raise InputError(DOING, f"--order {design.order}", found, "ask about the suite itself with --population suite, or leave it out")
+    sizes = [min(design.look_every, most - begun) for begun in range(0, most, design.look_every)]
+    return Strata(families_of({cell.scene: cell.ref.path for cell in plan.cells}, f"--order {design.order}"), tuple(sizes))
 
 
 def execute_decision(
@@ -129,7 +156,7 @@ def execute_decision(
         executor, store: As for a run; the decision does not depend on them.
 
     Raises:
-        InputError: The folder holds another run.
+        InputError: The folder holds another run, or the question cannot be asked in this order of scenes.
         InfrastructureError: Another process writes the folder.
     """
     drawing = _Drawing(plan, question, design, controls, stored)
@@ -182,9 +209,16 @@ class _Drawing:
         names = [spec.name for spec in plan.renderers]
         self.baseline = stored.name if stored is not None else plan.options.baseline or names[0]
         (self.candidate,) = (name for name in names if stored is not None or name != self.baseline)
-        self.order = drawing_order(list(plan.scenarios), design.order_seed)
         self.per_seed = len(plan.renderers)
         self.ceiling = min(design.budget or len(plan.cells), len(plan.cells))
+        seeds = 1 if design.auto_seeds else len(plan.seeds)
+        self.horizon = max(1, min(len(plan.scenarios), self.ceiling // (self.per_seed * seeds)))
+        self.strata = strata_of(plan, question, design, self.horizon)
+        self.order = (
+            drawing_order(list(plan.scenarios), design.order_seed)
+            if self.strata is None
+            else self.strata.order(stream("decide", design.order_seed, "decide/strata"))
+        )
         self._of_scene: dict[str, list[Cell]] = {}
         for cell in plan.cells:
             self._of_scene.setdefault(cell.scene, []).append(cell)
@@ -241,8 +275,8 @@ class _Drawing:
             self.differences[one.metric] = found
             values[one.metric] = found.harm(one.metric)
             if self.question.population == "suite":
-                adjusted[one.metric] = adjusted_draws(values[one.metric], one, self.order, self.controls.get(one.metric))
-        self.state = state_after(self.question, values, self._horizon(), adjusted, len(self.order))
+                adjusted[one.metric] = adjusted_draws(values[one.metric], one, self.order, self.controls.get(one.metric), self.strata)
+        self.state = state_after(self.question, values, self.horizon, adjusted, len(self.order))
         self.looks.append(look_as_dict(self.state, self.rollouts, self._chosen[self.scenes[-1]]))
         self.stopped = self._reason_to_stop()
 
@@ -283,6 +317,8 @@ class _Drawing:
             "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},
             "seeds": {"most": len(self.plan.seeds), "chosen_by": self._seeds_by(), "scene_cost": self.design.scene_cost},
             "controls": {name: one.facts for name, one in self.controls.items()},
+            "drawn": {"order": self.design.order}
+            | ({} if self.strata is None else {"families": dict(Counter(self.strata.family_of.values()))}),
             "order": self.scenes,
             "looks": self.looks,
             "verdict": words.get(outcome.cause, "undecided"),
@@ -300,11 +336,6 @@ class _Drawing:
             lost = ", ".join(f"{self.differences[name].missing} of {name}" for name in self.lacking)
             return f"pairs lack a value: {lost}; more than the share of {self.design.max_missing:g} that is allowed"
         return ""
-
-    def _horizon(self) -> int:
-        """Return the most scenes that can be driven; where seeds are chosen, with one each."""
-        seeds = 1 if self.design.auto_seeds else len(self.plan.seeds)
-        return max(1, min(len(self.order), self.ceiling // (self.per_seed * seeds)))
 
     def _seeds_by(self) -> str:
         return "cost against variance of earlier scenes" if self.design.auto_seeds else "all that were asked for"

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.measured import share_measurements
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runtime.executors.assignment import assignment_as_here
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool
@@ -21,6 +22,7 @@ from alpasim_plugin.runtime.executors.dispatch import dispatch
 from alpasim_plugin.runtime.executors.identity import targets_of
 from alpasim_plugin.runtime.executors.local import run_local
 from alpasim_plugin.runtime.executors.parcel import Parcel, unpack
+from alpasim_plugin.runtime.executors.scratch import measured_folder
 from alpasim_plugin.runtime.kernels import compile_for
 from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
@@ -66,6 +68,7 @@ class HowToRun:
         limit_s: Seconds that one rollout may take; a worker that exceeds them is killed. None: no limit.
         executor: Where rollouts run.
         store: URL of a store in which rollouts are looked up and committed; None: the run folder alone.
+        run: Token by which the processes of the run know each other.
     """
 
     threads: Threads
@@ -75,6 +78,7 @@ class HowToRun:
     retry: bool = False
     executor: Executor = LOCAL
     store: str | None = None
+    run: str = field(default_factory=lambda: os.urandom(8).hex())
 
     @property
     def stated(self) -> dict[str, Any]:
@@ -104,6 +108,7 @@ def execute(
         noticed: Called with one line for each damaged rollout.
         known: Folders of rollouts that were finished once.
     """
+    share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
     shelf = None if how.store is None else Shelf(opened(how.store), plan.options, how.reuse_undigested)
@@ -184,8 +189,14 @@ def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, s
         remedy, state = find_rollout_state(cell, root, reuse_undigested=True)
         return state.manifest if remedy == "none" else None
 
-    for cell, got in run_local(work, todo, how.threads.workers, how.threads.per_worker, how.limit_s, recall):
+    for cell, got in run_local(partial(_of_run, how.run, work), todo, how.threads.workers, how.threads.per_worker, how.limit_s, recall):
         yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
+
+
+def _of_run(run: str, work: Callable[[Cell], dict[str, Any]], cell: Cell) -> dict[str, Any]:
+    """Run a cell in a worker of this machine."""
+    share_measurements(measured_folder(run))
+    return work(cell)
 
 
 def _run_elsewhere(
@@ -196,7 +207,7 @@ def _run_elsewhere(
         return
     from alpasim_plugin.runtime.executors.mission import mission_of  # a run on this machine needs none of it
 
-    mission, contents = mission_of(plan, todo, how.threads.per_worker, how.store, shelf.fresh if shelf else "")
+    mission, contents = mission_of(plan, how.run, todo, how.threads.per_worker, how.store, shelf.fresh if shelf else "")
     most = min(how.threads.workers, len(todo))
     given = assignment_as_here(mission, contents, targets_of(plan.parts), how.executor.resources, most, noticed)
     with opened_pool(how.executor, given, root) as pool:

@@ -34,22 +34,22 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return for each renderer with a fixer what its workers chose by measuring their machine, for ``run.json``.
+    """Return for each renderer with a fixer what was chosen by measuring the machines, for ``run.json``.
 
-    Workers measure by themselves. Equal choices are one entry, with the measurements of the first worker and the number of rollouts; more
-    than one entry says that workers computed differently.
+    One entry for each node (``node``; null: the machine that the command ran on) and choice, with what was measured and the number of
+    rollouts. A node has several entries only where the run was continued, or its processes share no temporary folder.
     """
     out: dict[str, list[dict[str, Any]]] = {}
     for manifest in manifests:
         facts = (manifest.get("fixer") or {}).get("chosen")
         if not facts:
             continue
-        entries = out.setdefault(manifest["renderer"], [])
-        same = [entry for entry in entries if _picked(entry) == _picked(facts)]
+        node, entries = manifest.get("node"), out.setdefault(manifest["renderer"], [])
+        same = [entry for entry in entries if (entry["node"], _picked(entry)) == (node, _picked(facts))]
         if same:
             same[0]["rollouts"] += 1
         else:
-            entries.append({**facts, "rollouts": 1})
+            entries.append({"node": node, **facts, "rollouts": 1})
     return out
 
 

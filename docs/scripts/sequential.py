@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -41,6 +41,7 @@ from alpasim_plugin.bench.interval_study import CORRELATIONS, RATES
 PAGE = Path(__file__).resolve().parents[1] / "experiments" / "sequential.md"
 POWERS = (0.8, 0.9, 0.95)
 LONG = 1000  # scenes of the runs that must not err
+UNEQUAL = [40, 30, 25, 20, 5]
 SHAPES = ("normal", "log-normal difference", "log-normal", "log-normal, other way")
 
 
@@ -151,17 +152,29 @@ def suites(runs: int) -> str:
 
 
 def families(runs: int) -> str:
-    """Return scenes and errors for suites of five families: random order, families as control, and stratified order."""
+    """Return scenes and errors for suites of families: random order, families as control, and stratified order."""
+    return _by_family(
+        runs, {"60, five equal": [12] * 5, "120, five equal": [24] * 5, "120, five unequal": UNEQUAL, "120, twelve": [10] * 12}, False
+    )
+
+
+def family_rates(runs: int) -> str:
+    """Return the same for differences of -1, 0 and 1, which are bet on."""
+    return _by_family(runs, {"120, five equal": [24] * 5, "120, five unequal": UNEQUAL}, True)
+
+
+def _by_family(runs: int, suites_of: Mapping[str, list[int]], bounded: bool) -> str:
     rows = []
-    for size in (60, 120):
+    for label, sizes in suites_of.items():
+        size = sum(sizes)
         for between in (0.0, 0.3, 0.6):
-            cells = [str(size), f"{100 * between:g} %"]
+            cells = [label, f"{100 * between:g} %"]
             for way in get_args(Way):
-                edge, far = (family_ends(runs, size, between, way, on_threshold) for on_threshold in (True, False))
+                edge, far = (family_ends(runs, sizes, between, way, on_threshold, bounded) for on_threshold in (True, False))
                 err = [float(np.mean(side <= size - 1)) for side in (edge.good, edge.bad)]
                 cells += [f"{far.mean_scenes(size):.1f}", " / ".join(map(_percent, err))]
             rows.append(cells)
-    return _markdown(["scenes", "variance between families", *(name for way in get_args(Way) for name in (way, "errors"))], rows)
+    return _markdown(["scenes, families", "variance between", *(name for way in get_args(Way) for name in (way, "errors"))], rows)
 
 
 def hidden(runs: int) -> str:
@@ -222,6 +235,7 @@ MAKERS: dict[str, Callable[[int], str]] = {
     "rollouts": rollouts,
     "suites": suites,
     "families": families,
+    "family-rates": family_rates,
     "seeds": seeds,
 }
 

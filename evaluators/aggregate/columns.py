@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,21 +34,30 @@ KEPT_BYTES = 512 << 20  # metrics held in memory
 BATCH_ROWS = 1 << 17
 
 
+Reasons = Callable[[str, str], str]  # (renderer, metric)
+
+
+def _unknown(renderer: str, metric: str) -> str:
+    """Know no reason: a table of rollouts alone does not have it."""
+    return ""
+
+
 class RolloutTable:
     """The rollouts of one or several runs.
 
     Args:
         data: Rows with the columns of ``rollouts.parquet``.
         where: What is read, for messages.
+        reasons: Gives for a renderer and metric why values are not valid; empty where nobody knows.
 
     Attributes:
         metrics: Names, in the order of the columns.
-        policies: Names, in order of appearance.
+        renderers, policies: Names, in order of appearance.
         n_rollouts: Rows.
     """
 
-    def __init__(self, data: pads.Dataset, where: str) -> None:
-        self._data, self._where = data, where
+    def __init__(self, data: pads.Dataset, where: str, reasons: Reasons = _unknown) -> None:
+        self._data, self._where, self.reasons = data, where, reasons
         self.metrics = [name.removesuffix(VALID) for name in data.schema.names if name.endswith(VALID)]
         self._kept: dict[str, F64] = {}
         codes: dict[str, list[I64]] = {name: [] for name in ("renderer", "policy", "scene")}
@@ -67,10 +76,12 @@ class RolloutTable:
         self._seed, self._ok = _joined(seeds), np.concatenate(ok) if ok else np.zeros(0, dtype=bool)
         self._failed, self._failure = np.flatnonzero(~self._ok), _joined(failures)
         self.n_rollouts = len(self._ok)
-        self.policies = _in_order(self._policy, self._names["policy"])
+        self.renderers, self.policies = (
+            _in_order(codes, self._names[name]) for name, codes in (("renderer", self._renderer), ("policy", self._policy))
+        )
 
     @classmethod
-    def of_files(cls, paths: Sequence[Path]) -> RolloutTable:
+    def of_files(cls, paths: Sequence[Path], reasons: Reasons = _unknown) -> RolloutTable:
         """Open ``rollouts.parquet`` of one or several runs; a metric that a run lacks is missing in all its rollouts.
 
         Raises:
@@ -83,18 +94,24 @@ class RolloutTable:
             schema = pa.unify_schemas([pq.read_schema(path) for path in paths], promote_options="permissive")
             coded = [pa.field(f.name, pa.dictionary(pa.int32(), pa.string())) if f.name in TEXTS else f for f in schema]
             reader = pads.ParquetFileFormat(dictionary_columns=set(TEXTS) & set(schema.names))
-            return cls(pads.dataset([str(path) for path in paths], schema=pa.schema(coded), format=reader), where)
+            return cls(pads.dataset([str(path) for path in paths], schema=pa.schema(coded), format=reader), where, reasons)
 
     @classmethod
     def of_table(cls, table: pa.Table) -> RolloutTable:
         """Take a table in memory."""
         return cls(pads.dataset(table), "a table of rollouts")
 
-    def sides(self, policy: str) -> dict[str, RendererColumns]:
-        """Return RENDERER -> its rollouts with a policy, in order of appearance."""
+    def sides(self, policy: str, named: str | None = None) -> dict[str, RendererColumns]:
+        """Return RENDERER -> its rollouts with a policy, in order of appearance.
+
+        Args:
+            policy: Its name in the table.
+            named: What cells call it; None: the same.
+        """
         mine = self._policy == self._names["policy"][policy]
         names = _in_order(self._renderer[mine], self._names["renderer"])
-        return {name: self._side(policy, np.flatnonzero(mine & (self._renderer == self._names["renderer"][name]))) for name in names}
+        codes = self._names["renderer"]
+        return {name: self._side(name, named or policy, np.flatnonzero(mine & (self._renderer == codes[name]))) for name in names}
 
     def failures(self) -> dict[str, int]:
         """Return how many rollouts did not run to their end, by failure class."""
@@ -127,7 +144,7 @@ class RolloutTable:
             with parsing(DOING, self._where, AGAIN, "no readable parquet"):
                 yield from self._data.scanner(columns=list(columns), batch_size=BATCH_ROWS).to_batches()
 
-    def _side(self, policy: str, rows: I64) -> RendererColumns:
+    def _side(self, renderer: str, policy: str, rows: I64) -> RendererColumns:
         scene_names = np.array(list(self._names["scene"]), dtype=object)
         present, number = np.unique(self._scene[rows], return_inverse=True)
         order = np.argsort(scene_names[present])
@@ -136,7 +153,7 @@ class RolloutTable:
         seeds, seed = np.unique(self._seed[rows], return_inverse=True)
         keys, cell = np.unique(rank[number.reshape(-1)] * len(seeds) + seed.reshape(-1), return_inverse=True)
         cells = Cells(policy, tuple(scene_names[present][order].tolist()), seeds, keys)
-        return RendererColumns(self, rows, self._ok[rows], cells, cell.reshape(-1), cells.scene)
+        return RendererColumns(self, renderer, rows, self._ok[rows], cells, cell.reshape(-1), cells.scene)
 
 
 @dataclass(frozen=True)
@@ -154,6 +171,15 @@ class Cells(Sequence[Cell]):
     scenes: tuple[str, ...]
     seeds: I64
     keys: I64
+
+    @classmethod
+    def of(cls, cells: Sequence[Cell]) -> Cells:
+        """Return sorted cells of one policy."""
+        policies, scenes, seeds = zip(*cells, strict=True) if cells else ((), (), ())
+        names, own = tuple(sorted(set(scenes))), np.unique(np.array(seeds, dtype=np.int64))
+        place = {name: i for i, name in enumerate(names)}
+        keys = np.array([place[name] for name in scenes], dtype=np.int64) * max(len(own), 1)
+        return cls(policies[0] if policies else "", names, own, keys + np.searchsorted(own, np.array(seeds, dtype=np.int64)))
 
     @property
     def scene(self) -> I64:
@@ -200,10 +226,12 @@ class RendererColumns(Side):
 
     Attributes:
         table: Where they are.
+        renderer: Whose they are.
         rows: ``(R,)`` which rollouts of the table.
     """
 
     table: RolloutTable
+    renderer: str
     rows: I64
     ok: Bool
     cells: Cells
@@ -215,21 +243,19 @@ class RendererColumns(Side):
         return self.table.column(metric)[self.rows]
 
     def place_in(self, other: Side) -> I64:
-        """Return each cell's index in the other side, made of columns too; see `Side.place_in`."""
-        if not isinstance(other, RendererColumns):
-            raise TypeError(f"{type(other).__name__} is not made of columns")
+        """Return each cell's index in the other side; see `Side.place_in`."""
         if id(other) not in self._places:
-            self._places[id(other)] = self.cells.place_in(other.cells)
+            self._places[id(other)] = self.cells.place_in(other.cells if isinstance(other.cells, Cells) else Cells.of(other.cells))
         return self._places[id(other)]
 
     def first_row(self, cell: Cell) -> int | None:
         """Return the first rollout of a cell."""
         at = self.cells.find(cell)
-        return None if at is None else int(np.argmax(self.cell == at))
+        return None if at is None else int(self._first_rows[at])
 
     def reason(self, row: int, metric: str) -> str:
-        """Say that a table of rollouts does not tell why a value is not valid."""
-        return "not given"
+        """Return why a metric of the renderer is not valid; see `RolloutTable.reasons`."""
+        return self.table.reasons(self.renderer, metric) or "not given"
 
     def failure(self, row: int) -> str:
         """Return the failure class of a rollout."""
@@ -238,6 +264,11 @@ class RendererColumns(Side):
     @cached_property
     def _places(self) -> dict[int, I64]:
         return {}
+
+    @cached_property
+    def _first_rows(self) -> I64:
+        """Give the first rollout of each cell ``(C,)``."""
+        return np.asarray(np.unique(self.cell, return_index=True)[1])
 
 
 def _codes(column: Any, names: dict[str, int]) -> I64:

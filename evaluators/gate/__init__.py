@@ -2,8 +2,8 @@
 
 from evaluators.gate.baseline import Baseline, baseline_of, check_made_alike, check_matches, read_baseline, write_baseline
 from evaluators.gate.decided import judge_decided
-from evaluators.gate.judge import Check, GateVerdict, judge
-from evaluators.gate.rows import rows_of_run
+from evaluators.gate.judge import Check, GateVerdict, judge, judge_table
+from evaluators.gate.rows import rows_of_run, table_of_run
 from evaluators.gate.spec import GateSpec, MetricRule, load_gate
 
 __all__ = [
@@ -17,8 +17,10 @@ __all__ = [
     "check_matches",
     "judge",
     "judge_decided",
+    "judge_table",
     "load_gate",
     "read_baseline",
     "rows_of_run",
+    "table_of_run",
     "write_baseline",
 ]

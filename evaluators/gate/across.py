@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from alpasim_plugin.errors import InputError
+from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.paired import LISTED, compare
-from evaluators.aggregate.rows import Row, by_renderer, metric_names
 from evaluators.aggregate.verdict import default_margin
 from evaluators.gate.baseline import check_scenes, scene_hashes
-from evaluators.gate.rows import of_policy, policies_of, rows_of_run
+from evaluators.gate.rows import table_of_run
 from evaluators.report.run_folder import Run
 
 DOING = "comparing runs"
@@ -39,16 +39,16 @@ def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, 
     Raises:
         InputError: Only one renderer, or an unknown baseline.
     """
-    rows = rows_of_run(run)
-    known = list(by_renderer(rows))
+    table = table_of_run(run)
+    known = table.renderers
     name = baseline or (run.info.get("config") or {}).get("baseline") or (known[0] if known else "")
     if name not in known:
         raise InputError(DOING, f"baseline {name!r}", f"{run.folder} does not have it", f"choose one of {', '.join(known) or 'none'}")
     if len(known) < 2:
         raise InputError(DOING, str(run.folder), f"only one renderer, {name}", "name a second run, or run two renderers")
     bases = {one: base for one, base in (run.info.get("bases") or {}).items() if one in known and base in known and name not in (one, base)}
-    found = _pairs(rows, rows, {other: name for other in known if other != name}, "", margins, listed)
-    return Comparison(found, with_base={} if baseline is not None else _pairs(rows, rows, bases, "", margins, listed))
+    found = _pairs(table, table, {other: name for other in known if other != name}, "", margins, listed)
+    return Comparison(found, with_base={} if baseline is not None else _pairs(table, table, bases, "", margins, listed))
 
 
 def compare_runs(
@@ -66,9 +66,9 @@ def compare_runs(
     if presets[0] != presets[1]:
         raise InputError(DOING, both, f"presets {presets[0]!r} and {presets[1]!r}", "give the command of one run again with --preset")
     check_scenes(scene_hashes(first), scene_hashes(second), both, DOING, "run both on the same scene files")
-    rows = rows_of_run(second)
-    base_rows, notes = _align_policies(rows_of_run(first), rows)
-    there, here = list(by_renderer(base_rows)), list(by_renderer(rows))
+    table, base = table_of_run(second), table_of_run(first)
+    partner_of, notes = _align_policies(base.policies, table.policies)
+    there, here = base.renderers, table.renderers
     if baseline is not None and baseline not in there:
         raise InputError(DOING, f"baseline {baseline!r}", f"{first.folder} does not have it", f"choose one of {', '.join(there)}")
     alone = there[0] if len(there) == 1 else None
@@ -77,39 +77,48 @@ def compare_runs(
     if lone:
         raise InputError(DOING, f"renderers {lone} of {second.folder}", f"{first.folder} has {', '.join(there)}", "name one by --baseline")
     chosen = {name: other for name, other in partner.items() if other is not None}
-    return Comparison(_pairs(rows, base_rows, chosen, f"{first.folder}: ", margins, listed), notes)
+    return Comparison(_pairs(table, base, chosen, f"{first.folder}: ", margins, listed, partner_of), notes)
 
 
 def _pairs(
-    rows: Sequence[Row],
-    base_rows: Sequence[Row],
+    table: RolloutTable,
+    base: RolloutTable,
     partner: Mapping[str, str],
     prefix: str,
     margins: Mapping[str, float] | None,
     listed: int,
+    policy_of: Mapping[str, str] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    names = metric_names([*rows, *base_rows])
+    """Compare renderers with their partners, policy by policy.
+
+    Args:
+        table: The rollouts that are compared.
+        base: Those that they are compared with.
+        partner: RENDERER of ``table`` -> renderer of ``base``.
+        prefix: Of the partner's name.
+        margins, listed: As for `compare_runs`.
+        policy_of: POLICY of ``table`` -> policy of ``base``; None: the same.
+    """
     out: dict[str, dict[str, Any]] = {}
-    policies = policies_of(rows)
-    for policy in policies:
-        here, there = by_renderer(of_policy(rows, policy)), by_renderer(of_policy(base_rows, policy))
+    for policy in table.policies:
+        of_base = policy if policy_of is None else policy_of.get(policy)
+        here, there = table.sides(policy), base.sides(of_base, policy) if of_base in base.policies else {}
         for renderer, other in partner.items():
             if renderer in here and other in there:
-                variant = renderer if len(policies) == 1 else f"{renderer}/{policy}"
+                variant = renderer if len(table.policies) == 1 else f"{renderer}/{policy}"
                 out[variant] = {
                     name: compare(
                         here[renderer], there[other], name, prefix + other, (margins or {}).get(name, default_margin(name)), listed
                     )
-                    for name in names
+                    for name in dict.fromkeys([*table.metrics, *base.metrics])
                 }
     return out
 
 
-def _align_policies(base_rows: Sequence[Row], rows: Sequence[Row]) -> tuple[Sequence[Row], tuple[str, ...]]:
-    """Give the first run's only policy the name of the second's only one, where they share none."""
-    there, here = policies_of(base_rows), policies_of(rows)
+def _align_policies(there: Sequence[str], here: Sequence[str]) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return for each of the second run's policies the first's: of the same name, or where they share none its only one."""
     if set(there) & set(here):
-        return base_rows, ()
+        return {policy: policy for policy in here if policy in there}, ()
     if len(there) == len(here) == 1:
-        return [{**row, "policy": here[0]} for row in base_rows], (f"policy {here[0]} is compared with policy {there[0]}",)
+        return {here[0]: there[0]}, (f"policy {here[0]} is compared with policy {there[0]}",)
     raise InputError(DOING, f"policies {there} and {here}", "none in common", "compare runs of one policy each, or of the same policies")

@@ -9,14 +9,16 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.errors import InputError
+from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.rows import RendererRows, Row, by_renderer, failure_of, is_ok
+from evaluators.aggregate.rows import Row, Side, by_renderer, failure_of, is_ok
 from evaluators.gate.rows import of_policy, policies_of
 from evaluators.gate.spec import GateSpec, MetricRule
 from evaluators.metrics import info
 
 Kind = Literal["margin", "limit"]
+Sides = Mapping[str, Side]  # RENDERER -> its rollouts
 
 
 @dataclass(frozen=True)
@@ -65,10 +67,31 @@ def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = No
     Raises:
         InputError: A renderer that the gate names is not there, or nothing is left to judge.
     """
+    return judge_sides(_sides(rows), failures_of(rows), spec, None if stored is None else _sides(stored), stored_name)
+
+
+def judge_table(table: RolloutTable, spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "") -> GateVerdict:
+    """Judge rollouts in columns; see `judge`."""
+    by_class = table.failures()
+    failures = {"n_rollouts": table.n_rollouts, "n_failed": sum(by_class.values()), "by_class": by_class}
+    sides = {policy: table.sides(policy) for policy in table.policies}
+    return judge_sides(sides, failures, spec, None if stored is None else _sides(stored), stored_name)
+
+
+def judge_sides(
+    sides: Mapping[str, Sides], failures: Mapping[str, Any], spec: GateSpec, stored: Mapping[str, Sides] | None, stored_name: str
+) -> GateVerdict:
+    """Judge rollouts that are laid out by cell; see `judge`.
+
+    Args:
+        sides: POLICY -> RENDERER -> its rollouts, in order of appearance.
+        failures: As `failures_of` gives them.
+        spec, stored_name: As for `judge`.
+        stored: The same of a stored baseline.
+    """
     checks: list[Check] = []
-    for policy in policies_of(rows):
-        here = by_renderer(of_policy(rows, policy))
-        there = here if stored is None else by_renderer(of_policy(stored, policy))
+    for policy, here in sides.items():
+        there = here if stored is None else stored.get(policy, {})
         for renderer in _judged(here, spec, stored is not None):
             base = _baseline_name(renderer, here, there, spec, stored is not None)
             for metric, rule in spec.metrics.items():
@@ -77,11 +100,15 @@ def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = No
                     checks.append(_margin(side, there[base], (renderer, policy), base, metric, rule, spec))
                 if rule.max is not None or rule.min is not None:
                     checks.append(_limit(side, (renderer, policy), metric, rule))
-    failures = failures_of(rows)
     found = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
     outcome = worst([outcome_of_failures(failures, spec.max_failed), *found])
-    name = stored_name if stored is not None else f"renderer {spec.baseline or next(iter(by_renderer(rows)))} of the same run"
+    first = next(iter(next(iter(sides.values()))))
+    name = stored_name if stored is not None else f"renderer {spec.baseline or first} of the same run"
     return GateVerdict(outcome, tuple(checks), failures, name)
+
+
+def _sides(rows: Sequence[Row]) -> dict[str, Sides]:
+    return {policy: by_renderer(of_policy(rows, policy)) for policy in policies_of(rows)}
 
 
 def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
@@ -93,7 +120,7 @@ def failures_of(rows: Sequence[Row]) -> dict[str, Any]:
     return {"n_rollouts": len(rows), "n_failed": sum(by_class.values()), "by_class": by_class}
 
 
-def _judged(here: Mapping[str, RendererRows], spec: GateSpec, has_stored: bool) -> list[str]:
+def _judged(here: Sides, spec: GateSpec, has_stored: bool) -> list[str]:
     absent = [name for name in spec.renderers if name not in here]
     if absent:
         raise InputError("judging a run", f"renderers {absent}", "the run has none of these", f"it has {', '.join(here)}")
@@ -111,9 +138,7 @@ def _nothing(base: str) -> list[str]:
     raise InputError("judging a run", f"baseline {base!r}", "the run has no other renderer", "run two renderers, or give --baseline-file")
 
 
-def _baseline_name(
-    renderer: str, here: Mapping[str, RendererRows], there: Mapping[str, RendererRows], spec: GateSpec, has_stored: bool
-) -> str:
+def _baseline_name(renderer: str, here: Sides, there: Sides, spec: GateSpec, has_stored: bool) -> str:
     name = spec.baseline or (renderer if has_stored else next(iter(here)))
     needs = any(rule.margin is not None for rule in spec.metrics.values())
     if needs and name not in there:
@@ -123,9 +148,7 @@ def _baseline_name(
     return name
 
 
-def _margin(
-    side: RendererRows, base: RendererRows, variant: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec
-) -> Check:
+def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec) -> Check:
     entry = compare(side, base, metric, name, rule.margin or 0.0)
     planned = entry["n_cells"] + entry["n_missing"]
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
@@ -139,7 +162,7 @@ def _margin(
     return Check(*variant, metric, "margin", cause, said, entry, rule.must_decide)
 
 
-def _limit(side: RendererRows, variant: tuple[str, str], metric: str, rule: MetricRule) -> Check:
+def _limit(side: Side, variant: tuple[str, str], metric: str, rule: MetricRule) -> Check:
     values = side.values(metric)
     known = values[np.isfinite(values)]
     unit = info(metric).unit

@@ -1,12 +1,22 @@
-"""A run folder as rollout rows, the common form of runs, stored baselines and gates."""
+"""A run folder as columns, for its own numbers, and as rows, for what is stored or joined with other rows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.rows import Row
-from evaluators.report.run_folder import Run
+from evaluators.report.run_folder import ROLLOUTS, Run
+
+
+def table_of_run(run: Run) -> RolloutTable:
+    """Return the rollouts of a run as columns, read from its folder one metric at a time.
+
+    Raises:
+        InputError: ``rollouts.parquet`` cannot be read.
+    """
+    return RolloutTable.of_files([run.folder / ROLLOUTS], lambda renderer, metric: run.invalid_reasons.get((renderer, metric), ""))
 
 
 def rows_of_run(run: Run) -> list[dict[str, Any]]:

@@ -20,10 +20,12 @@ class StoredSide:
     """Rollouts of the baseline that were driven earlier.
 
     Attributes:
+        renderer: Its renderer.
         name: What it is, in words.
         rows: One a rollout, of one renderer and policy.
     """
 
+    renderer: str
     name: str
     rows: tuple[Row, ...]
 
@@ -58,8 +60,13 @@ def stored_side(
         raise InputError(DOING, str(path), f"no rollout of policy {policy}", f"drive one of {', '.join(policies_of(rows))}")
     known = sorted({str(row["renderer"]) for row in mine})
     if renderer not in known:
-        raise InputError(DOING, str(path), f"no rollout of renderer {renderer}", f"set `baseline` of the gate to one of {', '.join(known)}")
-    side = StoredSide(f"{renderer} of {path}", tuple(row for row in mine if row["renderer"] == renderer))
+        raise InputError(
+            DOING,
+            str(path),
+            f"no rollout of renderer {renderer}",
+            f"name one of {', '.join(known)}: `baseline` of a gate, --baseline of decide",
+        )
+    side = StoredSide(renderer, f"{renderer} of {path}", tuple(row for row in mine if row["renderer"] == renderer))
     there = {(str(row["scene"]), int(row["seed"])) for row in side.rows if is_ok(row)}
     lacking = sorted(set(planned) - there)
     if len(lacking) > max_missing * len(planned):

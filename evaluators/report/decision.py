@@ -63,7 +63,9 @@ def guarantee(decision: Decision) -> list[str]:
         "scenes": "about the population that the scenes were drawn from",
         "suite": f"about the mean over the {decision['ceiling']['scenes']} scenes of this suite with these seeds",
     }[asked["population"]]
-    first = f"wrong in at most {100 * asked['alpha']:g} % of runs, over all looks; {of_what}"
+    families = decision.get("drawn", {}).get("families", {})
+    order = f", in stratified order of {len(families)} families" if families else ""
+    first = f"wrong in at most {100 * asked['alpha']:g} % of runs, over all looks; {of_what}{order}"
     kinds: dict[str, list[str]] = {}
     for name, one in asked["metrics"].items():
         kinds.setdefault(one["guarantee"], []).append(name)

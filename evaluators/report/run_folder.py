@@ -6,12 +6,12 @@ The report is a pure reader: it works on a folder that was copied from another m
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 from urllib.parse import quote
 
 import numpy as np
@@ -26,6 +26,7 @@ from evaluators.metrics import declare_from
 from evaluators.report.shapes import RunInfo, SceneFile, Summary
 
 DOING = "reading a run folder"
+ROLLOUTS = "rollouts.parquet"
 AGAIN = "give a folder written by simrun run or simrun score, or write it again with the same command and --resume"
 ROLLOUT_COLUMNS: dict[str, Kind] = {"renderer": "text", "policy": "text", "scene": "text", "seed": "integer", "status": "text"}
 STEP_COLUMNS: dict[str, Kind] = {**ROLLOUT_COLUMNS, "t_us": "integer", "metric": "text", "value": "number", "valid": "flag"}
@@ -73,20 +74,51 @@ class Rollout:
         return any((self.metrics.get(name) or 0.0) >= 0.5 for name in names)
 
 
+class StoredRollouts(Sequence[Rollout]):
+    """The rows of ``rollouts.parquet``, read when the first one is asked for: what only needs columns never makes them.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @cached_property
+    def _rows(self) -> tuple[Rollout, ...]:
+        table = read_parquet(self._path, DOING, ROLLOUT_COLUMNS, AGAIN)
+        with parsing(DOING, self._path, AGAIN, "rows that are none of a run"):
+            return rollouts_of_table(table)[0]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Rollout: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Rollout, ...]: ...
+    def __getitem__(self, index: int | slice) -> Rollout | tuple[Rollout, ...]:
+        return self._rows[index]
+
+    def __iter__(self) -> Iterator[Rollout]:
+        return iter(self._rows)
+
+
 @dataclass(frozen=True)
 class Run:
-    """A run folder in memory, except steps and scenes, which are read on demand.
+    """A run folder; rollouts, steps and scenes are read on demand.
 
     Attributes:
         info: ``run.json``.
         summary: ``summary.json``.
+        rollouts: Rows of ``rollouts.parquet``.
         metric_names: Rollout metrics in the column order of ``rollouts.parquet``.
     """
 
     folder: Path
     info: Mapping[str, Any]
     summary: Mapping[str, Any]
-    rollouts: tuple[Rollout, ...]
+    rollouts: Sequence[Rollout]
     metric_names: tuple[str, ...]
 
     @property
@@ -309,16 +341,18 @@ def read_run(run_dir: Path | str) -> Run:
     info: Mapping[str, Any] = read_json_as(RunInfo, folder / "run.json", DOING, do_this=AGAIN)
     declare_from(info)
     summary: Mapping[str, Any] = read_json_as(Summary, folder / "summary.json", DOING, do_this=AGAIN)
-    path = folder / "rollouts.parquet"
-    table = read_parquet(path, DOING, ROLLOUT_COLUMNS, AGAIN)
-    with parsing(DOING, path, AGAIN, "rows that are none of a run"):
-        rollouts, names = rollouts_of_table(table)
-    return Run(folder, info, summary, rollouts, names)
+    path = folder / ROLLOUTS
+    return Run(folder, info, summary, StoredRollouts(path), metrics_in(check_parquet(path, DOING, ROLLOUT_COLUMNS, AGAIN)))
+
+
+def metrics_in(columns: Sequence[str]) -> tuple[str, ...]:
+    """Return the metrics among the columns of ``rollouts.parquet``: those with a column of validity."""
+    return tuple(name.removesuffix("_valid") for name in columns if name.endswith("_valid"))
 
 
 def rollouts_of_table(table: pa.Table) -> tuple[tuple[Rollout, ...], tuple[str, ...]]:
     """Return the rollouts of a table with the columns of ``rollouts.parquet``, and the names of their metrics."""
-    names = tuple(name.removesuffix("_valid") for name in table.column_names if name.endswith("_valid"))
+    names = metrics_in(table.column_names)
     rows = []
     for row in table.to_pylist():
         metrics = {m: _number(row.get(m)) if row[f"{m}_valid"] else None for m in names}

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.types import F64, Bool
 from evaluators.sequential import line
 from evaluators.sequential.draws import Draws
 from evaluators.sequential.plan import Plan
@@ -32,43 +32,40 @@ def log_evidence(draws: Draws, mean: F64 | float, plan: Plan, first_look: int = 
         first_look: Scenes before the first statement, at least 2.
     """
     n = np.arange(1, draws.n + 1)
-    spread, slope = _scales(draws, plan, first_look)
+    may_say, spread, slope = _looks(draws, plan, first_look)
     total = np.cumsum(draws.x - draws.offset, axis=-1) - np.cumsum(draws.slope, axis=-1) * np.asarray(mean, dtype=np.float64)[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = _normal_of_t(total / (spread * np.sqrt(n)), n)
-    w = np.where(n >= first_look, z * np.sqrt(n / plan.horizon), -np.inf)
+        z = _normal_of_t(total / (spread * np.sqrt(n)), draws.freedom)
+    w = np.where(may_say, z * np.sqrt(n / plan.horizon), -np.inf)
     return line.log_evidence(w, n / plan.horizon, slope, plan.alpha)
 
 
 def lower_bound(draws: Draws, plan: Plan, first_look: int = FIRST_LOOK) -> F64:
     """Return the greatest mean ``(...)`` that the scenes refute as too small, at any look so far; -inf before the first look."""
-    if draws.n < first_look:
+    may_say, spread, slope = _looks(draws, plan, first_look)
+    if not may_say.any():
         return np.full(draws.x.shape[:-1], -np.inf)
     n = np.arange(1, draws.n + 1)
-    spread, slope = _scales(draws, plan, first_look)
     z = (line.height(slope, plan.alpha) + slope * n / plan.horizon) * np.sqrt(plan.horizon / n)
-    lows = (np.cumsum(draws.x - draws.offset, axis=-1) - _t_of_normal(z, n) * spread * np.sqrt(n)) / np.cumsum(draws.slope, axis=-1)
-    return np.asarray(np.where(n >= first_look, lows, -np.inf).max(axis=-1))
+    t = _t_of_normal(z, draws.freedom)
+    lows = (np.cumsum(draws.x - draws.offset, axis=-1) - t * spread * np.sqrt(n)) / np.cumsum(draws.slope, axis=-1)
+    return np.asarray(np.where(may_say, lows, -np.inf).max(axis=-1))
 
 
-def _scales(draws: Draws, plan: Plan, first_look: int) -> tuple[F64, F64]:
-    """Return the standard deviation after every scene ``(..., n)``, and the slope of the line ``(..., 1)``."""
-    n = np.arange(1, draws.n + 1)
-    # About the first value: sums of squares of large values that hardly differ would lose all digits.
-    x = draws.x - draws.x[..., :1]
-    square = np.cumsum(x * x, axis=-1) - np.cumsum(x, axis=-1) ** 2 / n
-    spread = np.sqrt(np.maximum(square, 0.0) / np.maximum(n - 1, 1))
+def _looks(draws: Draws, plan: Plan, first_look: int) -> tuple[Bool, F64, F64]:
+    """Return where something may be said ``(n,)``, the standard deviation there ``(..., n)``, and the slope of the line ``(..., 1)``."""
+    may_say = draws.is_end & (np.arange(1, draws.n + 1) >= first_look) & (draws.freedom >= 1.0)
     floor = LEAST_SPREAD * plan.distance if plan.distance is not None else NO_SPREAD
-    spread = np.maximum(spread, floor)
-    at = min(first_look, draws.n) - 1
-    return spread, plan.slope(spread[..., at : at + 1])
+    spread = np.maximum(draws.spread, floor)
+    at = int(np.argmax(may_say)) if may_say.any() else draws.n - 1
+    return may_say, spread, plan.slope(spread[..., at : at + 1])
 
 
-def _normal_of_t(t: F64, n: I64) -> F64:
-    tail = scipy.special.stdtr(np.maximum(n - 1, 1), -np.abs(t))
+def _normal_of_t(t: F64, freedom: F64) -> F64:
+    tail = scipy.special.stdtr(np.maximum(freedom, 1.0), -np.abs(t))
     return np.asarray(-np.sign(t) * scipy.special.ndtri(tail))
 
 
-def _t_of_normal(z: F64, n: I64) -> F64:
+def _t_of_normal(z: F64, freedom: F64) -> F64:
     tail = scipy.special.ndtr(-np.abs(z))
-    return np.asarray(-np.sign(z) * scipy.special.stdtrit(np.maximum(n - 1, 1), tail))
+    return np.asarray(-np.sign(z) * scipy.special.stdtrit(np.maximum(freedom, 1.0), tail))

@@ -27,7 +27,7 @@ HALVINGS = 32
 
 
 def bet_sizes(draws: Draws, threshold: float, plan: Plan) -> F64:
-    """Return the bet on every scene ``(..., n)``, from the scenes before it.
+    """Return the bet on every scene ``(..., n)``, from the scenes before its batch; it is the same on all scenes of a batch.
 
     The variance is the mean square about the threshold of the scenes so far, and of `PRIOR_SCENES` imagined ones with the standard
     deviation `PRIOR_WIDTH` times the range.
@@ -35,19 +35,21 @@ def bet_sizes(draws: Draws, threshold: float, plan: Plan) -> F64:
     gain = draws.x - draws.offset - draws.slope * threshold
     half_range = 0.5 * (draws.high[..., :1] - draws.low[..., :1])
     imagined = PRIOR_SCENES * (2.0 * PRIOR_WIDTH * half_range) ** 2
-    count = PRIOR_SCENES + np.arange(draws.n)
+    count = PRIOR_SCENES + draws.begin
     square = gain**2
-    variance = (imagined + np.cumsum(square, axis=-1) - square) / count
-    fourth = (imagined * half_range**2 + np.cumsum(square**2, axis=-1) - square**2) / count
-    spread, left = np.sqrt(variance), np.sqrt(np.maximum(plan.horizon - np.arange(draws.n), 1) / plan.horizon)
+    variance = (imagined + (np.cumsum(square, axis=-1) - square)[..., draws.begin]) / count
+    fourth = (imagined * half_range**2 + (np.cumsum(square**2, axis=-1) - square**2)[..., draws.begin]) / count
+    spread, left = np.sqrt(variance), np.sqrt(np.maximum(plan.horizon - draws.begin, 1) / plan.horizon)
     slope, scale = plan.slope(spread) * left, spread * left * math.sqrt(plan.horizon)
     most = _most(gain + draws.low - draws.x)
-    capital = np.zeros(draws.x.shape[:-1])
+    capital, bet = np.zeros(draws.x.shape[:-1]), np.zeros(draws.x.shape[:-1])
     bets = np.empty_like(gain)
     for i in range(draws.n):
-        wanted = relative_slope(capital - plan.log_bar, slope[..., i]) / scale[..., i]
-        bets[..., i] = np.minimum(growing(wanted, fourth[..., i] / variance[..., i]), most[..., i])
-        capital = capital + np.log1p(bets[..., i] * gain[..., i])
+        if draws.begin[i] == i:
+            wanted = relative_slope(capital - plan.log_bar, slope[..., i]) / scale[..., i]
+            bet = np.minimum(growing(wanted, fourth[..., i] / variance[..., i]), most[..., i])
+        bets[..., i] = bet
+        capital = capital + np.log1p(bet * gain[..., i])
     return bets
 
 
@@ -70,7 +72,7 @@ def growing(wanted: F64, tail: F64) -> F64:
 
 
 def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
-    """Return the log of the capital ``(..., n)`` after every scene of one who bets that the mean is above ``mean``.
+    """Return the log of the capital ``(..., n)`` of one who bets that the mean is above ``mean``; -inf (nothing said) within a batch.
 
     It falls with ``mean``, for every course of the values. A mean that is impossible, since all scenes left could not make up for it, has
     an infinite capital against it.
@@ -84,7 +86,7 @@ def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
     lost = gain + draws.low - draws.x
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.where(lost > 0.0, np.inf, np.log1p(np.minimum(sizes, _most(lost)) * gain))
-    return np.asarray(np.cumsum(steps, axis=-1))
+    return np.where(draws.is_end, np.cumsum(steps, axis=-1), -np.inf)
 
 
 def _most(lost: F64) -> F64:

@@ -3,7 +3,8 @@
 For a finite suite the mean of anything known of its scenes is known, over all of them and over those that are left. So a prediction of a
 scene's difference may be taken off, and the mean prediction over the scenes left put back: the expectation given all earlier scenes stays,
 whatever the prediction is worth. Its coefficients come from earlier scenes alone (a control variate with predictable coefficients; families
-as control give what stratified drawing gives, to first order). A poor control costs a little speed, never the guarantee.
+as control give what stratified order gives, `strata.py`, once their means are learnt). A poor control costs a little speed, never the
+guarantee.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import numpy as np
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.parts import digest
-from alpasim_plugin.types import F64
+from alpasim_plugin.types import F64, I64
 from evaluators.aggregate.rows import Row, by_renderer
 from evaluators.sequential.draws import Draws, without_replacement
 from evaluators.sequential.question import MetricQuestion
+from evaluators.sequential.strata import Strata, families_of, stratified
 
 LEAST_SCENES = 5  # before the first coefficient
 RIDGE = 1.0  # scenes' worth of shrinkage of every standardised coefficient
@@ -57,7 +59,7 @@ def join(first: Control, second: Control) -> Control:
 
 
 def of_families(paths: Mapping[str, str]) -> Control:
-    """Return the families of scenes as control: scenes made from one file by seeds, else scenes of one folder.
+    """Return the families of scenes as control (`families_of`).
 
     Args:
         paths: SCENE -> path of its scenario.
@@ -65,12 +67,8 @@ def of_families(paths: Mapping[str, str]) -> Control:
     Raises:
         InputError: There is only one family.
     """
-    by_file = len(set(paths.values())) <= len(paths) / 2
-    family = {scene: path if by_file else PurePath(path).parent.name for scene, path in paths.items()}
+    family = families_of(paths, "--control family")
     names = sorted(set(family.values()))
-    if len(names) < 2:
-        found = f"all {len(paths)} scenes are of one family, {names[0]}"
-        raise InputError(DOING, "--control family", found, "leave it out, or give a suite with scenes of several files or folders")
     short = [PurePath(name).stem for name in names]
     return Control({s: tuple(float(family[s] == name) for name in names) for s in paths}, tuple(f"family {name}" for name in short))
 
@@ -106,41 +104,45 @@ def of_rows(rows: Sequence[Row], metric: str, scenes: Sequence[str], candidate: 
     return Control({s: tuple(values.get(s, middle[name]) for name, values in found.items()) for s in scenes}, tuple(found))
 
 
-def adjusted_draws(values: F64, one: MetricQuestion, order: Sequence[str], control: Control | None) -> Draws:
+def adjusted_draws(values: F64, one: MetricQuestion, order: Sequence[str], control: Control | None, strata: Strata | None = None) -> Draws:
     """Return the draws of a finite suite, less what a control predicts.
 
     Args:
         values: ``(n,)`` differences of the first n scenes, positive is worse; scenes without one are NaN and are left out of the suite.
         one: The question about the metric.
         order: All scenes of the suite in the order of the drawing.
-        control: None: without replacement alone.
+        control: None: nothing is taken off.
+        strata: Of the order; None: it is random.
     """
     low, high = one.harm_bounds
     known = np.isfinite(values)
-    size = len(order) - int(np.sum(~known))
-    x = values[known]
-    if control is None:
-        return without_replacement(x, low, high, size)
+    at = np.flatnonzero(known)
+    begin = np.arange(len(at)) if strata is None else np.searchsorted(at, strata.begins(len(values))[at])
     kept = [scene for i, scene in enumerate(order) if i >= len(values) or known[i]]
-    z = np.array([control.features[scene] for scene in kept])
-    return without_replacement(x, low, high, size, *predictions(x, z))
+    x = values[known]
+    features = None if control is None else np.array([control.features[scene] for scene in kept])
+    removed, reach = (None, None) if features is None else predictions(x, features, begin)
+    if strata is None:
+        return without_replacement(x, low, high, len(kept), removed, reach)
+    return stratified(x, low, high, strata.numbers(kept), begin, removed, reach, less_means=one.method == "asymptotic")
 
 
-def predictions(x: F64, z: F64) -> tuple[F64, F64]:
+def predictions(x: F64, z: F64, begin: I64 | None = None) -> tuple[F64, F64]:
     """Return what is taken off each draw, and its greatest possible size, both ``(n,)``.
 
     Args:
         x: ``(n,)`` differences in the order drawn.
         z: ``(size, q)`` features of all scenes, those drawn first.
+        begin: ``(n,)`` first scenes of the batches, before which all is known; None: every scene is a batch.
     """
     n, size = len(x), len(z)
+    begin = np.arange(n) if begin is None else begin
     z = (z - z.mean(axis=0)) / np.where(np.ptp(z, axis=0) > 0.0, z.std(axis=0), 1.0)
-    coefficients = _coefficients(x, z[:n])
-    left = size - np.arange(n)
-    rest = (z.sum(axis=0) - np.cumsum(z[:n], axis=0) + z[:n]) / left[:, None]  # mean over the scenes left, the one drawn included
+    coefficients = _coefficients(x, z[:n])[begin]
+    rest = (z.sum(axis=0) - np.cumsum(z[:n], axis=0) + z[:n])[begin] / (size - begin)[:, None]  # mean over the scenes left
     removed = np.sum(coefficients * (z[:n] - rest), axis=1)
-    reach = np.array([np.max(np.abs((z[i:] - rest[i]) @ coefficients[i])) for i in range(n)])
-    return removed, reach
+    reach = np.array([np.max(np.abs((z[i:] - rest[i]) @ coefficients[i])) for i in np.unique(begin)])
+    return removed, reach[np.unique(begin, return_inverse=True)[1].reshape(-1)]
 
 
 def _coefficients(x: F64, z: F64) -> F64:

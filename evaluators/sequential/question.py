@@ -15,6 +15,7 @@ from evaluators.sequential.asymptotic import FIRST_LOOK
 Asked = Literal["non-inferior", "better"]
 Method = Literal["betting", "asymptotic"]
 Population = Literal["scenes", "suite"]
+Order = Literal["random", "stratified"]
 
 DOING = "asking a question"
 OPPOSITE: dict[str, str] = {"non-inferior": "worse", "better": "not better"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
 from typing_extensions import TypedDict
 
@@ -76,6 +76,7 @@ class Decision(TypedDict):
     ceiling: dict[str, int]  # scenes, rollouts
     seeds: dict[str, Any]  # how many a scene and why
     controls: dict[str, Any]  # what takes out variance, by metric
+    drawn: NotRequired[dict[str, Any]]  # order: random (where absent) or stratified, then the number of scenes of each family
     order: list[str]  # scenes driven, in their order
     looks: list[Look]
     verdict: str

@@ -46,10 +46,16 @@ def test_a_suite_is_decided_sooner_than_its_population_and_a_control_helps():
     assert known < suite < population
 
 
-def test_families_as_control_save_about_what_a_stratified_order_saves():
-    random, control, stratified = (family_ends(40, 60, 0.6, way, on_threshold=False).mean_scenes(60) for way in get_args(Way))
-    assert max(control, stratified) < 0.95 * random
-    assert abs(control - stratified) < 0.15 * random
+@pytest.mark.parametrize("sizes", [(12,) * 5, (20, 15, 12, 10, 3)])
+def test_where_families_differ_the_stratified_order_saves_more_than_the_control(sizes):
+    random, control, stratified = (family_ends(40, sizes, 0.6, way, on_threshold=False).mean_scenes(60) for way in get_args(Way))
+    assert stratified < 0.95 * control < 0.95 * random
+
+
+@pytest.mark.parametrize("bounded", [False, True])
+def test_the_stratified_order_rarely_errs_on_the_threshold(bounded):
+    on_edge = family_ends(100, (20, 15, 12, 10, 3), 0.3, "stratified", True, bounded)
+    assert max((on_edge.good < 60).mean(), (on_edge.bad < 60).mean()) <= 0.11  # three standard errors above 5 %
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 import pytest
 
@@ -17,6 +18,8 @@ from evaluators.aggregate import columns
 from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.overall import numbers
 from evaluators.aggregate.paired import base_pairs
+from evaluators.aggregate.rows import RendererRows
+from evaluators.gate import GateSpec, judge, judge_table
 
 METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacle_m")
 KEYS = ("renderer", "policy", "scene", "seed", "status", "failure_class")
@@ -123,3 +126,41 @@ def test_a_run_without_rollouts_has_no_numbers() -> None:
     table = RolloutTable.of_table(table_of(rows_like_a_run(("a",), ("p",), 1, (0,), 3)).slice(0, 0))
     assert numbers(table) == {"metrics": {}, "paired": {}, "paired_with_base": {}}
     assert table.failures() == {}
+
+
+SPEC = GateSpec.model_validate(
+    {"version": 1, "metrics": {"offroad": {"margin": 0.1}, "lateral_distance_m": {"margin": 0.2, "max": 3.0}, "progress": {"min": 0.9}}}
+)
+
+
+@pytest.mark.parametrize("stored", [None, rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 7, (1, 2, 5), 12)])
+def test_a_gate_judges_columns_as_rows_beside_stored_rows_too(stored):
+    rows = rows_like_a_run(("clean", "3dgs", "onefixer"), ("a", "c"), 6, (0, 1, 2), 11)
+    assert judge_table(RolloutTable.of_table(table_of(rows)), SPEC, stored, "before") == judge(rows, SPEC, stored, "before")
+
+
+def test_a_gate_of_rows_and_of_columns_refuses_a_baseline_that_is_not_there():
+    rows = rows_like_a_run(("clean", "3dgs"), ("a",), 3, (0,), 13)
+    spec = SPEC.model_copy(update={"baseline": "absent"})
+    for call in (lambda: judge(rows, spec), lambda: judge_table(RolloutTable.of_table(table_of(rows)), spec)):
+        with pytest.raises(InputError, match="absent"):
+            call()
+
+
+def test_cells_of_rows_are_those_of_columns():
+    rows = [row for row in rows_like_a_run(("clean",), ("p",), 9, (3, 2**62, 5), 14)]
+    there = RolloutTable.of_table(table_of(rows)).sides("p")["clean"]
+    found = columns.Cells.of(RendererRows.of(rows).cells)
+    assert (found.policy, found.scenes, found.seeds.tolist(), found.keys.tolist()) == (
+        there.cells.policy, there.cells.scenes, there.cells.seeds.tolist(), there.cells.keys.tolist()
+    )  # fmt: skip
+    assert len(columns.Cells.of(())) == 0
+
+
+def test_the_reason_for_a_missing_value_is_asked_for_by_renderer_and_metric():
+    rows = [{"renderer": r, "policy": "p", "scene": "s", "seed": 0, "status": "ok", "failure_class": None} for r in ("clean", "3dgs")]
+    rows = [row | {"offroad": None, "offroad_valid": False} for row in rows]
+    data = pads.dataset(table_of(rows))
+    table = RolloutTable(data, "here", lambda renderer, metric: f"{metric} of {renderer}" if renderer == "clean" else "")
+    sides = table.sides("p")
+    assert [sides[name].reason(0, "offroad") for name in ("clean", "3dgs")] == ["offroad of clean", "not given"]

@@ -5,8 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from alpasim_plugin import measured
+from alpasim_plugin.measured import share_measurements
 from alpasim_plugin.nets import machine_probe, precision
 from alpasim_plugin.nets.machine_probe import Probe, choose_threads, probe_precision
+from alpasim_plugin.nets.precision import choose_precision
 
 
 def test_the_probe_measures_time_and_error_of_both_precisions():
@@ -19,7 +22,7 @@ def test_the_probe_measures_time_and_error_of_both_precisions():
 @pytest.mark.parametrize(("bf16_ms", "name"), [(1.0, "bf16"), (6.0, "bf16"), (6.2, "fp32"), (9.0, "fp32"), (80.0, "fp32")])
 def test_the_faster_precision_is_taken_and_its_error_recorded(monkeypatch, bf16_ms, name):
     monkeypatch.setattr(precision, "probe_precision", lambda: Probe(9.0, bf16_ms, 1e-7, 3e-3))
-    choice = precision.choose_precision.__wrapped__("auto")
+    choice = precision.choose_precision("auto")
     assert choice.name == name
     assert choice.as_dict()["error"] == (3e-3 if name == "bf16" else 1e-7)
     assert choice.as_dict()["probe"]["bf16_ms"] == bf16_ms
@@ -29,7 +32,19 @@ def test_the_faster_precision_is_taken_and_its_error_recorded(monkeypatch, bf16_
 def test_threads_that_do_not_pay_are_left_unused(monkeypatch, slowdown, number):
     monkeypatch.setattr(machine_probe, "_ms", lambda *pair: slowdown[torch.get_num_threads()])
     before = torch.get_num_threads()
-    found = choose_threads.__wrapped__(2)
+    found = machine_probe._time_threads(2)
     assert (found.number, found.ms) == (number, slowdown)
     assert torch.get_num_threads() == before
-    assert choose_threads.__wrapped__(1).ms == {}
+    assert choose_threads(1).ms == {}
+
+
+def test_processes_of_a_run_on_a_node_choose_what_the_first_one_measured(monkeypatch, tmp_path):
+    share_measurements(tmp_path / "run")
+    try:
+        mine = choose_threads(2), probe_precision()
+        monkeypatch.setattr(measured, "_taken", {})  # as in another process
+        monkeypatch.setattr(machine_probe, "_ms", lambda *pair: pytest.fail("measured again"))
+        assert (choose_threads(2), probe_precision()) == mine
+        assert choose_precision().probe == mine[1]
+    finally:
+        share_measurements(None)

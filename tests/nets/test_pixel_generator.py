@@ -162,5 +162,5 @@ def test_half_precision_gives_the_same_picture() -> None:
 def test_the_precision_is_chosen_once_and_says_why() -> None:
     assert choose_precision("bf16").why == "as set"
     assert choose_precision("auto", "cuda").name == "bf16"
-    assert choose_precision() is choose_precision()
+    assert choose_precision() == choose_precision()
     assert "times as fast as float32" in choose_precision().why

@@ -83,6 +83,25 @@ def test_the_order_depends_on_the_seed_and_the_names_alone() -> None:
     assert sorted(drawing_order(names, 3)) == sorted(names)
 
 
+def test_in_stratified_order_every_batch_has_both_families_and_the_record_names_them(tmp_path: Path) -> None:
+    listed = [ref for name in ("smoke/straight", "smoke/curve") for ref in expand(name, SHORT)]
+    refs = [ScenarioRef(ref.path, seed, ref.overrides) for ref in listed for seed in (1, 2)]
+    plan = make_plan(refs, (GREY, DARKER), (BY_GREY,), (0,), RunOptions(images="none", baseline=GREY))
+    suite = replace(SAME, population="suite", alpha=0.02)
+    decided, heard = decide(tmp_path / "run", suite, plan, Design("stratified", look_every=2))
+    file_of = {cell.scene: cell.ref.path for cell in plan.cells}
+    order = decided.record["order"]
+    assert [len({file_of[scene] for scene in order[at : at + 2]}) for at in (0, 2)] == [2, 2]
+    assert (heard.looks[-1], decided.record["stopped"]) == ((4, "good"), "decided")  # of all scenes the answer is exact
+    assert list(decided.record["drawn"]["families"].values()) == [2, 2]
+    assert "in stratified order of 2 families" in render_report(read_run(tmp_path / "run"))
+    with pytest.raises(InputError, match="shares of families in a population"):
+        decide(tmp_path / "scenes", SAME, plan, Design("stratified"))
+    with pytest.raises(InputError, match="are of one family"):
+        decide(tmp_path / "one", suite, plan_of(4), Design("stratified"))
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 def test_an_interrupted_decision_continues_and_decides_the_same(worse, tmp_path: Path) -> None:
     before = told(worse[0])
     root = tmp_path / "again"
@@ -168,7 +187,19 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
     assert "non-inferior, after 2 of 2 scenes" in out
     assert "wrong in at most 40 % of runs, over all looks" in out
     assert run_command([*words, str(tmp_path / "run"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["decision"]["verdict"] == "non-inferior"
+    both = json.loads(capsys.readouterr().out)["decision"]
+    assert both["verdict"] == "non-inferior"
+    # The same with that run as the baseline: the renderer in question alone is driven, onto the same decision.
+    alone = [DARKER if word == f"{GREY},{DARKER}" else word for word in words]
+    alone += [str(tmp_path / "alone"), "--json", "--baseline-file", str(tmp_path / "run")]
+    assert run_command([*alone, "--baseline", GREY]) == 0
+    one = json.loads(capsys.readouterr().out)["decision"]
+    assert [look["metrics"] for look in one["looks"]] == [look["metrics"] for look in both["looks"]]
+    assert (both["rollouts"], one["rollouts"], one["baseline"]) == (4, 2, f"{GREY} of {tmp_path / 'run'}")
+    assert run_command([*alone, "--baseline", "clean"]) == 2
+    assert "no rollout of renderer clean" in capsys.readouterr().out
+    assert run_command([*alone, "smoke/lead_car"]) == 2
+    assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -186,6 +217,22 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path: Path, c
         (
             ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--population", "suite", "--seeds", "auto:3"],
             "same seeds in every scene",
+        ),
+        (["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--order", "stratified"], "--population suite"),
+        (
+            [
+                "--renderer",
+                f"{GREY},{DARKER}",
+                "--metric",
+                "progress",
+                "--population",
+                "suite",
+                "--order",
+                "stratified",
+                "--control",
+                "family",
+            ],
+            "taken out by the order",
         ),
     ],
 )
@@ -221,6 +268,8 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
     assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().err
     assert run_command([*words, "--baseline-file", str(tmp_path / "run")]) == 2
     assert "2 renderers beside a stored baseline" in capsys.readouterr().err
+    assert run_command([*words, "--order", "stratified"]) == 2
+    assert "shares of families in a population" in capsys.readouterr().err
     assert run_command(["gate", str(tmp_path / "run"), "--scenes", "smoke/curve"]) == 2
     assert run_command(["gate", str(tmp_path / "run"), "--until-decided"]) == 2
     capsys.readouterr()

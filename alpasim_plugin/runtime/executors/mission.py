@@ -11,6 +11,7 @@ from pathlib import Path
 
 from alpasim_plugin.atomic import disk_error, scratch_folder
 from alpasim_plugin.errors import InfrastructureError, SimrunError
+from alpasim_plugin.measured import share_measurements
 from alpasim_plugin.parts import PartSpec
 from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction import KIND as MODELS
@@ -19,7 +20,7 @@ from alpasim_plugin.runtime.cell import failed_manifest, run_cell
 from alpasim_plugin.runtime.executors.base import Faulty, Node
 from alpasim_plugin.runtime.executors.parcel import Parcel, pack
 from alpasim_plugin.runtime.executors.placing import Contents, is_here, paths_in, place, placed_path, with_paths
-from alpasim_plugin.runtime.executors.scratch import scratch_root
+from alpasim_plugin.runtime.executors.scratch import measured_folder, scratch_root
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.stores.stored import commit_key, run_stored_cell
 from alpasim_plugin.types import Scenario
@@ -33,6 +34,7 @@ class Mission:
     """Drive cells of a run; pickled once per worker.
 
     Attributes:
+        run: Token of the run.
         options: Of the run.
         threads: Of each rollout.
         scenes: Scene -> SHA-256 of the pickled scenario.
@@ -42,6 +44,7 @@ class Mission:
         fresh: As for `alpasim_plugin.runtime.stores.stored.commit_key`.
     """
 
+    run: str
     options: RunOptions
     threads: int
     scenes: Mapping[str, str]
@@ -53,6 +56,7 @@ class Mission:
     def __call__(self, item: Cell, node: Node) -> Parcel | Faulty[Parcel]:
         """Drive one cell; what says more of the node than of the rollout comes back as `Faulty`."""
         cell = item
+        share_measurements(measured_folder(self.run))
         try:
             with scratch_folder(scratch_root() / "rollout", "driving on a node") as scratch:
                 here = self._placed(cell, node)
@@ -153,7 +157,7 @@ def place_model(scenario: Scenario, files: Mapping[str, str], node: Node) -> Non
     cached(MODELS, key, make, lambda folder: folder, f"reconstruction of {scenario.scene_id} for {node.name}")
 
 
-def mission_of(plan: RunPlan, cells: Sequence[Cell], threads: int, store: str | None, fresh: str) -> tuple[Mission, Contents]:
+def mission_of(plan: RunPlan, run: str, cells: Sequence[Cell], threads: int, store: str | None, fresh: str) -> tuple[Mission, Contents]:
     """Return what the nodes need to drive cells of a plan, and the contents that they will ask for.
 
     Raises:
@@ -176,4 +180,4 @@ def mission_of(plan: RunPlan, cells: Sequence[Cell], threads: int, store: str | 
     for part in plan.parts:
         for file in part.files:
             contents.add_file(Path(file))
-    return Mission(plan.options, threads, scenes, backgrounds, models, store, fresh), contents
+    return Mission(run, plan.options, threads, scenes, backgrounds, models, store, fresh), contents

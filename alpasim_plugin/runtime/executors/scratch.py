@@ -23,6 +23,11 @@ def scratch_root() -> Path:
     return Path(os.environ.get("SIMRUN_SCRATCH") or tempfile.gettempdir(), f"simrun-{os.getuid()}-{socket.gethostname()}")
 
 
+def measured_folder(run: str) -> Path:
+    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.measured`)."""
+    return scratch_root() / "measured" / run
+
+
 def sweep(pids: Sequence[int] = ()) -> None:
     """Remove what killed workers have left on this node, once these processes are gone.
 

@@ -1,0 +1,42 @@
+"""What a node does for a run, here: it drives a cell from what it is sent, and shares what it measures with the run's other workers."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+from alpasim_plugin import measured
+from alpasim_plugin.runtime.executors.base import Node
+from alpasim_plugin.runtime.executors.mission import mission_of
+from alpasim_plugin.runtime.executors.parcel import Parcel
+from alpasim_plugin.runtime.executors.scratch import measured_folder
+from alpasim_plugin.runtime.fixer_table import chosen
+from tests.runtime.test_decide import plan_of
+
+
+def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("SIMRUN_SCRATCH", str(tmp_path))
+    plan = plan_of(scenes=1)
+    try:
+        for run in ("first", "second"):
+            mission, contents = mission_of(plan, run, plan.cells[:1], 1, None, "")
+            parcel = pickle.loads(pickle.dumps(mission))(plan.cells[0], Node("n1", contents.read))
+            assert isinstance(parcel, Parcel)
+            assert (parcel.manifest["status"], parcel.manifest["node"]) == ("ok", "n1")
+            assert measured._folder == measured_folder(run)
+            measured.measured("speed", lambda: {"ms": 1.0})
+            assert (measured_folder(run) / "speed.json").exists()
+    finally:
+        measured.share_measurements(None)
+
+
+def test_the_record_of_a_run_says_what_was_chosen_on_each_node() -> None:
+    def manifest(node: str | None, precision: str) -> dict:
+        facts = {"precision": {"name": precision}, "threads": {"number": 1}}
+        return {"renderer": "onefixer", "fixer": {"chosen": facts}} | ({"node": node} if node else {})
+
+    found = chosen([manifest("a", "bf16"), manifest("b", "fp32"), manifest("a", "bf16"), manifest(None, "bf16"), {"renderer": "clean"}])
+    assert [(one["node"], one["precision"]["name"], one["rollouts"]) for one in found["onefixer"]] == [
+        ("a", "bf16", 2), ("b", "fp32", 1), (None, "bf16", 1)
+    ]  # fmt: skip
+    assert list(found) == ["onefixer"]
