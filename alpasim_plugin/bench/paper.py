@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
-from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of
+from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.parts import resolve
@@ -83,11 +83,13 @@ class Compared:
         measured: PROTOCOL -> values and features by arm.
         works: PROTOCOL -> its works.
         shown: Clips of the page.
+        units: ARM -> what it makes at a time and what that costs; None for the render.
     """
 
     measured: dict[str, Measured] = field(default_factory=dict)
     works: dict[str, list[Work]] = field(default_factory=dict)
     shown: list[ShownClip] = field(default_factory=list)
+    units: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
 
 def arms_in(folder: Path) -> tuple[Variant, ...]:
@@ -118,6 +120,7 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
     """
     out = Compared()
     arms = (Variant(RAW), *(Variant(name, resolve("fixer", name, ())) for name in SHIPPED), *arms_in(run.arms))
+    out.units = {arm.label: unit_of(arm) for arm in arms}
     for name in ("cycle", "under-trained"):
         if name in run.protocols:
             sequences = _sequences(run, name)

@@ -87,7 +87,7 @@ def paper(
     rows = {name: [row_of(work) for work in works] for name, works in found.works.items()}
     judged = judge_claims(found.measured)
     command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"
-    write_text(out / "paper.md", document(published(), found.measured, rows, why, command))
+    write_text(out / "paper.md", document(published(), found.measured, rows, found.units, why, command))
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
     verdicts = [
         {"number": one.claim.number, "verdict": one.verdict, "contests": [asdict(result) for result in one.results]} for one in judged

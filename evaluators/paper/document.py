@@ -15,6 +15,10 @@ from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
 from evaluators.paper.verdict import judge_claims
 
+PERIOD_MS = 100.0  # between frames of the pairs
+TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a block waits
+for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
+"""
 WINDOW = 93  # frames: the length of the paper's training clips
 PAIRED = ("psnr_db", "perceptual-syn", "fd_syn_clip", "fvmd_lk", "warp_l1", "lane_f1_syn", "cuboid_f1_syn")
 HOW = """A claim is a paired difference over the same clips, 95 %: a t interval, or for metrics of whole sets (`fd_syn_clip`, `fvmd_lk`)
@@ -29,6 +33,7 @@ def document(
     published: Published,
     measured: Mapping[str, Measured],
     rows: Mapping[str, Sequence[Mapping[str, Any]]],
+    units: Mapping[str, Mapping[str, Any] | None],
     reasons: Mapping[int, str],
     command: str,
 ) -> str:
@@ -38,6 +43,7 @@ def document(
         published: The paper's numbers.
         measured: PROTOCOL -> what was measured; one that was not run is named as such.
         rows: PROTOCOL -> rows of clips, for quality by frame.
+        units: ARM -> ``frames``, ``lookahead_frames`` and ``calls_per_frame`` of what it makes at a time.
         reasons: Claim -> why it comes out as it does here.
         command: That makes it.
     """
@@ -61,7 +67,7 @@ def document(
         parts.append(f"\n{_counts(mine)}\n")
     parts.append("## A wrong map\n\n" + (_map_error(measured["map-error"]) if "map-error" in measured else "Not run.\n"))
     parts.append("## By position\n\n" + (by_position(rows["under-trained"]) if "under-trained" in rows else "Not run.\n"))
-    parts.append("## Time\n\n" + (_times(measured["cycle"]) if "cycle" in measured else "Not run.\n"))
+    parts.append("## Time\n\n" + (_times(measured["cycle"], units) if "cycle" in measured else "Not run.\n"))
     parts.append("## The paper's claims\n\n" + verdicts(judge_claims(measured), reasons))
     return "\n".join(parts)
 
@@ -136,12 +142,16 @@ def _with_half(centre: float, low: float | None, high: float | None, digits: int
     return f"{centre:.{digits}f}{half}"
 
 
-def _times(measured: Measured) -> str:
+def _times(measured: Measured, units: Mapping[str, Mapping[str, Any] | None]) -> str:
+    """Return time and latency: a frame waits for the frames that its block looks ahead to, and for the whole block's computation."""
     rows = []
     for arm in measured.arms:
-        if measured.has(arm, "ms_per_frame"):
-            found = measured.mean(arm, "ms_per_frame")
-            rows.append([arm, _with_half(found.centre, found.low, found.high, 1)])
-    return "Median over blocks of each clip, mean over clips, one thread; drawing of map and render not included.\n\n" + markdown_table(
-        ["arm", "ms a frame"], rows
-    )
+        unit = units.get(arm)
+        if not measured.has(arm, "ms_per_frame") or unit is None:
+            continue
+        found = measured.mean(arm, "ms_per_frame")
+        first = unit["lookahead_frames"] * PERIOD_MS + unit["frames"] * found.centre
+        calls = f"{unit['calls_per_frame']:.3g}"
+        rows.append([arm, _with_half(found.centre, found.low, found.high, 1), calls, str(unit["lookahead_frames"]), f"{first:.0f}"])
+    head = ["arm", "ms a frame", "network calls a frame", "look-ahead, frames", "first frame of a block, ms"]
+    return TIMES + "\n" + markdown_table(head, rows)

@@ -140,12 +140,19 @@ def test_a_document_says_what_was_not_run() -> None:
         for i, clip in enumerate(CLIPS)
     ]
     found: Published = published()
-    text = document(found, {"under-trained": Measured(from_rows(rows))}, {"under-trained": rows}, {}, "simrun bench paper")
+    text = document(found, {"under-trained": Measured(from_rows(rows))}, {"under-trained": rows}, {}, {}, "simrun bench paper")
     assert text.count("Not run.") == 5
     assert "Claim 3** was not measured: protocol cycle" in text
     windows = by_position(rows).splitlines()
     assert "| 0 to 92 | 93 to 189 |" in windows[0]
     assert windows[2].startswith("| 3dgs | 25.50 ± ")
+
+
+def test_the_first_frame_waits_for_look_ahead_and_the_whole_block() -> None:
+    timed = Measured({"V9": {clip: {"ms_per_frame": 20.0} for clip in CLIPS}, "3dgs": {}})
+    unit = {"frames": 8, "lookahead_frames": 7, "calls_per_frame": 0.125}
+    text = document(published(), {"cycle": timed}, {}, {"V9": unit, "3dgs": None}, {}, "simrun bench paper")
+    assert "| V9 | 20.0 ± 0.0 | 0.125 | 7 | 860 |" in text  # 7 x 100 ms and 8 x 20 ms
 
 
 def test_a_page_holds_every_frame_and_refuses_films_of_other_lengths() -> None:
