@@ -17,7 +17,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.devices import take_threads
 from alpasim_plugin.fixers.image_pipeline import fix_images, sample_window
-from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
+from alpasim_plugin.fixers.image_settings import MaplessSettings, NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.networks import LATENT, load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.settings import FixerSettings
@@ -38,14 +38,42 @@ class ImageHistory:
     references: tuple[U8, ...]  # (H, W, 3) last outputs as returned, newest first; as many as the network looks at
 
 
-class ImageFixer(Fixer):
+class MaplessFixer(Fixer):
+    """What the sessions without a map have in common: networks, label, times and the key of the noise.
+
+    Args:
+        settings: Of the session's kind.
+        scene_id, seed: Key of the noise.
+        device: ``cpu`` or ``cuda``.
+        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
+
+    Raises:
+        InputError: Weights that are missing or do not fit.
+    """
+
+    def __init__(self, settings: MaplessSettings, scene_id: str, seed: int, device: str, threads: int | None) -> None:
+        self.chosen = take_threads(threads)
+        self.scene_id = scene_id
+        self.networks = load_networks(settings, device)
+        self.clock = StageClock(device)
+        self.trained = self.networks.trained
+        count = len(settings.network_times)
+        self.label = f"{settings.name}{f'@{count}' if count > 1 else ''}, {self.networks.note}"
+        self.reset(seed)
+
+    @property
+    def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
+        """Total wall time by stage since the session was made, milliseconds."""
+        return {name: self.clock.ms.get(name, 0.0) for name in TIMED}
+
+
+class ImageFixer(MaplessFixer):
     """Repair the frames of one rollout one by one. A step may hold other cameras than the step before.
 
     Args:
         settings: Of `RenderStepSettings`, or of `NoiseWindowSettings` with windows of one frame.
         scene_id, seed: Key of the noise, with the camera and the frame's index in the rollout.
-        device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
+        device, threads: See `MaplessFixer`.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -57,19 +85,8 @@ class ImageFixer(Fixer):
         if not isinstance(settings, RenderStepSettings | NoiseWindowSettings) or settings.is_offline:
             found = f"settings of type {type(settings).__name__}" + (" for whole clips" if settings.is_offline else "")
             raise InputError("making a fixer of single frames", settings.name, found, "take them from fixer_settings(name)")
-        self.chosen = take_threads(threads)
-        self.settings, self.scene_id = settings, scene_id
-        self.networks = load_networks(settings, device)
-        self._clock = StageClock(device)
-        self.trained = self.networks.trained
-        count = len(settings.network_times)
-        self.label = f"{settings.name}{f'@{count}' if count > 1 else ''}, {self.networks.note}"
-        self.reset(seed)
-
-    @property
-    def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
-        """Total wall time by stage since the session was made, milliseconds."""
-        return {name: self._clock.ms.get(name, 0.0) for name in TIMED}
+        self.settings = settings
+        super().__init__(settings, scene_id, seed, device, threads)
 
     def reset(self, seed: int) -> None:
         """Drop the history of every camera and use the noise of another seed."""
@@ -111,7 +128,7 @@ class ImageFixer(Fixer):
         """Return the fixed frames ``(B, 3, 1, H, W)``, padded and not clipped."""
         clip = to_clip(view, 1, self.networks.device)
         if isinstance(self.settings, NoiseWindowSettings):
-            return sample_window(self.networks, self.settings, clip.rgb, clip.alpha, self._noise(view, clip, pasts), self._clock)
+            return sample_window(self.networks, self.settings, clip.rgb, clip.alpha, self._noise(view, clip, pasts), self.clock)
         out = torch.empty_like(clip.rgb)
         wanted = self.settings.references
         # A camera's first frames have too few outputs before them: they are fixed by themselves, in a batch of their own.
@@ -120,7 +137,7 @@ class ImageFixer(Fixer):
             if rows:
                 references = self._references(view, [pasts[b] for b in rows]) if rows is joined else None
                 alpha = None if clip.alpha is None else clip.alpha[rows]
-                out[rows] = fix_images(self.networks, self.settings, clip.rgb[rows], alpha, references, self._clock)
+                out[rows] = fix_images(self.networks, self.settings, clip.rgb[rows], alpha, references, self.clock)
         return out
 
     def _references(self, view: Views, pasts: Sequence[ImageHistory | None]) -> Tensor:

@@ -16,29 +16,27 @@ from torch import Tensor
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.devices import take_threads
+from alpasim_plugin.fixers.image_fixer import MaplessFixer
 from alpasim_plugin.fixers.image_pipeline import sample_window
 from alpasim_plugin.fixers.image_settings import NoiseWindowSettings
-from alpasim_plugin.fixers.networks import LATENT, load_networks
+from alpasim_plugin.fixers.networks import LATENT
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import Views, group_views, to_clip, to_images
 from alpasim_plugin.fixers.windows import fade_in, windows
 from alpasim_plugin.nets.clips import SIDE, crop_clip
-from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
+from alpasim_plugin.types import U8, BlockRule, Frame
 
 WHOLE_CLIP = sys.maxsize  # frames of a block: as many as there are
 
 
-class WindowFixer(Fixer):
+class WindowFixer(MaplessFixer):
     """Repair a whole clip in overlapping windows.
 
     Args:
         settings: Of `NoiseWindowSettings`.
         scene_id, seed: Key of the noise, with the camera and the latent's index, counted through the windows.
-        device: ``cpu`` or ``cuda``.
-        threads: Torch threads that this process may use; as many are used as pay. None leaves their number.
+        device, threads: See `MaplessFixer`.
 
     Raises:
         InputError: Settings of another fixer, or weights that are missing or do not fit.
@@ -50,18 +48,8 @@ class WindowFixer(Fixer):
         if not isinstance(settings, NoiseWindowSettings):
             found = f"settings of type {type(settings).__name__}"
             raise InputError("making a fixer of whole clips", settings.name, found, "take them from fixer_settings(name)")
-        self.chosen = take_threads(threads)
-        self.settings, self.scene_id = settings, scene_id
-        self.networks = load_networks(settings, device)
-        self._clock = StageClock(device)
-        self.trained = self.networks.trained
-        self.label = f"{settings.name}@{len(settings.steps)}, {self.networks.note}"
-        self.reset(seed)
-
-    @property
-    def stage_ms(self) -> dict[str, float]:  # type: ignore[override]  # computed when it is read
-        """Total wall time by stage since the session was made, milliseconds."""
-        return {name: self._clock.ms.get(name, 0.0) for name in TIMED}
+        self.settings = settings
+        super().__init__(settings, scene_id, seed, device, threads)
 
     def reset(self, seed: int) -> None:
         """Take another clip, with the noise of another seed."""
@@ -121,5 +109,5 @@ class WindowFixer(Fixer):
         first = 0 if settings.noise == "fixed" else index * settings.latents
         shape = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE)
         (eps,) = latent_noise(self.scene_id, self.seed, view.cameras, 1, range(first, first + settings.latents), shape)
-        made = sample_window(self.networks, settings, clip.rgb, clip.alpha, eps.to(self.networks.device), self._clock)
+        made = sample_window(self.networks, settings, clip.rgb, clip.alpha, eps.to(self.networks.device), self.clock)
         return crop_clip(made, cut.size).cpu()
