@@ -50,7 +50,11 @@ class Distillation:
     gradient_latents: int | None = 21
     adversarial: AdversarialTerm | None = None
     tail_drop: TailDrop | None = None
-    perceptual: bool = False
+
+    @property
+    def perceptual(self) -> bool:
+        """It has no perceptual term."""
+        return False
 
     def task(self, inputs: StageInputs) -> DistillationTask:
         """Make the stage's batches and losses."""

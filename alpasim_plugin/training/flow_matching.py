@@ -50,7 +50,11 @@ class FlowMatching:
     shift: float = 1.0
     bell: bool = False
     tail_drop: TailDrop | None = None
-    perceptual: bool = False
+
+    @property
+    def perceptual(self) -> bool:
+        """It has no perceptual term."""
+        return False
 
     def task(self, inputs: StageInputs) -> FlowMatchingTask:
         """Make the stage's batches and loss."""

@@ -96,7 +96,7 @@ class LatentClips:
         digest: Of everything the latents depend on: autoencoder, form, and the sequences in their order.
 
     Raises:
-        InputError: No sequence, or one that is too short for a clip.
+        InputError: No sequence, one that is too short for a clip, or sequences of several image sizes.
     """
 
     def __init__(
@@ -109,6 +109,10 @@ class LatentClips:
     ) -> None:
         if not sequences:
             raise InputError(DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first")
+        sizes = sorted({sequence.clip.rgb_gt.shape[1:3] for sequence in sequences})
+        if len(sizes) > 1:
+            found = f"images of {', '.join(f'{width}x{height}' for height, width in sizes)}, which make no batch"
+            raise InputError(DOING, "the pairs", found, "give a folder with the sequences of one size")
         encoder = digest(vae, form)
         self.form, self.digest = form, f"{encoder}-{pairs_digest(sequences)}"
         self._folder = folder / encoder

@@ -109,12 +109,16 @@ def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: 
     assert not torch.equal(after[0].z_r, before[0].z_r)
 
 
-def test_too_short_sequences_and_no_sequences_are_refused(data: Path, tmp_path: Path) -> None:
+def test_sequences_that_make_no_clips_or_no_batch_are_refused(data: Path, tmp_path: Path) -> None:
     make(tmp_path, name="short", frames=9)
     with pytest.raises(InputError, match="a clip has 13"):
         LatentClips(PairDataset(tmp_path, "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
     with pytest.raises(InputError, match="no finished sequence"):
         LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+    make(tmp_path, "mixed/train", "a", frames=13)
+    make(tmp_path, "mixed/train", "b", frames=13, width=64)
+    with pytest.raises(InputError, match="images of 48x32, 64x32, which make no batch"):
+        LatentClips(PairDataset(tmp_path / "mixed", "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
 
 
 QUICK = ("base", "base-bi", "image", "V5", "V6", "V7", "V8")  # between them every branch; V9 is trained below
