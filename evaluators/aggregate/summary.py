@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64, I64
-from evaluators.aggregate.bootstrap import cluster_bootstrap
+from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, n_clusters, normal_half_width, wilson_rate, within
 from evaluators.aggregate.rows import Row, Side, by_renderer, metric_names
 from evaluators.metrics import info, value_range
@@ -42,7 +43,9 @@ def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str]) -> dict[s
         sides: RENDERER -> its rollouts.
         metrics: Which metrics.
     """
-    return {renderer: {name: _entry(side, name) for name in metrics} for renderer, side in sides.items()}
+    # Metric by metric: renderers share its column and its draws.
+    found = {name: {renderer: _entry(side, name) for renderer, side in sides.items()} for name in metrics}
+    return {renderer: {name: found[name][renderer] for name in metrics} for renderer in sides}
 
 
 def _entry(side: Side, metric: str) -> dict[str, Any]:
@@ -86,9 +89,14 @@ def _entry(side: Side, metric: str) -> dict[str, Any]:
 def _bootstrap(metric: str, values: F64, scenes: I64, n_scenes: int) -> dict[str, Any]:
     if n_scenes > BOOTSTRAP_SCENES:
         return {"ci95_bootstrap_reason": f"not drawn for more than {BOOTSTRAP_SCENES} scenes; ci95_clustered needs no second opinion there"}
-    # Keyed by the metric alone: renderers meet the same draws of scenes.
-    found = cluster_bootstrap(values, scenes, stream(metric, 0, "aggregate/bootstrap"))
+    found = cluster_bootstrap(values, scenes, partial(_redraws, metric))
     return {"ci95_bootstrap": found.bounds} | ({"ci95_bootstrap_reason": found.reason} if found.reason else {})
+
+
+@lru_cache(maxsize=1)
+def _redraws(metric: str, scenes: int) -> I64:
+    """Return the draws of a metric's scenes; keyed by the metric alone, so that renderers meet the same ones."""
+    return redraws(scenes, stream(metric, 0, "aggregate/bootstrap"))
 
 
 def _counts(values: F64) -> dict[str, Any]:

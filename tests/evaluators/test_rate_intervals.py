@@ -11,10 +11,16 @@ from scipy import stats
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.seeding import stream
 from evaluators import aggregate
-from evaluators.aggregate.bootstrap import cluster_bootstrap
+from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, rate_interval, wilson_rate
 from tests.evaluators.test_tables_over_rollouts import rows_of
 from tests.examples import examples
+
+
+def by_key(key: str):
+    """Draw by a stream of its own."""
+    return lambda scenes: redraws(scenes, stream(key, 0, "test"))
+
 
 shares = st.lists(st.sampled_from([0.0, 0.2, 1 / 3, 0.5, 0.8, 1.0]), min_size=2, max_size=40)
 
@@ -61,7 +67,7 @@ def test_scenes_that_all_have_the_same_share_are_as_many_trials_as_scenes():
 def test_one_scene_has_no_interval_over_scenes_however_many_seeds():
     one = clustered([0.0, 1.0, 1.0], ["a"] * 3, is_rate=True)
     assert (one.bounds, one.reason) == (None, "needs at least two scenes, found 1")
-    drawn = cluster_bootstrap([0.0, 1.0, 1.0], ["a"] * 3, stream("x", 0, "test"))
+    drawn = cluster_bootstrap([0.0, 1.0, 1.0], ["a"] * 3, by_key("x"))
     assert (drawn.bounds, drawn.reason) == (None, "needs at least two scenes, found 1")
 
 
@@ -97,16 +103,16 @@ def test_the_bootstrap_follows_its_generator_and_nears_t_where_scenes_are_many()
     rng = np.random.Generator(np.random.Philox(3))
     values = rng.normal(2.0, 1.0, 400)
     scenes = [f"s{i // 2:03d}" for i in range(400)]
-    one = cluster_bootstrap(values, scenes, stream("x", 0, "test"))
-    assert one == cluster_bootstrap(values, scenes, stream("x", 0, "test"))
-    assert one != cluster_bootstrap(values, scenes, stream("y", 0, "test"))
+    one = cluster_bootstrap(values, scenes, by_key("x"))
+    assert one == cluster_bootstrap(values, scenes, by_key("x"))
+    assert one != cluster_bootstrap(values, scenes, by_key("y"))
     t = clustered(values, scenes)
     assert (one.low, one.high) == pytest.approx((t.low, t.high), abs=0.02)
 
 
 def test_bootstrap_draws_scenes_and_not_rollouts():
     values, scenes = np.repeat([0.0, 10.0], 100), ["a"] * 100 + ["b"] * 100
-    one = cluster_bootstrap(values, scenes, stream("x", 0, "test"))
+    one = cluster_bootstrap(values, scenes, by_key("x"))
     assert (one.low, one.high) == (0.0, 10.0)  # both draws the same scene in a quarter of the draws each
 
 

@@ -268,6 +268,17 @@ def test_a_gate_drives_until_its_margins_are_decided(tmp_path: Path, capsys) -> 
     assert "1 of the 3 scenes and seeds that may be driven are not in it" in capsys.readouterr().err
     assert run_command([*words, "--baseline-file", str(tmp_path / "run")]) == 2
     assert "2 renderers beside a stored baseline" in capsys.readouterr().err
+    # Of the suite itself, family by family: each file with two seeds.
+    suite = tmp_path / "suite.yaml"
+    entries = "".join(f"  - {{path: smoke/{name}, seeds: [1, 2]}}\n" for name in ("straight", "curve"))
+    suite.write_text(f"version: 1\nscenarios:\n{entries}")
+    asked = [
+        str(tmp_path / "suite") if word == str(tmp_path / "run") else str(suite) if word == "smoke/straight" else word for word in words
+    ]
+    asked = [word for at, word in enumerate(asked) if word != "smoke/curve" and not (word == "--scenes" and asked[at + 1] == "smoke/curve")]
+    assert run_command([*asked, "--population", "suite", "--order", "stratified"]) == 1  # exact after the last scene
+    assert "about the mean over the 4 scenes of this suite" in capsys.readouterr().out
+    assert (read_decision(tmp_path / "suite") or {})["drawn"]["order"] == "stratified"
     assert run_command([*words, "--order", "stratified"]) == 2
     assert "shares of families in a population" in capsys.readouterr().err
     assert run_command(["gate", str(tmp_path / "run"), "--scenes", "smoke/curve"]) == 2
