@@ -16,8 +16,8 @@ from evaluators.paper.tables import differences, markdown_table, paper_against_o
 from evaluators.paper.verdict import judge_claims
 
 PERIOD_MS = 100.0  # between frames of the pairs
-TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a block waits
-for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
+TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a
+block waits for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
 """
 WINDOW = 93  # frames: the length of the paper's training clips
 PAIRED = ("psnr_db", "perceptual-syn", "fd_syn_clip", "fvmd_lk", "warp_l1", "lane_f1_syn", "cuboid_f1_syn")
