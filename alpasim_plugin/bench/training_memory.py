@@ -14,10 +14,10 @@ from torch import Tensor
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
 from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.processes import end_with_parent
+from alpasim_plugin.processes import end_with_parent, resident_mb
 from alpasim_plugin.training.shared_rollout import Objectives, Sample, losses
 
-MIB = 1024.0  # ru_maxrss counts KiB
+KIB_OF_MIB, MB_OF_MIB = 1024.0, 2**20 / 1e6
 
 
 class MemoryCell(NamedTuple):
@@ -86,4 +86,6 @@ def _measure(sizes: DiTSizes, n: int, k: int, clips: int, rows: int, columns: in
 
 
 def _peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    """Return this process's peak memory, MiB. Linux counts that of the process that started it into ``ru_maxrss``."""
+    own = resident_mb("VmHWM")
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / KIB_OF_MIB if own is None else own / MB_OF_MIB
