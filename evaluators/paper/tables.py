@@ -11,6 +11,7 @@ from evaluators.paper.verdict import Judged, Result
 from evaluators.video.table import DIGITS, SCALE
 
 NOT_RUN = "not run"
+SET_DIGITS = {"fd_syn_clip": 2, "fd_syn_16": 2, "fvmd_lk": 0}
 ARROWS = {"higher": "↑", "lower": "↓"}
 
 
@@ -43,7 +44,7 @@ def _ours(metric: PaperMetric, arm: str, measured: Measured) -> str:
     if not measured.has(arm, metric.ours):
         return "null"
     found = measured.mean(arm, metric.ours)
-    digits = 1 if metric.scale > 1 else DIGITS.get(metric.ours, 3)
+    digits = 1 if metric.scale > 1 else (DIGITS | SET_DIGITS).get(metric.ours, 3)
     text = f"{found.centre * metric.scale:.{digits}f}"
     if found.low is None or found.high is None:
         return text
@@ -64,7 +65,7 @@ def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Se
 
 def difference_text(found: Difference) -> str:
     """Return a difference with its half-width, or with its p-value for a metric of whole sets; bold where it is shown."""
-    digits, scale = DIGITS.get(found.metric, 4), SCALE.get(found.metric, 1.0)
+    digits, scale = (DIGITS | SET_DIGITS).get(found.metric, 4), SCALE.get(found.metric, 1.0)
     text = f"{found.difference * scale:+.{digits}f}"
     if found.low is not None and found.high is not None:
         text += f" ± {(found.high - found.low) / 2 * scale:.{digits}f}"

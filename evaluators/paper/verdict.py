@@ -68,7 +68,8 @@ def _result(contest: Contest, measured: Measured | None) -> Result:
         return Result(contest, "not measured", None, f"protocol {contest.protocol}")
     for arm in (contest.first, contest.second):
         if not measured.has(arm, contest.metric):
-            return Result(contest, "not measured", None, f"{contest.metric} of {arm}")
+            missing = f"{contest.metric} of {arm}" if arm in measured.values else f"arm {arm}"
+            return Result(contest, "not measured", None, missing)
     found = measured.difference(contest.metric, contest.first, contest.second)
     return Result(contest, _outcome(contest, found, measured), found)
 
