@@ -58,7 +58,7 @@ def student(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # no
     return train_fixer(run_of(data, recipe_of("omnidreams")), tmp_path_factory.mktemp("arms") / "student")
 
 
-QUICK = ("one-forcing",)  # it has the stages and parts of the others, but for the opacity
+QUICK = ("self-forcing",)  # it has the stages of the others; the adversarial head is tried by itself
 
 
 @pytest.mark.parametrize("recipe", [pytest.param(r, id=r.name, marks=() if r.name in QUICK else pytest.mark.slow) for r in CAUSAL_ARMS])
@@ -96,6 +96,7 @@ def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) ->
     assert (a != b).any()
 
 
+@pytest.mark.slow
 def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811
     recipe = recipe_of("self-forcing")
     run = run_of(data, recipe, student=student, teacher=student)
