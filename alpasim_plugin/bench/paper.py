@@ -107,8 +107,11 @@ def arms_in(folder: Path) -> tuple[Variant, ...]:
         name, settings = bundle_fixer(path)
         arm = path.parent.name
         for steps in STEPS.get(arm, (None,)):
-            label, fixer = (arm, name) if steps is None else (f"{arm}@{steps}", f"{name}@{steps}")
-            found.append(Variant(label, resolve("fixer", fixer, settings)))
+            if steps is None:
+                found.append(Variant(arm, resolve("fixer", name, settings)))
+            else:  # the bundle's own steps would come after those of the name
+                others = tuple(setting for setting in settings if setting.partition("=")[0] != "steps")
+                found.append(Variant(f"{arm}@{steps}", resolve("fixer", f"{name}@{steps}", others)))
     return tuple(found)
 
 

@@ -9,6 +9,10 @@ import pytest
 
 from alpasim_plugin.bench import paper as bench_paper
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.fixers.bundle import save_bundle
+from alpasim_plugin.nets import DiTSizes, TinyVAE
+from alpasim_plugin.nets.init import initial_weights
+from tests.fixers.fixer_cases import small_settings
 from tests.training.pair_files import make
 
 
@@ -52,6 +56,17 @@ def test_tables_verdicts_and_a_page_and_nothing_is_measured_twice(
     assert len(rows) == 2 * 2 * 3
     assert run_command(command) == 0
     assert {path: path.stat().st_mtime_ns for path in rows} == rows
+
+
+def test_an_arm_with_several_numbers_of_steps_takes_each_though_its_bundle_names_one(tmp_path: Path) -> None:
+    settings = small_settings("window=3")
+    assert len(settings.steps) == 1
+    parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
+    for arm in ("omnidreams", "V9"):
+        (tmp_path / arm).mkdir()
+        save_bundle(tmp_path / arm / bench_paper.BUNDLE, parts, settings, trained=True, note="random")
+    found = bench_paper.arms_in(tmp_path)
+    assert {arm.label: len(arm.spec.settings.steps) for arm in found} == {"V9": 1, "omnidreams@1": 1, "omnidreams@4": 4}  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
