@@ -23,7 +23,7 @@ class MaplessSettings(LatentFixerSettings):
     """Attention over all latents of one call, no map, no cache."""
 
     opacity_to_decoder: bool = Field(
-        default=False, description="Whether a decoder that sees the render is told where it is opaque; without it, opaque everywhere."
+        default=False, description="Whether a decoder conditioned on the render is also conditioned on its opacity; else opacity 1."
     )
 
     @property

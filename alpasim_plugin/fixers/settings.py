@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -183,9 +184,9 @@ class LatentFixerSettings(FixerSettings):
     fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
 
     @property
+    @abstractmethod
     def network_times(self) -> tuple[float, ...]:
         """Time inputs of the network's denoising steps, 0 to 1000."""
-        raise NotImplementedError
 
     @property
     def finalises(self) -> bool:
