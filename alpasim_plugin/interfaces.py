@@ -83,12 +83,15 @@ class Declaration:
         trained: Whether the part's weights were learned; None where it has none.
         note: What the part is, for labels: "trained", "untrained (identity)".
         is_remote: The part's behaviour is decided elsewhere, as a service's is: it has no digest, and its rollouts are never reused.
+        missing: What a user must still give before the part can be built, as an error says it; empty where nothing is missing. A run with
+            such a part is refused before its first rollout.
     """
 
     files: Mapping[str, Path] = field(default_factory=dict)
     trained: bool | None = None
     note: str = ""
     is_remote: bool = False
+    missing: str = ""
 
 
 @runtime_checkable

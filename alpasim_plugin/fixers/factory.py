@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from alpasim_plugin.fixers.pixel_fixer import PixelFixer
     from alpasim_plugin.fixers.window_fixer import WindowFixer
 
+FixerWithWeights = OneFixerSettings | PixelFixerSettings | RenderStepSettings | NoiseWindowSettings
 PARTS = ("bundle", "dit", "vae", "decoder", "prompt")
 
 
@@ -51,7 +52,7 @@ def windows(
     return (WindowFixer if settings.is_offline else ImageFixer)(settings, scene_id, seed, device, threads)
 
 
-def describe(settings: OneFixerSettings | PixelFixerSettings | RenderStepSettings | NoiseWindowSettings) -> Declaration:
+def describe(settings: FixerWithWeights) -> Declaration:
     """Say whose weights the settings name.
 
     Raises:
@@ -66,8 +67,27 @@ def describe(settings: OneFixerSettings | PixelFixerSettings | RenderStepSetting
         trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
         return Declaration(files, trained, "trained" if trained else "untrained")
     if "weights.dit" in files:
-        return Declaration(files, True, "weights of a checkpoint")
-    return Declaration(files, False, "weights missing" if settings.untrained == "refuse" else f"untrained ({settings.untrained})")
+        trained, note = True, "weights of a checkpoint"
+    else:
+        trained, note = False, "weights missing" if settings.untrained == "refuse" else f"untrained ({settings.untrained})"
+    missing = next((part for part in needed_parts(settings) if f"weights.{part}" not in files), None)
+    if settings.untrained != "refuse" or missing is None:
+        return Declaration(files, trained, note)
+    return Declaration(files, trained, f"weights missing: {missing}" if files else note, missing=weights_to_give(missing, getattr(settings, "trained_by", None)))
+
+
+def needed_parts(settings: FixerWithWeights) -> tuple[str, ...]:
+    """Return the parts whose weights a fixer without a bundle needs."""
+    if isinstance(settings, PixelFixerSettings):
+        return ("bundle",)
+    return ("dit", "vae", "decoder") if settings.decoder.kind == "taehv" else ("dit", "vae")
+
+
+def weights_to_give(part: str, trained_by: str | None = None) -> str:
+    """Return what to do about missing weights, as the last part of an error."""
+    choice = "" if part == "bundle" else " (or fixer.weights.bundle=FILE)"
+    do = f"give --set fixer.weights.{part}=FILE{choice}; for timing alone, fixer.untrained=random"
+    return do if trained_by is None else f"train it: {trained_by}; then {do}"
 
 
 onefixer.settings_model = OneFixerSettings  # type: ignore[attr-defined]

@@ -13,6 +13,7 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
+from alpasim_plugin.fixers.factory import weights_to_give
 from alpasim_plugin.fixers.settings import FixerSettings, LatentFixerSettings, OneFixerSettings
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.checkpoints import load_weights
@@ -210,7 +211,4 @@ class Parts:
 
     def refuse(self, part: str, found: str) -> None:
         """Raise the error for weights that are missing."""
-        do = f"give --set fixer.weights.{part}=FILE (or fixer.weights.bundle=FILE); for timing alone, fixer.untrained=random"
-        if self.settings.trained_by is not None:
-            do = f"train it: {self.settings.trained_by}; then {do}"
-        raise InputError(DOING, f"{self.settings.name}, weights.{part}", found, do)
+        raise InputError(DOING, f"{self.settings.name}, weights.{part}", found, weights_to_give(part, self.settings.trained_by))

@@ -16,6 +16,7 @@ from torch import Tensor
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
+from alpasim_plugin.fixers.factory import weights_to_give
 from alpasim_plugin.fixers.keep_render import render_share
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.recorded_step import RecordedStep
@@ -110,8 +111,8 @@ def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
 
 def _untrained(settings: PixelFixerSettings) -> PixelGenerator:
     if settings.untrained == "refuse":
-        do = "give --set fixer.weights.bundle=FILE; for timing alone, fixer.untrained=random"
-        raise InputError(DOING, f"{settings.name}, weights.bundle", "no weights, and settings.untrained is 'refuse'", do)
+        found = "no weights, and settings.untrained is 'refuse'"
+        raise InputError(DOING, f"{settings.name}, weights.bundle", found, weights_to_give("bundle"))
     given = settings.generator
     sizes = PixelSizes(**given.model_dump())
     net = PixelGenerator.random(sizes, derive_seed("fixer", 0, settings.name))

@@ -7,7 +7,7 @@ import inspect
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,7 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         overrides: ``KEY=VALUE`` of the fixer's settings; ignored where there is none.
 
     Raises:
-        InputError: As `resolve`; a step count without a fixer; a fixer of whole clips.
+        InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one without the weights that it needs.
     """
     front, plus, base = name.partition("+")
     if not plus:
@@ -138,9 +138,9 @@ def declaration_of(factory: Any, settings: BaseModel | None, folder: Path) -> De
     else:
         given = getattr(factory, "files", {})
         files = given if isinstance(given, Mapping) else {str(path): Path(path) for path in given}
-        attributes = ("trained", "note", "is_remote")
+        attributes = ("trained", "note", "is_remote", "missing")
         declared = Declaration(**{key: getattr(factory, key) for key in attributes if isinstance(getattr(factory, key, None), bool | str)})
-    return Declaration({key: folder / path for key, path in files.items()}, declared.trained, declared.note, declared.is_remote)
+    return replace(declared, files={key: folder / path for key, path in files.items()})
 
 
 def _declares_nothing(kind: KindName, target: str) -> bool:
@@ -180,6 +180,7 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
         dict(getattr(factory, "metrics", {})) if spec.kind == "evaluator" else {},
         str(getattr(factory, "controller", "bicycle")) if spec.kind == "policy" else "",
         spec.address,
+        declared.missing,
     )
 
 
@@ -205,13 +206,16 @@ def _steps_to_front(front: str, base: str) -> tuple[str, str]:
 
 
 def _in_the_loop(fixer: PartSpec) -> PartSpec:
-    """Refuse a fixer that needs frames which a closed loop has not rendered yet."""
+    """Refuse a fixer without weights, and one that needs frames which a closed loop has not rendered yet."""
+    doing, named = "choosing a renderer for a closed loop", f"fixer {fixer.name!r}"
     settings: Any = fixer.settings
     if getattr(settings, "is_offline", False):
         ahead = settings.unit.lookahead_frames
         found = f"its first frame needs {ahead} frames after it, which a closed loop has not driven yet"
         do = f"fix recorded clips with it: simrun refine --fixer {fixer.name}, simrun bench quality --fixer {fixer.name}"
-        raise InputError("choosing a renderer for a closed loop", f"fixer {fixer.name!r}", found, do)
+        raise InputError(doing, named, found, do)
+    if fixer.missing:
+        raise InputError(doing, named, fixer.note, fixer.missing)
     return fixer
 
 

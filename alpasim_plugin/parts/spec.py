@@ -33,6 +33,7 @@ class PartSpec:
         metrics: An evaluator's own metrics.
         controller: A policy's controller.
         address: What follows ``scheme://`` in the name of a remote part.
+        missing: What must be given before it can be built; empty where nothing is missing.
     """
 
     kind: KindName
@@ -46,6 +47,7 @@ class PartSpec:
     metrics: Mapping[str, MetricInfo] = field(default_factory=dict)
     controller: str = ""
     address: str | None = None
+    missing: str = ""
 
     @property
     def label(self) -> str:

@@ -191,7 +191,15 @@ def test_windows_are_refused_in_a_closed_loop_before_anything_is_loaded() -> Non
         resolve_renderer("3dgs-enhancer")
     with pytest.raises(InputError, match="which a closed loop has not driven yet"):
         resolve_renderer("3dgs-enhancer@4+clean")
-    assert resolve_renderer("gsfix3d@4").fixer is not None
+    assert resolve_renderer("gsfix3d@4", ["untrained=random"]).fixer is not None
+
+
+@pytest.mark.parametrize("name", ["difix", "omnidreams@4", "onefixer-2b"])
+def test_a_run_with_a_fixer_without_weights_is_refused_before_it_starts(name: str) -> None:
+    with pytest.raises(InputError, match=r"closed loop[\s\S]*weights missing[\s\S]*give --set fixer\.weights\.dit=FILE"):
+        resolve_renderer(name)
+    with pytest.raises(InputError, match=r"weights missing: vae[\s\S]*give --set fixer\.weights\.vae=FILE"):
+        resolve_renderer(name, [f"weights.dit={__file__}"])
 
 
 @pytest.mark.parametrize(

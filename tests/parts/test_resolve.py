@@ -15,7 +15,7 @@ from alpasim_plugin.parts.loading import load
 from alpasim_plugin.parts.resolve import PLAIN_KINDS
 from alpasim_plugin.parts.source import OWN_ROOT, code_digest, code_files, reached
 
-DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "metrics", "controller")
+DECLARED = ("settings_model", "describe", "files", "trained", "note", "is_remote", "missing", "metrics", "controller")
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
