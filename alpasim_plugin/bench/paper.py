@@ -6,6 +6,7 @@ resumes.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,16 +15,21 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from alpasim_plugin.atomic import write_json
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
+from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.paper.document import Findings
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip
+from evaluators.paper.wrong_map import Shift
 from evaluators.video.summary import TRUTH
 
 DOING = "making the paper's comparison"
@@ -32,7 +38,13 @@ STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (
 OURS = "V9"  # the paper's own method on the backbone that the arms share
 SHIPPED = ("onefixer", "onefixer-dit-tiny")  # rows of their own in every table
 ABLATION = ("V1", "V2", "V3", "V3b", "V4", "V5", "V6", "V7", "V8", "V9")
+UNCONDITIONED = ("V5", "artifixer")  # trained with a black map; without a map's input
 PAPER_LENGTH = {"cycle": 198, "under-trained": 900, "map-error": 198}
+SHIFTS = {shift.label: shift for shift in CONFIGURATIONS}
+MEMORY = """Peak memory of forward and backward of one training sample above that of the network and its inputs, and the time of the second
+of two runs: 256x144, one clip, the rollout on own history with the perceptual term on its last k latents, without decoding.
+"""
+MEMORY_LATENTS, MEMORY_HORIZONS = (8, 12, 16, 24), (1, 4, 8, 12, 16)  # the paper's figure has 16 and 24 latents
 CURVES = ("psnr_db", "perceptual-syn", "warp_l1")
 Told = Callable[[str, int, int, Work, Mapping[str, Any]], None]
 
@@ -72,7 +84,7 @@ class PaperRun:
     seed: int = 0
     filmed: int = 2
     map_clips: int = 8
-    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop")
+    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory")
 
 
 @dataclass
@@ -84,12 +96,16 @@ class Compared:
         works: PROTOCOL -> its works.
         shown: Clips of the page.
         units: ARM -> what it makes at a time and what that costs; None for the render.
+        shifted: The protocol ``map-error`` by configuration, where ``measured`` has groups of them.
+        memory: Peak memory of a training sample by clip length and horizon.
     """
 
     measured: dict[str, Measured] = field(default_factory=dict)
     works: dict[str, list[Work]] = field(default_factory=dict)
     shown: list[ShownClip] = field(default_factory=list)
     units: dict[str, dict[str, Any] | None] = field(default_factory=dict)
+    shifted: Measured | None = None
+    memory: list[MemoryCell] = field(default_factory=list)
 
 
 def arms_in(folder: Path) -> tuple[Variant, ...]:
@@ -130,13 +146,47 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
             _open_loop(run, name, sequences, arms, frozenset(s.name for s in evenly(sequences, run.filmed)), told, out)
     if "cycle" in run.protocols:
         out.shown = shown_clips(out.works["cycle"])
-    shifted = _shifted(arms)
-    if "map-error" in run.protocols and shifted:
-        _open_loop(run, "map-error", evenly(_sequences(run, "cycle"), run.map_clips), shifted, frozenset(), told, out)
-        out.measured["map-error"] = grouped(out.measured["map-error"])
+    if "map-error" in run.protocols:
+        shown = _shifted(arms, run.arms)
+        _open_loop(run, "map-error", evenly(_sequences(run, "cycle"), run.map_clips), shown, frozenset(), told, out)
+        out.shifted = out.measured["map-error"]
+        out.measured["map-error"] = grouped(out.shifted)
     if "closed-loop" in run.protocols and run.drives is not None:
         out.measured["closed-loop"] = drives(run.drives)
+    if "memory" in run.protocols:
+        out.memory = training_memory(run.out / "memory.json")
     return out
+
+
+def findings(compared: Compared) -> Findings:
+    """Return what the document is made of."""
+    shifts = {arm: shift for arm in (compared.shifted.arms if compared.shifted else ()) if (shift := _shift_of(arm)) is not None}
+    cells = compared.memory
+    rises = "rises with both" if monotone(cells) else "does not rise with both everywhere"
+    return Findings(
+        compared.measured,
+        {name: [row_of(work) for work in works] for name, works in compared.works.items()},
+        compared.units,
+        None if compared.shifted is None else (compared.shifted, shifts),
+        f"{MEMORY}\n{memory_table(cells)}\n\nIt {rises}, as the paper says it does, within 10 % (the allocator's).\n" if cells else "",
+    )
+
+
+def _shift_of(arm: str) -> Shift | None:
+    """Return how far the map of an arm of ``map-error`` is off; None for arms beside the configurations."""
+    shift = SHIFTS.get(arm.rpartition(" ")[2])
+    return None if shift is None else Shift(abs(shift.lanes_left_m), shift.boxes_m)
+
+
+def training_memory(path: Path) -> list[MemoryCell]:
+    """Measure the peak memory of a training sample on our backbone over clip length and horizon, once; ``path`` keeps it."""
+    if path.is_file():
+        return [MemoryCell(**cell) for cell in json.loads(path.read_text())]
+    settings = resolve("fixer", "onefixer-dit-tiny", ()).settings
+    assert isinstance(settings, OneFixerSettings)
+    cells = measure_memory(settings, MEMORY_LATENTS, MEMORY_HORIZONS, clips=1, rows=18, columns=32)
+    write_json(path, [cell._asdict() for cell in cells])
+    return cells
 
 
 def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:
@@ -174,14 +224,20 @@ def _features(works: Iterable[Work]) -> dict[str, dict[str, dict[str, Any]]]:
     return out
 
 
-def _shifted(arms: Sequence[Variant]) -> tuple[Variant, ...]:
-    """Return our method under all wrong maps, and the arm without a map as the line to stay above."""
+def _shifted(arms: Sequence[Variant], folder: Path) -> tuple[Variant, ...]:
+    """Return our method under all wrong maps, and the lines to stay above: itself and V5 with a black map, and an arm without a map."""
     by_name = {arm.label: arm for arm in arms}
-    ours = by_name.get(OURS) or by_name.get(SHIPPED[0])
-    if ours is None:
-        return ()
-    wrong = tuple(replace(ours, label=f"{ours.label} {shift.label}", map_shift=shift) for shift in CONFIGURATIONS)
-    return (Variant(RAW), *wrong, *([by_name["V5"]] if "V5" in by_name else []))
+    ours = by_name.get(OURS) or by_name[SHIPPED[0]]
+    wrong = (replace(ours, label=f"{ours.label} {shift.label}", map_shift=shift) for shift in CONFIGURATIONS)
+    lines = (by_name[name] for name in UNCONDITIONED if name in by_name)
+    return (Variant(RAW), *wrong, *([black_map(folder / OURS / BUNDLE)] if OURS in by_name else []), *lines)
+
+
+def black_map(bundle: Path) -> Variant:
+    """Return an arm that is shown a black semantic map, which is what the paper calls unconditioned."""
+    name, settings = bundle_fixer(bundle)
+    others = tuple(setting for setting in settings if setting.partition("=")[0] not in ("uses_map", "no_map"))
+    return Variant(f"{bundle.parent.name}, black map", resolve("fixer", name, (*others, "uses_map=false", "no_map=black")))
 
 
 def grouped(measured: Measured) -> Measured:
@@ -190,15 +246,14 @@ def grouped(measured: Measured) -> Measured:
     Returns:
         Arms ``NAME, lanes 0.25 m aside`` and ``NAME, boxes 0.35 m aside`` beside those without a shift.
     """
-    shifts = {shift.label: shift for shift in CONFIGURATIONS}
     values: dict[str, dict[str, dict[str, list[float]]]] = {}
     plain: dict[str, Mapping[str, Mapping[str, float]]] = {}
     for arm, clips in measured.values.items():
         name, _, label = arm.rpartition(" ")
-        if label not in shifts:
+        if label not in SHIFTS:
             plain[arm] = clips
             continue
-        for group in _groups(name, shifts[label]):
+        for group in _groups(name, SHIFTS[label]):
             for clip, found in clips.items():
                 for metric, value in found.items():
                     values.setdefault(group, {}).setdefault(clip, {}).setdefault(metric, []).append(value)

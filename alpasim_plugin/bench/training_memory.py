@@ -65,6 +65,13 @@ def memory_table(cells: Sequence[MemoryCell]) -> str:
     return "\n".join(lines)
 
 
+def monotone(cells: Sequence[MemoryCell], tolerance: float = 0.1) -> bool:
+    """Tell whether memory rises with the length and with the horizon, within the share that an allocator rounds by."""
+    by_cell = {(cell.latents, cell.horizon): cell.extra_mib for cell in cells}
+    larger = [(a, b) for a in by_cell for b in by_cell if a != b and a[0] <= b[0] and a[1] <= b[1]]
+    return all(by_cell[a] <= (1 + tolerance) * by_cell[b] for a, b in larger)
+
+
 def _measure(sizes: DiTSizes, n: int, k: int, clips: int, rows: int, columns: int, window: int) -> MemoryCell:
     net = CosmosCausalDiT.from_state_dict(initial_weights(sizes, 0))
     generator = torch.Generator().manual_seed(0)

@@ -13,19 +13,19 @@ from rich.console import Console
 
 from alpasim_plugin.atomic import write_json, write_text
 from alpasim_plugin.bench.judged import Judging
-from alpasim_plugin.bench.paper import DOING, PaperRun, compare_arms
-from alpasim_plugin.bench.quality_run import Work, row_of
+from alpasim_plugin.bench.paper import DOING, PaperRun, compare_arms, findings
+from alpasim_plugin.bench.quality_run import Work
 from alpasim_plugin.cli.training_options import whole_numbers
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.reading import read_json_object
 from alpasim_plugin.runtime.provenance import hardware, versions
-from evaluators.paper.document import document
+from evaluators.paper.document import document, draw_figures
 from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
 from evaluators.paper.verdict import judge_claims
 
-PROTOCOLS = ("cycle", "under-trained", "map-error", "closed-loop")
+PROTOCOLS = ("cycle", "under-trained", "map-error", "closed-loop", "memory")
 EPILOG = """
 Examples:
 
@@ -84,17 +84,18 @@ def paper(
             console.print(f"{protocol} {i}/{n} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
 
     found = compare_arms(run, told)
-    rows = {name: [row_of(work) for work in works] for name, works in found.works.items()}
+    made = findings(found)
     judged = judge_claims(found.measured)
     command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"
-    write_text(out / "paper.md", document(published(), found.measured, rows, found.units, why, command))
+    write_text(out / "paper.md", document(published(), made, why, command))
+    draw_figures(made, out)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
     verdicts = [
         {"number": one.claim.number, "verdict": one.verdict, "contests": [asdict(result) for result in one.results]} for one in judged
     ]
     write_json(out / "paper.json", {**facts, "claims": verdicts})
     if found.shown:
-        first = rows["cycle"][0]["size"]
+        first = made.rows["cycle"][0]["size"]
         write_text(out / "side-by-side.html", render_side_by_side(found.shown, (int(first[0]), int(first[1]))))
     print(json.dumps(verdicts) if as_json else f"wrote {out / 'paper.md'}")
 

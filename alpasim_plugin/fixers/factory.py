@@ -73,7 +73,12 @@ def describe(settings: FixerWithWeights) -> Declaration:
     missing = next((part for part in needed_parts(settings) if f"weights.{part}" not in files), None)
     if settings.untrained != "refuse" or missing is None:
         return Declaration(files, trained, note)
-    return Declaration(files, trained, f"weights missing: {missing}" if files else note, missing=weights_to_give(missing, getattr(settings, "trained_by", None)))
+    return Declaration(
+        files,
+        trained,
+        f"weights missing: {missing}" if files else note,
+        missing=weights_to_give(missing, getattr(settings, "trained_by", None)),
+    )
 
 
 def needed_parts(settings: FixerWithWeights) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ Relation = Literal["better", "not better", "close"]
 FD, PERCEPTUAL, CUBOID, XERR, LANE, JITTER = (
     "fd_syn_clip", "perceptual-syn", "cuboid_f1_syn", "lane_xerr_syn_m", "lane_f1_syn", "lane_jitter_syn_m",
 )  # fmt: skip
-MOTION, WARP, PSNR, SSIM, MS = "fvmd_lk", "warp_l1", "psnr_db", "ssim", "ms_per_frame"
+MOTION, WARP, PSNR, SSIM, MS, DRIFT = "fvmd_lk", "warp_l1", "psnr_db", "ssim", "ms_per_frame", "drift_psnr_db"
 CLOSE = 0.10  # share of the second arm's value below which a difference counts as none
 
 ONE_STEP = ("difix", "harmonizer", "harmonizer-temporal", "artifixer", "omnidreams@1", "self-forcing", "one-forcing")
@@ -145,5 +145,10 @@ CLAIMS: tuple[Claim, ...] = (
             *each("map-error", (LANE,), "V9, lanes 0.50 m aside", ("V5",)),
             *each("map-error", (CUBOID,), "V9, boxes 0.35 m aside", ("V5",)),
         ),
+    ),
+    Claim(
+        12, "A temporal Harmonizer that was trained on clean frames drifts on its own outputs; one trained on its own outputs does not",
+        "drift figure",
+        (Contest("cycle", DRIFT, "harmonizer-temporal", "harmonizer-temporal-teacher"),),
     ),
 )  # fmt: skip

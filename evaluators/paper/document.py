@@ -3,50 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from evaluators.aggregate.intervals import t_interval
+from evaluators.paper import wrong_map
 from evaluators.paper.claims import OURS
 from evaluators.paper.measured import Measured
+from evaluators.paper.position import DRIFTING, by_position, distance_by_position, drift, with_half
 from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
 from evaluators.paper.verdict import judge_claims
+from evaluators.video.charts import plot_by_frame
+from evaluators.video.summary import summarise
 
+WRONG_MAP, POSITION, DRIFT = "wrong-map.png", "by-position.png", "drift.png"  # figures beside the document
 PERIOD_MS = 100.0  # between frames of the pairs
 TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a
 block waits for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
 """
-WINDOW = 93  # frames: the length of the paper's training clips
+BASELINE = "3dgs"
 PAIRED = ("psnr_db", "perceptual-syn", "fd_syn_clip", "fvmd_lk", "warp_l1", "lane_f1_syn", "cuboid_f1_syn")
 HOW = """A claim is a paired difference over the same clips, 95 %: a t interval, or for metrics of whole sets (`fd_syn_clip`, `fvmd_lk`)
 a test that swaps whole clips. Bold: shown. Absolute values do not compare with the paper's: other scenes, networks and resolution; our
 metrics stand in the place of those that need networks of others. Every arm but `onefixer` has the same backbone here."""
-SHIFTED = """Lanes and boxes of the semantic map moved by a constant, 45 configurations grouped by distance, clip by clip; render and truth
-as they are.
-"""
 
 
-def document(
-    published: Published,
-    measured: Mapping[str, Measured],
-    rows: Mapping[str, Sequence[Mapping[str, Any]]],
-    units: Mapping[str, Mapping[str, Any] | None],
-    reasons: Mapping[int, str],
-    command: str,
-) -> str:
+@dataclass(frozen=True)
+class Findings:
+    """What a comparison found.
+
+    Args:
+        measured: PROTOCOL -> what was measured; one that was not run is not there. ``map-error`` holds groups of configurations.
+        rows: PROTOCOL -> rows of clips, for quality by frame.
+        units: ARM -> ``frames``, ``lookahead_frames`` and ``calls_per_frame`` of what it makes at a time.
+        shifted: ``map-error`` with an arm for each configuration, and how far each is off.
+        memory: Table of the peak memory of a training sample; empty where it was not measured.
+    """
+
+    measured: Mapping[str, Measured]
+    rows: Mapping[str, Sequence[Mapping[str, Any]]]
+    units: Mapping[str, Mapping[str, Any] | None]
+    shifted: tuple[Measured, Mapping[str, wrong_map.Shift]] | None = None
+    memory: str = ""
+
+
+def document(published: Published, found: Findings, reasons: Mapping[int, str], command: str) -> str:
     """Return the document.
 
     Args:
         published: The paper's numbers.
-        measured: PROTOCOL -> what was measured; one that was not run is named as such.
-        rows: PROTOCOL -> rows of clips, for quality by frame.
-        units: ARM -> ``frames``, ``lookahead_frames`` and ``calls_per_frame`` of what it makes at a time.
+        found: What was measured.
         reasons: Claim -> why it comes out as it does here.
         command: That makes it.
     """
+    measured, rows = found.measured, found.rows
     parts = [f"```bash\n{command}\n```\n", HOW + "\n"]
     for name, table, heading in (
         ("cycle", "cycle", "Cycle renders"),
@@ -65,11 +76,26 @@ def document(
             metrics = [m for m in (PAIRED if name != "closed-loop" else published_ours(published, table)) if mine.has(lead, m)]
             parts.append("\n" + differences(mine, lead, [arm for arm in mine.arms if arm != lead], metrics))
         parts.append(f"\n{_counts(mine)}\n")
-    parts.append("## A wrong map\n\n" + (_map_error(measured["map-error"]) if "map-error" in measured else "Not run.\n"))
-    parts.append("## By position\n\n" + (by_position(rows["under-trained"]) if "under-trained" in rows else "Not run.\n"))
-    parts.append("## Time\n\n" + (_times(measured["cycle"], units) if "cycle" in measured else "Not run.\n"))
-    parts.append("## The paper's claims\n\n" + verdicts(judge_claims(measured), reasons))
+    sections = {
+        "A wrong map": _map_errors(found),
+        "By position": _positions(measured["under-trained"], rows["under-trained"]) if "under-trained" in rows else "",
+        "Drift": drift(measured["cycle"], rows["cycle"]) + f"\n![Quality by frame]({DRIFT})" if "cycle" in rows else "",
+        "Time": _times(measured["cycle"], found.units) if "cycle" in measured else "",
+        "Memory": found.memory,
+        "The paper's claims": verdicts(judge_claims(measured), reasons),
+    }
+    parts += [f"## {heading}\n\n{text or 'Not run.'}\n" for heading, text in sections.items()]
     return "\n".join(parts)
+
+
+def draw_figures(found: Findings, folder: Path) -> None:
+    """Write the document's figures beside it: those of the protocols that were run."""
+    if found.shifted is not None:
+        wrong_map.plot(*found.shifted, folder / WRONG_MAP)
+    for name, protocol, arms in ((POSITION, "under-trained", None), (DRIFT, "cycle", DRIFTING)):
+        shown = [row for row in found.rows.get(protocol, ()) if arms is None or row["arm"] in arms]
+        if shown:
+            plot_by_frame(summarise(shown, BASELINE), folder / name)
 
 
 def published_ours(published: Published, table: str) -> list[str]:
@@ -96,50 +122,17 @@ def _counts(measured: Measured) -> str:
     return f"{most} clips or scenes, {len(measured.arms)} arms."
 
 
-def _map_error(measured: Measured) -> str:
-    metrics = [
-        m
-        for m in ("lane_f1_syn", "lane_xerr_syn_m", "cuboid_f1_syn", "psnr_db", "perceptual-syn")
-        if any(measured.has(a, m) for a in measured.arms)
-    ]
-    rows = []
-    for arm in measured.arms:
-        cells = []
-        for metric in metrics:
-            if not measured.has(arm, metric):
-                cells.append("null")
-                continue
-            found = measured.mean(arm, metric)
-            half = "" if found.low is None or found.high is None else f" ± {(found.high - found.low) / 2:.3f}"
-            cells.append(f"{found.centre:.3f}{half}")
-        rows.append([arm, *cells])
-    return SHIFTED + "\n" + markdown_table(["arm", *metrics], rows)
+def _map_errors(found: Findings) -> str:
+    if "map-error" not in found.measured:
+        return ""
+    text = wrong_map.means(found.measured["map-error"])
+    return text if found.shifted is None else f"{text}\n{wrong_map.ranges(*found.shifted)}\n![Boxes over configurations]({WRONG_MAP})"
 
 
-def by_position(rows: Sequence[Mapping[str, Any]], metrics: Sequence[str] = ("psnr_db", "perceptual-syn")) -> str:
-    """Return quality in windows of 93 frames: mean over clips with its 95 % t interval."""
-    by_arm: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        if all(metric in row["series"] for metric in metrics):
-            by_arm.setdefault(str(row["arm"]), []).append(row)
-    length = min((int(row["frames"]) for row in rows), default=0)
-    edges = [*range(0, length - WINDOW // 2, WINDOW), length] if length > WINDOW else [0, length]
-    out = []
-    for metric in metrics:
-        head = [metric, *(f"{low} to {high - 1}" for low, high in pairwise(edges))]
-        lines = []
-        for arm, mine in by_arm.items():
-            windows = [
-                t_interval([float(np.mean(row["series"][metric][low:high])) for row in mine], "clips") for low, high in pairwise(edges)
-            ]
-            lines.append([arm, *(_with_half(w.centre, w.low, w.high, 2 if metric == "psnr_db" else 4) for w in windows)])
-        out.append(markdown_table(head, lines))
-    return "\n".join(out)
-
-
-def _with_half(centre: float, low: float | None, high: float | None, digits: int) -> str:
-    half = "" if low is None or high is None else f" ± {(high - low) / 2:.{digits}f}"
-    return f"{centre:.{digits}f}{half}"
+def _positions(measured: Measured, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return PSNR, perceptual distance and Frechet distance by position."""
+    frames = min((int(row["frames"]) for row in rows), default=0)
+    return by_position(rows) + "\n" + distance_by_position(measured, frames) + f"\n![Quality by frame]({POSITION})"
 
 
 def _times(measured: Measured, units: Mapping[str, Mapping[str, Any] | None]) -> str:
@@ -152,6 +145,6 @@ def _times(measured: Measured, units: Mapping[str, Mapping[str, Any] | None]) ->
         found = measured.mean(arm, "ms_per_frame")
         first = unit["lookahead_frames"] * PERIOD_MS + unit["frames"] * found.centre
         calls = f"{unit['calls_per_frame']:.3g}"
-        rows.append([arm, _with_half(found.centre, found.low, found.high, 1), calls, str(unit["lookahead_frames"]), f"{first:.0f}"])
+        rows.append([arm, with_half(found.centre, found.low, found.high, 1), calls, str(unit["lookahead_frames"]), f"{first:.0f}"])
     head = ["arm", "ms a frame", "network calls a frame", "look-ahead, frames", "first frame of a block, ms"]
     return TIMES + "\n" + markdown_table(head, rows)

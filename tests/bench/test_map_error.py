@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift, shifted_maps
-from alpasim_plugin.bench.paper import grouped
+from alpasim_plugin.bench.paper import Compared, black_map, findings, grouped
+from alpasim_plugin.fixers import fixer_settings
+from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.geometry import interpolate
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
 from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.types import F64, U8, Scenario
+from evaluators.paper import wrong_map
 from evaluators.paper.measured import Measured
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
@@ -56,6 +61,32 @@ def test_lanes_and_boxes_move_alone(street: Scenario) -> None:
     assert changed[0].any()
     assert changed[1].any()
     assert changed[1].sum() < changed[0].sum() / 2  # one car against the whole road
+
+
+def test_a_box_is_over_configurations_and_its_dot_is_the_true_map(tmp_path: Path) -> None:
+    found_at = {shift.label: {"lane_f1_syn": 0.9 - abs(shift.lanes_left_m), "psnr_db": 20.0} for shift in CONFIGURATIONS}
+    values = {f"V9 {label}": {clip: found for clip in "ab"} for label, found in found_at.items()}
+    raw = Measured({**values, "V5": {clip: {"lane_f1_syn": 0.3} for clip in "ab"}})
+    found = findings(Compared(measured={"map-error": grouped(raw)}, shifted=raw)).shifted
+    assert found is not None
+    measured, shifts = found
+    assert len(shifts) == 45
+    lines = wrong_map.ranges(measured, shifts).splitlines()
+    assert "| lanes 0.25 m | 18 | 0.650 (0.650 to 0.650) | 20.000 (20.000 to 20.000) |" in lines
+    assert "| boxes 0.00 m | 5 | 0.650 (0.400 to 0.900) | 20.000 (20.000 to 20.000) |" in lines
+    wrong_map.plot(measured, shifts, tmp_path / "boxes.png")
+    assert (tmp_path / "boxes.png").stat().st_size > 10_000
+
+
+def test_a_black_map_is_the_bundles_own_fixer_with_another_input() -> None:
+    bundle = fixer_settings("onefixer-dit-tiny").weights.bundle
+    assert bundle is not None
+    arm = black_map(Path(bundle))
+    assert arm.spec is not None
+    settings = arm.spec.settings
+    assert isinstance(settings, OneFixerSettings)
+    assert (settings.uses_map, settings.no_map, arm.spec.trained) == (False, "black", True)
+    assert arm.label == "weights, black map"
 
 
 def test_the_papers_configurations_are_grouped_by_distance() -> None:

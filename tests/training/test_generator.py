@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.bench.training_memory import measure_memory, memory_table
+from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
@@ -282,3 +282,10 @@ def test_memory_grows_with_the_clip_and_the_horizon() -> None:
     by = {(c.latents, c.horizon): c.extra_mib for c in cells}
     assert by[12, 4] > by[4, 4] > 0
     assert "| 12 |" in memory_table(cells)
+    assert monotone(cells)
+
+
+def test_memory_that_falls_with_the_horizon_is_not_monotone() -> None:
+    cells = [MemoryCell(8, 1, 100.0, 1.0), MemoryCell(8, 4, 95.0, 1.0), MemoryCell(16, 4, 300.0, 1.0)]
+    assert monotone(cells)
+    assert not monotone([*cells, MemoryCell(16, 8, 200.0, 1.0)])

@@ -10,9 +10,10 @@ import pytest
 
 from alpasim_plugin.errors import EvaluatorError, InputError
 from evaluators.paper.claims import CLAIMS, Claim, Contest
-from evaluators.paper.document import by_position, document
+from evaluators.paper.document import Findings, document, draw_figures
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip, render_side_by_side
+from evaluators.paper.position import by_position, distance_by_position, drift
 from evaluators.paper.published import Published, published
 from evaluators.paper.tables import paper_against_ours
 from evaluators.paper.verdict import judge_claims
@@ -104,8 +105,8 @@ def test_one_lost_contest_refutes_and_a_missing_arm_leaves_it_open() -> None:
 
 
 def test_claims_name_arms_and_metrics_that_there_are() -> None:
-    known = {arm for table in published().tables.values() for arm in table.rows} | {"3dgs"}
-    measured_as = {metric.ours for metric in published().metrics.values()} | {"ms_per_frame"}
+    known = {arm for table in published().tables.values() for arm in table.rows} | {"3dgs", "harmonizer-temporal-teacher"}
+    measured_as = {metric.ours for metric in published().metrics.values()} | {"ms_per_frame", "drift_psnr_db"}
     for claim in CLAIMS:
         assert claim.contests
         for contest in claim.contests:
@@ -140,8 +141,9 @@ def test_a_document_says_what_was_not_run() -> None:
         for i, clip in enumerate(CLIPS)
     ]
     found: Published = published()
-    text = document(found, {"under-trained": Measured(from_rows(rows))}, {"under-trained": rows}, {}, {}, "simrun bench paper")
-    assert text.count("Not run.") == 5
+    findings = Findings({"under-trained": Measured(from_rows(rows))}, {"under-trained": rows}, {})
+    text = document(found, findings, {}, "simrun bench paper")
+    assert text.count("Not run.") == 7
     assert "Claim 3** was not measured: protocol cycle" in text
     windows = by_position(rows).splitlines()
     assert "| 0 to 92 | 93 to 189 |" in windows[0]
@@ -151,8 +153,43 @@ def test_a_document_says_what_was_not_run() -> None:
 def test_the_first_frame_waits_for_look_ahead_and_the_whole_block() -> None:
     timed = Measured({"V9": {clip: {"ms_per_frame": 20.0} for clip in CLIPS}, "3dgs": {}})
     unit = {"frames": 8, "lookahead_frames": 7, "calls_per_frame": 0.125}
-    text = document(published(), {"cycle": timed}, {}, {"V9": unit, "3dgs": None}, {}, "simrun bench paper")
+    text = document(published(), Findings({"cycle": timed}, {}, {"V9": unit, "3dgs": None}), {}, "simrun bench paper")
     assert "| V9 | 20.0 ± 0.0 | 0.125 | 7 | 860 |" in text  # 7 x 100 ms and 8 x 20 ms
+
+
+def test_distance_by_position_compares_a_window_with_the_same_window_of_the_clean_frames() -> None:
+    rng = np.random.default_rng(0)
+    clean = {clip: rng.normal(size=(12, 3)) for clip in CLIPS}  # 12 vectors of 16 frames: 192 frames
+    late = {clip: x + 5.0 * (np.arange(12) >= 5)[:, None] for clip, x in clean.items()}
+    features = {
+        arm: {clip: {"fd_syn_16": x} for clip, x in mine.items()} for arm, mine in (("truth", clean), ("same", clean), ("late", late))
+    }
+    lines = distance_by_position(Measured({"same": {}, "late": {}}, features), 192).splitlines()
+    assert lines[0].split("|")[2:4] == [" 0 to 79 ", " 80 to 191 "]
+    assert lines[2].split("|")[2:4] == [" 0.0 ", " 0.0 "]
+    assert lines[3].split("|")[2:4] == [" 0.0 ", " 75.0 "]  # 5 in each of 3 dimensions
+    assert distance_by_position(Measured({"same": {}}), 192) == ""
+
+
+def test_drift_sets_both_trainings_of_the_temporal_arm_side_by_side(tmp_path: Path) -> None:
+    falls = {"3dgs": 0.0, "harmonizer-temporal": 0.2, "harmonizer-temporal-teacher": 3.0, "difix": 0.0}
+    rows = [
+        {
+            "arm": arm, "clip": clip, "seed": 0, "frames": 198, "identical": 0, "events": {}, "ms_per_frame": None,
+            "values": {"psnr_db": 24.0 - by / 2, "drift_psnr_db": i / 100 - by},
+            "series": {"psnr_db": np.linspace(24, 24 - by, 198).tolist()},
+        }
+        for arm, by in falls.items()
+        for i, clip in enumerate(CLIPS)
+    ]  # fmt: skip
+    measured = Measured(from_rows(rows))
+    text = drift(measured, rows)
+    assert "| harmonizer-temporal-teacher | 23.75 ± 0.00 |" in text
+    assert "| harmonizer-temporal-teacher | -2.9" in text
+    assert "difix" not in text
+    assert {one.claim.number: one.verdict for one in judge_claims({"cycle": measured})}[12] == "holds"
+    draw_figures(Findings({}, {"cycle": rows}, {}), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["drift.png"]
 
 
 def test_a_page_holds_every_frame_and_refuses_films_of_other_lengths() -> None:
