@@ -95,7 +95,7 @@ class FixerRun:
         """Return a stage's schedule."""
         steps = stage.updates(self.schedule.steps)
         warmup = min(self.schedule.warmup, steps)
-        return replace(self.schedule, steps=steps, warmup=warmup, decay_from=steps if stage.constant_rate else self.schedule.decay_from)
+        return replace(self.schedule, steps=steps, warmup=warmup, decay=stage.decay, last_share=stage.last_share)
 
 
 def train_fixer(

@@ -36,6 +36,13 @@ def log_normal_times(rng: np.random.Generator, count: int) -> Tensor:
     return torch.from_numpy(s / (1 + s))
 
 
+def seen_latents(rng: np.random.Generator, shape: tuple[int, int], dropout: float) -> Tensor:
+    """Draw which latents of windows ``(B, T)`` keep their condition; the first and the last always do."""
+    seen = rng.random(shape) >= dropout
+    seen[:, [0, -1]] = True
+    return torch.from_numpy(seen)
+
+
 def squared_error(error: Tensor, t: Tensor) -> Tensor:
     """Return the squared error of the velocity."""
     return error.square()

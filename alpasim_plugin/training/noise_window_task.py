@@ -14,7 +14,14 @@ from alpasim_plugin.fixers.image_settings import NoiseWindowSettings
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.cut_outs import cut_out
 from alpasim_plugin.training.multi_resolution_noise import multi_resolution_noise
-from alpasim_plugin.training.noise_window import edm_error, log_normal_times, noise_window_errors, squared_error, uniform_times
+from alpasim_plugin.training.noise_window import (
+    edm_error,
+    log_normal_times,
+    noise_window_errors,
+    seen_latents,
+    squared_error,
+    uniform_times,
+)
 from alpasim_plugin.training.picture_batches import PictureBatches, Pictures
 from alpasim_plugin.training.recipes.recipe import StageInputs
 from alpasim_plugin.training.recipes.start import channel_weights_of, transformer_with_render
@@ -34,12 +41,14 @@ class NoiseWindowLoss:
         error: Power and weight of the velocity's error.
         multi_resolution: Whether the noise has structure at several scales; otherwise it is white.
         cut_outs: Whether soft parts of the render are hidden.
+        dropout: Share of a window's latents without their condition, the first and the last excepted.
     """
 
     times: Literal["uniform", "log-normal"]
     error: Literal["squared", "edm"]
     multi_resolution: bool = False
     cut_outs: bool = False
+    dropout: float = 0.0
     perceptual: bool = False
 
     def task(self, inputs: StageInputs) -> NoiseWindowTask:
@@ -48,11 +57,12 @@ class NoiseWindowLoss:
 
 
 class NoiseWindowBatch(NamedTuple):
-    """Frames of windows with their noise ``(B, 16, latents, H / 8, W / 8)`` and times ``(B,)``."""
+    """Frames of windows with their noise ``(B, 16, latents, H / 8, W / 8)``, times ``(B,)`` and seen conditions ``(B, latents)``."""
 
     pictures: Pictures
     eps: Tensor
     t: Tensor
+    seen: Tensor
 
 
 class NoiseWindowTask:
@@ -89,12 +99,14 @@ class NoiseWindowTask:
         eps = torch.from_numpy(rng.standard_normal(shape, dtype=np.float32)) if white else multi_resolution_noise(rng, shape, t)
         if self.config.cut_outs:
             render = cut_out(stream("training", seed, "noise_window.cut_outs", index), render)
-        return NoiseWindowBatch(Pictures(render, clean), eps, t)
+        rng = stream("training", seed, "noise_window.dropout", index)
+        return NoiseWindowBatch(Pictures(render, clean), eps, t, seen_latents(rng, (len(render), self.latents), self.config.dropout))
 
     def loss(self, batch: NoiseWindowBatch, index: int) -> Loss:
         """Return the loss of a batch."""
         with torch.no_grad():
             z_r, z_0 = self.vae.encode(torch.cat(batch.pictures)).chunk(2)
+            z_r = z_r * batch.seen[:, None, :, None, None]
         errors = noise_window_errors(self.net, z_0, z_r, batch.eps, batch.t, self.text, ERRORS[self.config.error])
         loss = channel_weighted(errors, self.channel_weights).mean()
         return loss, {"flow": float(loss.detach())}

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -36,8 +36,9 @@ CARRIED = "carried."
 class Schedule:
     """Optimisation schedule.
 
-    The learning rate rises linearly, then falls to a hundredth along a cosine. With ``decay_from`` it stays at its peak until that update,
-    so that a run whose end is not known yet can go on: ``steps`` and ``decay_from`` may be changed until the decay begins.
+    The learning rate rises linearly, then falls to a share of its peak, along a cosine unless said otherwise. With ``decay_from`` it stays
+    at its peak until that update, so that a run whose end is not known yet can go on: ``steps`` and ``decay_from`` may be changed until
+    the decay begins.
 
     Args:
         steps: Total updates.
@@ -49,6 +50,8 @@ class Schedule:
         ema: Decay of the exponential moving average of the weights.
         save_every: Updates between checkpoints.
         decay_from: Update at which the decay begins; None: at the end of the warm-up.
+        decay: Form of the decay.
+        last_share: Share of the peak at the end.
     """
 
     steps: int
@@ -60,14 +63,20 @@ class Schedule:
     ema: float = 0.999
     save_every: int = 200
     decay_from: int | None = None
+    decay: Literal["cosine", "exponential", "constant"] = "cosine"
+    last_share: float = 0.01
 
     def lr(self, step: int) -> float:
         """Return the learning rate of an update, counted from 0."""
         if step < self.warmup:
             return self.peak_lr * (step + 1) / self.warmup
         begin = self.warmup if self.decay_from is None else max(self.decay_from, self.warmup)
-        t = max(step - begin, 0) / max(self.steps - begin, 1)
-        return self.peak_lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(t, 1.0))))
+        t = min(max(step - begin, 0) / max(self.steps - begin, 1), 1.0)
+        if self.decay == "constant":
+            return self.peak_lr
+        if self.decay == "exponential":
+            return self.peak_lr * self.last_share**t
+        return self.peak_lr * (self.last_share + (1 - self.last_share) * 0.5 * (1 + math.cos(math.pi * t)))
 
     @property
     def identity(self) -> dict[str, Any]:

@@ -24,7 +24,9 @@ from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.recipes.image_arms import IMAGE_ARMS
+from alpasim_plugin.training.recipes.registry import recipe_of
 from alpasim_plugin.training.render_step_task import RenderStepLoss
+from alpasim_plugin.training.trainer import Schedule
 from tests.fixers.fixer_cases import moving_picture, pixels
 
 from .pair_files import make
@@ -106,6 +108,12 @@ def test_an_arm_trains_its_parts_and_its_bundle_is_a_fixer(data: Path, trained: 
     fixed = [frame for block in refine_frames([(frame, None) for frame in frames], fixer) for frame in block.fixed]
     assert np.abs(pixels(fixed).astype(int) - pixels(frames)).max() > 0
     assert [frame.t_us for frame in fixed] == [frame.t_us for frame in frames]
+
+
+def test_the_published_decay_of_gsfix3d_in_the_papers_updates() -> None:
+    stage = recipe_of("gsfix3d").stages[0]
+    schedule = Schedule(10_000, peak_lr=1.0, decay=stage.decay, last_share=stage.last_share)
+    assert schedule.lr(10_000) == pytest.approx(0.1585, abs=1e-4)  # a hundredth after 25,000
 
 
 @pytest.mark.parametrize("recipe", ["harmonizer-temporal", pytest.param("gsfix3d", marks=pytest.mark.slow)])

@@ -22,7 +22,14 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.cut_outs import cut_out, soft_mask
 from alpasim_plugin.training.multi_resolution_noise import multi_resolution_noise
-from alpasim_plugin.training.noise_window import edm_error, log_normal_times, noise_window_errors, squared_error, uniform_times
+from alpasim_plugin.training.noise_window import (
+    edm_error,
+    log_normal_times,
+    noise_window_errors,
+    seen_latents,
+    squared_error,
+    uniform_times,
+)
 from alpasim_plugin.training.render_step import RenderStep, picture_losses, warp_term
 from alpasim_plugin.training.warping import flow_between, warping_loss
 from tests.fixers.fixer_cases import moving_picture, pixels
@@ -148,6 +155,12 @@ def test_the_warping_loss_is_small_where_the_prediction_moves_with_the_clean_fra
     assert float(warping_loss(now, earlier, away)) == pytest.approx(1e-3, rel=1e-3), "outside the picture nothing counts: sqrt(1e-6)"
     weighted = warp_term(now[:, :, None], clip, 2.0)["warp-farneback"]
     assert float(weighted) == pytest.approx(2 * float(warping_loss(now, earlier, flow)), rel=1e-5), "the last four, newest first"
+
+
+def test_conditions_are_dropped_between_the_ends_of_a_window() -> None:
+    seen = seen_latents(np.random.default_rng(0), (2000, 7), 0.2)
+    assert seen[:, [0, -1]].all()
+    assert seen[:, 1:-1].float().mean() == pytest.approx(0.8, abs=0.02)
 
 
 def test_the_enhancers_loss_is_edms_on_the_clean_latents(net: CosmosCausalDiT) -> None:

@@ -102,6 +102,14 @@ def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
     assert s.lr(110) == pytest.approx(0.01)
 
 
+def test_learning_rate_falls_exponentially_or_stays() -> None:
+    s = Schedule(steps=110, peak_lr=2.0, warmup=10, decay="exponential", last_share=0.01)
+    assert [s.lr(step) for step in (4, 10, 60, 110, 500)] == pytest.approx([1.0, 2.0, 0.2, 0.02, 0.02])
+    assert [Schedule(steps=110, peak_lr=2.0, warmup=10, decay="constant").lr(step) for step in (4, 10, 110)] == pytest.approx(
+        [1.0, 2.0, 2.0]
+    )
+
+
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
 def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
     (tmp_path / "log.jsonl").symlink_to("/dev/full")

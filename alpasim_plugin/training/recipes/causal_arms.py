@@ -30,7 +30,7 @@ SELF_FORCING = Stage(
     Distillation(),
     start={"dit": "student.dit", "real": "teacher.dit", "fake": "teacher.dit"},
     trained={"dit": STUDENT, "fake": CRITIC},
-    constant_rate=True,
+    decay="constant",
 )
 ONE_FORCING = replace(SELF_FORCING, objective=Distillation(adversarial=AdversarialTerm()), trained={**SELF_FORCING.trained, "head": CRITIC})
 
@@ -60,7 +60,7 @@ DISTILLED = Stage(
     OPACITY,
     {"dit": "causal.dit", "real": "bidirectional.dit", "fake": "bidirectional.dit"},
     {"dit": STUDENT, "fake": CRITIC},
-    constant_rate=True,
+    decay="constant",
 )
 
 CAUSAL_ARMS = (

@@ -19,6 +19,8 @@ HARMONIZER = Stage(
     "harmonizer", RenderStepLoss(weight=0.3, clamp=0.9), share=10, attention=frame_by_frame, seen=NO_MAP, latents=1,
     trained={"dit": TWO_THIRDS, "vae": TWO_THIRDS}, deployed={"references": 0},
 )  # fmt: skip
+GSFIX3D_LAST_SHARE = 0.01 ** (10_000 / 25_000)  # its rate falls to a hundredth in 25,000 updates; the paper's run has 10,000
+CONDITION_DROPOUT = 0.2  # .1 for the picture alone and .1 for picture and embedding; there is no embedding here
 WINDOW = 7  # latents of 25 frames
 
 
@@ -36,7 +38,7 @@ IMAGE_ARMS = (
         "DiFix3D+: one step from the render, transformer and decoder trained on pictures",
         (
             Stage(
-                "difix", RenderStepLoss(), share=2, attention=frame_by_frame, seen=NO_MAP, latents=1, constant_rate=True,
+                "difix", RenderStepLoss(), share=2, attention=frame_by_frame, seen=NO_MAP, latents=1, decay="constant",
                 trained={"dit": TWO_THIRDS, "vae.decoder": TWO_THIRDS},
             ),
         ),
@@ -56,7 +58,7 @@ IMAGE_ARMS = (
         (
             Stage(
                 "gsfix3d", NoiseWindowLoss("uniform", "squared", multi_resolution=True, cut_outs=True), share=25,
-                attention=frame_by_frame, seen=NO_MAP, latents=1,
+                attention=frame_by_frame, seen=NO_MAP, latents=1, decay="exponential", last_share=GSFIX3D_LAST_SHARE,
             ),
         ),
         fixer="gsfix3d",
@@ -66,8 +68,8 @@ IMAGE_ARMS = (
         "3DGS-Enhancer: windows of 25 frames in eight steps from noise, the render as a condition",
         (
             Stage(
-                "3dgs-enhancer", NoiseWindowLoss("log-normal", "edm"), share=1.25, attention=whole_clip, seen=NO_MAP, latents=WINDOW,
-                start={"dit": f"{INIT_BI}.dit"}, trained={"dit": PartSchedule(rate=1 / 3)},
+                "3dgs-enhancer", NoiseWindowLoss("log-normal", "edm", dropout=CONDITION_DROPOUT), share=1.25, attention=whole_clip,
+                seen=NO_MAP, latents=WINDOW, start={"dit": f"{INIT_BI}.dit"}, trained={"dit": PartSchedule(rate=1 / 3)},
             ),
         ),
         fixer="3dgs-enhancer",

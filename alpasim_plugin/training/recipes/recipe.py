@@ -150,7 +150,8 @@ class Stage:
         start: Initial weights by part: ``SOURCE.PART``, where the source is ``init``, ``init-bi`` or an earlier stage. A part that is not
             named is the objective's to initialise; ``vae`` is then the run's ``--vae``.
         trained: Trained parts, by the first names of their parameters, with learning rates relative to the run's.
-        constant_rate: Whether the learning rate stays at its peak instead of falling along a cosine.
+        decay: How the learning rate falls after the warm-up.
+        last_share: Share of the peak that it falls to.
         latents: Latents from a clip's start; None for the whole clip.
         deployed: Settings of its weights that differ from the recipe's.
     """
@@ -162,7 +163,8 @@ class Stage:
     seen: Seen = Seen()
     start: Mapping[str, str] = field(default_factory=lambda: DIT)
     trained: Mapping[str, PartSchedule] = field(default_factory=lambda: TRAINED_DIT)
-    constant_rate: bool = False
+    decay: Literal["cosine", "exponential", "constant"] = "cosine"
+    last_share: float = 0.01
     latents: int | None = None
     deployed: Mapping[str, Any] = field(default_factory=dict)
 
