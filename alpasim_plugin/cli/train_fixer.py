@@ -102,6 +102,7 @@ def train_fixer_command(
     recolour: Annotated[bool, typer.Option("--recolour/--no-recolour", hidden=True, help="Former name of the option above.")] = True,
     stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
+    snapshots: options.Snapshots = 0,
     threads: options.Threads = None,
     seed: options.Seed = 0,
     fixer: Annotated[str | None, typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's.")] = None,
@@ -122,9 +123,11 @@ def train_fixer_command(
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
     batches = BatchForm(clips, None, columns, seed)
     run = FixerRun(
-        settings, chosen, data, vae, named_weights(init, weights or []), form, batches, schedule, channels == "equal", PRECISIONS[precision]
-    )
+        settings, chosen, data, vae, named_weights(init, weights or []), form, batches, schedule, channels == "equal", PRECISIONS[precision],
+        snapshots,
+    )  # fmt: skip
     progress = options.Progress(run.updates)
+    progress.float32(run.precision, run.stages())
     distance = progress.perceptual_term(metric_weights) if run.perceptual else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
     progress.wrote(train_fixer(run, out, distance, encoded, progress.update, stop_at), as_json)

@@ -29,6 +29,7 @@ Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
 
 STATE_FILE, LOG_FILE, BAD_FILE = "state.safetensors", "log.jsonl", "bad_batch.pt"
+CORE_S = "core_s"  # processor time of an update, all threads together: unlike the wall clock's "s" alike on an idle and on a busy machine
 CARRIED = "carried."
 
 
@@ -209,7 +210,7 @@ class Trainer(Generic[Batch]):
         write_safetensors(self.folder / STATE_FILE, tensors, meta)
 
     def _update(self) -> dict[str, float]:
-        began = time.perf_counter()
+        began, core_began = time.perf_counter(), time.process_time()
         self.optimiser.zero_grad(set_to_none=True)
         sums: dict[str, float] = {}
         n = self.schedule.accumulate
@@ -235,7 +236,7 @@ class Trainer(Generic[Batch]):
         self.step += 1
         self._kept = {} if self._carried is None else dict(self._carried.carried())  # only now: a failed update leaves the last one's
         self._update_average()
-        return {**sums, **norms, "lr": lr, "s": time.perf_counter() - began}
+        return {**sums, **norms, "lr": lr, "s": time.perf_counter() - began, CORE_S: time.process_time() - core_began}
 
     def _clip(self) -> dict[str, float]:
         """Clip the gradients of every part that has any, and return their norms."""

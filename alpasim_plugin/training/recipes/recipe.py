@@ -153,6 +153,7 @@ class Stage:
         constant_rate: Whether the learning rate stays at its peak instead of falling along a cosine.
         latents: Latents from a clip's start; None for the whole clip.
         deployed: Settings of its weights that differ from the recipe's.
+        always_float32: Whether its forward passes are in float32 whatever the run's precision is.
     """
 
     name: str
@@ -165,6 +166,7 @@ class Stage:
     constant_rate: bool = False
     latents: int | None = None
     deployed: Mapping[str, Any] = field(default_factory=dict)
+    always_float32: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:
