@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar
@@ -69,6 +69,10 @@ class Schedule:
         begin = self.warmup if self.decay_from is None else max(self.decay_from, self.warmup)
         t = max(step - begin, 0) / max(self.steps - begin, 1)
         return self.peak_lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(t, 1.0))))
+
+    def of_length(self, steps: int) -> Schedule:
+        """Return the same for another number of updates: a twentieth of them is warm-up, and a checkpoint follows every fortieth."""
+        return replace(self, steps=steps, warmup=max(steps // 20, 1), save_every=max(steps // 40, 5))
 
     @property
     def identity(self) -> dict[str, Any]:

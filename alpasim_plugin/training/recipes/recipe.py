@@ -161,8 +161,8 @@ class Stage:
     share: float = 1.0
     attention: Callable[[int], Attention] = causal
     seen: Seen = Seen()
-    start: Mapping[str, str] = field(default_factory=lambda: DIT)
-    trained: Mapping[str, PartSchedule] = field(default_factory=lambda: TRAINED_DIT)
+    start: Mapping[str, str] = field(default_factory=lambda: dict(DIT))
+    trained: Mapping[str, PartSchedule] = field(default_factory=lambda: dict(TRAINED_DIT))
     constant_rate: bool = False
     latents: int | None = None
     deployed: Mapping[str, Any] = field(default_factory=dict)
