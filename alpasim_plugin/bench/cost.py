@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from alpasim_plugin.bench.quality import Variant
-from alpasim_plugin.bench.quality_run import QualityRun, evenly
+from alpasim_plugin.bench.quality_run import evenly
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -62,7 +62,7 @@ def cost_clips(pairs: Path, clips: int | None, frames: int | None) -> tuple[list
     """Return the clips of split ``val``, their common number of frames, and what they are in words.
 
     Raises:
-        InputError: Fewer than two cycle renders, or none of 17 frames: no window of the judge.
+        InputError: Fewer than two cycle renders.
     """
     sequences = [s for s in PairDataset(pairs, SPLIT).sequences if s.info["degradation"]["kind"] == "cycle"]
     chosen = evenly(sequences, clips or CLIPS)
@@ -73,10 +73,3 @@ def cost_clips(pairs: Path, clips: int | None, frames: int | None) -> tuple[list
     used = min(frames or FRAMES, shortest)
     why = "" if used == (frames or FRAMES) else f" (the shortest clip has no more; the paper's have {FRAMES})"
     return chosen, used, f"{len(chosen)} cycle renders of split {SPLIT}, {used} frames each{why}."
-
-
-def cost_run(base: QualityRun, sequences: Sequence[PairSequence], variants: Sequence[Variant], frames: int) -> QualityRun:
-    """Return the measurements to make, with the options of another run."""
-    from dataclasses import replace
-
-    return replace(base, sequences=sequences, variants=variants, frames=frames)

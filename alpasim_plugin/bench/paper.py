@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from alpasim_plugin.bench.cost import cost_clips, cost_curves
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
@@ -22,6 +23,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.paper.cost import Cost, contested
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip
 from evaluators.video.summary import TRUTH
@@ -84,12 +86,14 @@ class Compared:
         works: PROTOCOL -> its works.
         shown: Clips of the page.
         units: ARM -> what it makes at a time and what that costs; None for the render.
+        cost: Quality against training time; None where it was not asked for.
     """
 
     measured: dict[str, Measured] = field(default_factory=dict)
     works: dict[str, list[Work]] = field(default_factory=dict)
     shown: list[ShownClip] = field(default_factory=list)
     units: dict[str, dict[str, Any] | None] = field(default_factory=dict)
+    cost: Cost | None = None
 
 
 def arms_in(folder: Path) -> tuple[Variant, ...]:
@@ -136,6 +140,12 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
         out.measured["map-error"] = grouped(out.measured["map-error"])
     if "closed-loop" in run.protocols and run.drives is not None:
         out.measured["closed-loop"] = drives(run.drives)
+    if "cost" in run.protocols:
+        curves, snapshots = cost_curves(run.arms)
+        clips, frames, about = cost_clips(run.pairs, run.clips, run.frames)
+        _open_loop(replace(run, frames=frames), "cost", clips, snapshots, frozenset(), told, out)
+        out.cost = Cost(tuple(curves), out.measured["cost"], about)
+        out.measured["cost"] = contested(out.cost)
     return out
 
 

@@ -20,12 +20,15 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.reading import read_json_object
 from alpasim_plugin.runtime.provenance import hardware, versions
+from evaluators.paper.cost import cost_section, plot_cost
 from evaluators.paper.document import document
 from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
 from evaluators.paper.verdict import judge_claims
 
-PROTOCOLS = ("cycle", "under-trained", "map-error", "closed-loop")
+BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop")
+PROTOCOLS = (*BY_DEFAULT, "cost")
+COST_FIGURE = "cost.png"
 EPILOG = """
 Examples:
 
@@ -34,6 +37,8 @@ Examples:
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --drives runs/drives --only cycle,closed-loop --out runs/paper`
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --split val --clips 4 --frames 60 --out runs/first-look`
+
+- `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --only cost --judges 0 --out runs/cost`
 """
 
 
@@ -47,7 +52,7 @@ def paper(
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     long: Annotated[Path | None, typer.Option("--long", help="Pairs of 900 frames for the second table; else those of DATA.")] = None,
     drives: Annotated[Path | None, typer.Option("--drives", help="Finished run folder of the closed loop, for the third table.")] = None,
-    only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(PROTOCOLS),
+    only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(BY_DEFAULT),
     clips: Annotated[int | None, typer.Option("--clips", min=2, help="At most so many clips a protocol, evenly chosen.")] = None,
     frames: Annotated[int | None, typer.Option("--frames", min=2, help="First frames of a clip; as in the paper by default.")] = None,
     judges: Annotated[str | None, typer.Option("--judges", help="Ask the judges of these training seeds, as 0,1 (docs/judges.md).")] = None,
@@ -87,7 +92,10 @@ def paper(
     rows = {name: [row_of(work) for work in works] for name, works in found.works.items()}
     judged = judge_claims(found.measured)
     command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"
-    write_text(out / "paper.md", document(published(), found.measured, rows, found.units, why, command))
+    cost = None if found.cost is None else cost_section(found.cost, COST_FIGURE)
+    write_text(out / "paper.md", document(published(), found.measured, rows, found.units, why, command, cost))
+    if found.cost is not None:
+        plot_cost(found.cost, out / COST_FIGURE)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
     verdicts = [
         {"number": one.claim.number, "verdict": one.verdict, "contests": [asdict(result) for result in one.results]} for one in judged

@@ -65,8 +65,30 @@ class Curve:
         return next((point for point in reversed(self.points) if point.core_minutes <= core_minutes), None)
 
 
-def contested(curves: Sequence[Curve], measured: Measured) -> Measured:
+@dataclass(frozen=True)
+class Cost:
+    """What was measured of training times.
+
+    Args:
+        curves: Of the arms.
+        measured: By labels of their points.
+        about: What the clips are.
+    """
+
+    curves: tuple[Curve, ...]
+    measured: Measured
+    about: str
+
+    @property
+    def metrics(self) -> list[str]:
+        """Metrics that any point has."""
+        labels = [point.label for curve in self.curves for point in curve.points]
+        return [metric for metric in METRICS if any(self.measured.has(label, metric) for label in labels)]
+
+
+def contested(cost: Cost) -> Measured:
     """Return the measurements by names that claims use: every arm at its end, and ours in half of each other arm's time."""
+    curves, measured = cost.curves, cost.measured
     labels = {curve.arm: curve.points[-1].label for curve in curves}
     ours = next((curve for curve in curves if curve.arm == OURS), None)
     for curve in curves:
@@ -78,16 +100,14 @@ def contested(curves: Sequence[Curve], measured: Measured) -> Measured:
     return Measured(values, {**features, **reference}, measured.reference, measured.seed)
 
 
-def cost_section(curves: Sequence[Curve], measured: Measured, frames: str, figure: str) -> str:
-    """Return the section: how, a row for every snapshot, what half of the others' time gives, and the figure.
+def cost_section(cost: Cost, figure: str) -> str:
+    """Return the section: how, the figure, a row for every snapshot, and what half of the others' time gives.
 
     Args:
-        curves: Of the arms.
-        measured: By labels of points.
-        frames: What the clips are.
-        figure: Path of the figure beside the document.
+        cost: What was measured.
+        figure: Path of the figure, from the document's folder.
     """
-    shown = [metric for metric in METRICS if any(measured.has(point.label, metric) for curve in curves for point in curve.points)]
+    curves, measured, shown = cost.curves, cost.measured, cost.metrics
     rows = []
     for curve in curves:
         for point in curve.points:
@@ -96,7 +116,7 @@ def cost_section(curves: Sequence[Curve], measured: Measured, frames: str, figur
     head = ["arm", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[info(m).direction]}" for m in shown)]
     ends = "".join(f"- {curve.arm}: {', '.join(f'{name} to {end:.2f}' for name, end in curve.ends.items())}\n" for curve in curves)
     return (
-        f"{HOW}\n\n{frames}\n\n![Quality against core-minutes, borders of stages dashed]({figure})\n\n"
+        f"{HOW}\n\n{cost.about}\n\n![Quality against core-minutes, borders of stages dashed]({figure})\n\n"
         f"Ends of stages, core-minutes:\n\n{ends}\n{markdown_table(head, rows)}\n{_halves(curves)}"
     )
 
@@ -119,9 +139,9 @@ def _value(measured: Measured, label: str, metric: str) -> str:
     return f"{measured.mean(label, metric).centre:.{(DIGITS | SET_DIGITS).get(metric, 3)}f}"
 
 
-def plot_cost(curves: Sequence[Curve], measured: Measured, path: Path) -> None:
+def plot_cost(cost: Cost, path: Path) -> None:
     """Draw every metric against core-minutes and write a PNG; dashed lines are the ends of stages before the last."""
-    shown = [metric for metric in METRICS if any(measured.has(point.label, metric) for curve in curves for point in curve.points)]
+    curves, measured, shown = cost.curves, cost.measured, cost.metrics
     rows = -(-len(shown) // COLUMNS)
     figure = Figure(figsize=(5.2 * COLUMNS, 3.1 * rows + 0.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -36,6 +36,7 @@ def document(
     units: Mapping[str, Mapping[str, Any] | None],
     reasons: Mapping[int, str],
     command: str,
+    cost: str | None = None,
 ) -> str:
     """Return the document.
 
@@ -46,6 +47,7 @@ def document(
         units: ARM -> ``frames``, ``lookahead_frames`` and ``calls_per_frame`` of what it makes at a time.
         reasons: Claim -> why it comes out as it does here.
         command: That makes it.
+        cost: The section of `cost.cost_section`; None: not run.
     """
     parts = [f"```bash\n{command}\n```\n", HOW + "\n"]
     for name, table, heading in (
@@ -68,6 +70,7 @@ def document(
     parts.append("## A wrong map\n\n" + (_map_error(measured["map-error"]) if "map-error" in measured else "Not run.\n"))
     parts.append("## By position\n\n" + (by_position(rows["under-trained"]) if "under-trained" in rows else "Not run.\n"))
     parts.append("## Time\n\n" + (_times(measured["cycle"], units) if "cycle" in measured else "Not run.\n"))
+    parts.append("## Core-minutes to quality\n\n" + (cost or "Not run.\n"))
     parts.append("## The paper's claims\n\n" + verdicts(judge_claims(measured), reasons))
     return "\n".join(parts)
 
