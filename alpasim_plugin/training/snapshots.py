@@ -51,6 +51,8 @@ def core_seconds(folder: Path) -> list[float]:
     """
     path = folder / LOG_FILE
     rows = read_json_lines(path, DOING)
+    if [row.get("step") for row in rows] != list(range(1, len(rows) + 1)):
+        raise InputError(DOING, str(path), "rows that are not one for each update in order", "train in another folder")
     if not rows or any(CORE_S not in row for row in rows):
         raise InputError(
             DOING, str(path), f"updates without {CORE_S!r}", "train again: the log of an earlier version has no processor time"

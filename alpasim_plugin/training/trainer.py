@@ -164,6 +164,8 @@ class Trainer(Generic[Batch]):
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
+        if self.ranks.is_first:
+            self._cut_log()
 
     def run(self, report: Callable[[int, Mapping[str, float]], None] | None = None, until: int | None = None) -> None:
         """Train to the schedule's end, or to update ``until``.
@@ -299,8 +301,6 @@ class Trainer(Generic[Batch]):
                 self._kept = {name: value[self.ranks.rows(len(value))] for name, value in self._kept.items()}
                 self._carried.carry(self._kept)
             self._take(tensors)
-        if self.ranks.is_first:
-            self._cut_log()
 
     def _take(self, tensors: Mapping[str, Tensor]) -> None:
         """Take weights, averages and moments from a checkpoint's tensors."""
@@ -316,9 +316,9 @@ class Trainer(Generic[Batch]):
                 self.optimiser.state[p] = {k: t if k == "step" else t.to(p.device) for k, t in moments.items()}
 
     def _cut_log(self) -> None:
-        """Drop log rows of updates after the checkpoint, which are repeated, and a last row that a kill cut short."""
+        """Drop log rows of updates after the checkpoint (without one, all), which are repeated, and a last row that a kill cut short."""
         path, doing = self.folder / LOG_FILE, "continuing a training log"
-        if path.exists():
+        if path.is_file():
             lines = read_text(path, doing).split("\n")[:-1]
             with parsing(doing, path, f"remove {path}; only the curves are lost", "not a training log"):
                 kept = [line for line in lines if parse_json(line, path, doing)["step"] <= self.step]
