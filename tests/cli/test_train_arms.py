@@ -93,7 +93,7 @@ def test_a_sweep_makes_the_best_candidate_the_arm_whatever_the_number_of_process
 
 @pytest.mark.slow
 def test_a_budget_of_minutes_is_kept_with_recorded_times(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    train = command(data, "--budget", "minutes", "--minutes", "0.05", "--probe-updates", "5", "--json", out="timed")
+    train = command(data, "--budget", "minutes", "--minutes", "0.02", "--probe-updates", "5", "--json", out="timed")
     assert run_command(train) == 0
     rows = json.loads(capsys.readouterr().out)["arms"]
     probed = (data / "timed" / PROBE_FILE).read_text()
