@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from alpasim_plugin.atomic import write_json
+from alpasim_plugin.bench.cost import cost_clips, cost_curves
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
@@ -26,6 +27,7 @@ from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.paper.cost import Cost, contested
 from evaluators.paper.document import Findings
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip
@@ -98,6 +100,7 @@ class Compared:
         units: ARM -> what it makes at a time and what that costs; None for the render.
         shifted: The protocol ``map-error`` by configuration, where ``measured`` has groups of them.
         memory: Peak memory of a training sample by clip length and horizon.
+        cost: Quality against training time; None where it was not asked for.
     """
 
     measured: dict[str, Measured] = field(default_factory=dict)
@@ -106,6 +109,7 @@ class Compared:
     units: dict[str, dict[str, Any] | None] = field(default_factory=dict)
     shifted: Measured | None = None
     memory: list[MemoryCell] = field(default_factory=list)
+    cost: Cost | None = None
 
 
 def arms_in(folder: Path) -> tuple[Variant, ...]:
@@ -155,6 +159,12 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
         out.measured["closed-loop"] = drives(run.drives)
     if "memory" in run.protocols:
         out.memory = training_memory(run.out / "memory.json")
+    if "cost" in run.protocols:
+        curves, snapshots = cost_curves(run.arms)
+        clips, frames, about = cost_clips(run.pairs, run.clips, run.frames)
+        _open_loop(replace(run, frames=frames), "cost", clips, snapshots, frozenset(), told, out)
+        out.cost = Cost(tuple(curves), out.measured["cost"], about)
+        out.measured["cost"] = contested(out.cost)
     return out
 
 
@@ -169,6 +179,7 @@ def findings(compared: Compared) -> Findings:
         compared.units,
         None if compared.shifted is None else (compared.shifted, shifts),
         f"{MEMORY}\n{memory_table(cells)}\n\nIt {rises}, as the paper says it does, within 10 % (the allocator's).\n" if cells else "",
+        compared.cost,
     )
 
 

@@ -25,7 +25,8 @@ from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
 from evaluators.paper.verdict import judge_claims
 
-PROTOCOLS = ("cycle", "under-trained", "map-error", "closed-loop", "memory")
+BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory")
+PROTOCOLS = (*BY_DEFAULT, "cost")
 EPILOG = """
 Examples:
 
@@ -34,6 +35,8 @@ Examples:
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --drives runs/drives --only cycle,closed-loop --out runs/paper`
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --split val --clips 4 --frames 60 --out runs/first-look`
+
+- `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --only cost --judges 0 --out runs/cost`
 """
 
 
@@ -47,7 +50,7 @@ def paper(
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     long: Annotated[Path | None, typer.Option("--long", help="Pairs of 900 frames for the second table; else those of DATA.")] = None,
     drives: Annotated[Path | None, typer.Option("--drives", help="Finished run folder of the closed loop, for the third table.")] = None,
-    only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(PROTOCOLS),
+    only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(BY_DEFAULT),
     clips: Annotated[int | None, typer.Option("--clips", min=2, help="At most so many clips a protocol, evenly chosen.")] = None,
     frames: Annotated[int | None, typer.Option("--frames", min=2, help="First frames of a clip; as in the paper by default.")] = None,
     judges: Annotated[str | None, typer.Option("--judges", help="Ask the judges of these training seeds, as 0,1 (docs/judges.md).")] = None,

@@ -12,6 +12,8 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli import train_pairs, train_scenes
+from alpasim_plugin.cli.train_arms import EPILOG as ARMS_EXAMPLES
+from alpasim_plugin.cli.train_arms import arms
 from alpasim_plugin.cli.train_decoder import EPILOG as DECODER_EXAMPLE
 from alpasim_plugin.cli.train_decoder import decoder
 from alpasim_plugin.cli.train_fixer import memory_command, onefixer_settings, train_fixer_command
@@ -43,6 +45,7 @@ WIDTH, HEIGHT = 256, 144
 EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
 app.command("per-frame", epilog=PER_FRAME_EXAMPLES)(per_frame)
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
+app.command("arms", epilog=ARMS_EXAMPLES)(arms)
 app.command("decoder", epilog=DECODER_EXAMPLE)(decoder)
 app.command("painter", hidden=True)(decoder)  # former name
 app.command("memory", epilog="Example: `simrun train memory --latents 12,24 --horizon 1,4`")(memory_command)

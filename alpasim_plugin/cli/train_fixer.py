@@ -102,6 +102,7 @@ def train_fixer_command(
     recolour: Annotated[bool, typer.Option("--recolour/--no-recolour", hidden=True, help="Former name of the option above.")] = True,
     stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
     precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
+    snapshots: options.Snapshots = 0,
     threads: options.Threads = None,
     seed: options.Seed = 0,
     fixer: Annotated[str | None, typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's.")] = None,
@@ -118,13 +119,13 @@ def train_fixer_command(
     if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
         do = "leave out --block, --window and --sink"
         raise InputError("choosing what to train", f"recipe {recipe}", "it has no blocks and no history", do)
-    schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), accumulate=accumulate, ema=ema, save_every=max(steps // 40, 5))
+    schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
     batches = BatchForm(clips, None, columns, seed)
-    run = FixerRun(
-        settings, chosen, data, vae, named_weights(init, weights or []), form, batches, schedule, channels == "equal", PRECISIONS[precision]
-    )
+    files, equal = named_weights(init, weights or []), channels == "equal"
+    run = FixerRun(settings, chosen, data, vae, files, form, batches, schedule, equal, PRECISIONS[precision], snapshots)
     progress = options.Progress(run.updates)
+    progress.float32(run.precision, run.stages())
     distance = progress.perceptual_term(metric_weights) if run.perceptual else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
     progress.wrote(train_fixer(run, out, distance, encoded, progress.update, stop_at), as_json)

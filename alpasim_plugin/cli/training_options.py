@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +17,7 @@ from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.nets.image_distance import distance_for_training
 from alpasim_plugin.training.model_card import curves
 from alpasim_plugin.training.perceptual_term import Distance
+from alpasim_plugin.training.recipes.recipe import Stage
 from alpasim_plugin.training.trainer import LOG_FILE
 
 Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; the split 'train' is used.")]
@@ -27,6 +28,7 @@ Latents = Annotated[int, typer.Option("--latents", min=2, help="Latents of a cli
 Stride = Annotated[int, typer.Option("--stride", min=1, help="Frames between the starts of a sequence's clips.")]
 PeakLr = Annotated[float, typer.Option("--lr", min=1e-7, help="Peak learning rate.")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")]
+Snapshots = Annotated[int, typer.Option("--snapshots", min=0, help="Bundles of every stage to keep, at equal intervals of its updates.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, sampling and noise.")]
 MetricWeights = Annotated[
     Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
@@ -80,6 +82,12 @@ class Progress:
         name, measure = distance_for_training(metric_weights)
         self.console.print(f"perceptual term: {name}")
         return name, measure.distance
+
+    def float32(self, precision: torch.dtype | None, stages: Sequence[Stage]) -> None:
+        """Say which stages are trained in float32 though the run's precision is another."""
+        for stage in stages if precision is not None else ():
+            if stage.always_float32:
+                self.console.print(f"stage {stage.name} is trained in float32, whatever --precision says", highlight=False)
 
     def prepared(self, what: str, done: int, count: int, every: int = 10) -> None:
         """Report preparation before the first update."""

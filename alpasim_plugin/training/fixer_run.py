@@ -23,12 +23,14 @@ from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStep
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
+from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.model_card import ModelCard, curves
 from alpasim_plugin.training.pair_store import PairDataset
 from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.recipes.recipe import GIVEN, Recipe, Stage, StageInputs, Task, Weights
+from alpasim_plugin.training.snapshots import snapshot_file, snapshot_steps
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 BUNDLE_FILE = "fixer.safetensors"
@@ -52,7 +54,8 @@ class FixerRun:
         batches: Clips of a batch.
         schedule: Optimisation of a stage of share 1; its updates are the unit U.
         equal_channels: Whether flow matching weights all latent channels alike.
-        precision: Of the forward passes: None is float32.
+        precision: Of the forward passes: None is float32. A stage that is always trained in float32 ignores it.
+        snapshots: Weights that are kept of every stage at equal intervals (`snapshots`); equal weights come out with any number.
     """
 
     settings: TrainableSettings
@@ -65,6 +68,7 @@ class FixerRun:
     schedule: Schedule
     equal_channels: bool = False
     precision: torch.dtype | None = None
+    snapshots: int = 0
 
     def __post_init__(self) -> None:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
@@ -90,6 +94,10 @@ class FixerRun:
     def perceptual(self) -> bool:
         """Whether any stage to train has a perceptual term."""
         return any(stage.objective.perceptual for stage in self.stages())
+
+    def precision_of(self, stage: Stage) -> torch.dtype | None:
+        """Return the precision of a stage's forward passes."""
+        return None if stage.always_float32 else self.precision
 
     def schedule_of(self, stage: Stage) -> Schedule:
         """Return a stage's schedule."""
@@ -130,24 +138,39 @@ def train_fixer(
         if stop_at is not None and stop_at <= before:
             break
         last = stage is run.recipe.stages[-1]
-        path = _train_stage(run, stage, out if last else out / stage.name, clips, files, distance, _from(report, before), stop_at, before)
+        until = None if stop_at is None else stop_at - before
+        path = train_stage(run, stage, out if last else out / stage.name, clips, files, distance, _from(report, before), until)
         files[stage.name] = path
         before += stage.updates(run.schedule.steps)
     return path
 
 
-def _train_stage(
+def train_stage(
     run: FixerRun,
     stage: Stage,
     folder: Path,
     clips: LatentClips,
     files: Mapping[str, Path],
-    distance: tuple[str, Distance] | None,
-    report: Report | None,
-    stop_at: int | None,
-    before: int,
+    distance: tuple[str, Distance] | None = None,
+    report: Report | None = None,
+    until: int | None = None,
 ) -> Path:
-    """Train one stage and write its bundle."""
+    """Train one stage from its last checkpoint, if any, and write its bundle; a finished one is checked and left as it is.
+
+    Args:
+        run: The run that the stage belongs to.
+        stage: One of its recipe.
+        folder: Of this stage alone.
+        clips: Training latents.
+        files: Bundles by the names of the sources that the stage starts from.
+        distance: Name and function of the perceptual term.
+        report: Called after every update with its number and the logged values.
+        until: Update after which to stop; None: the last.
+
+    Raises:
+        InputError: Invalid data or weights, or a folder of another run.
+        InfrastructureError: The loss is not finite.
+    """
     inputs = stage_inputs(run, stage, clips, files, distance)
     task = stage.objective.task(inputs)
     for name, parameter in task.parts.named_parameters():
@@ -158,10 +181,22 @@ def _train_stage(
         "batches": asdict(inputs.form), "equal_channels": run.equal_channels, "seen": asdict(stage.seen),
         "attention": asdict(inputs.attention), "distance": distance[0] if distance else "none",
         "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
-        "vae": file_sha256(run.vae), "precision": str(run.precision),
+        "vae": file_sha256(run.vae), "precision": str(run.precision_of(stage)),
     }  # fmt: skip
-    trainer = Trainer(task.parts, folder, schedule, task.batch, task.loss, facts, run.precision, parts=stage.trained)
-    trainer.run(report, None if stop_at is None else stop_at - before)
+    trainer = Trainer(task.parts, folder, schedule, task.batch, task.loss, facts, run.precision_of(stage), parts=stage.trained)
+    if trainer.step == schedule.steps and is_written(run, stage, folder, schedule):
+        return folder / BUNDLE_FILE
+    kept = snapshot_steps(schedule.steps, run.snapshots)
+
+    def reported(step: int, numbers: Mapping[str, float]) -> None:
+        if step in kept:
+            path = snapshot_file(folder, step)
+            path.parent.mkdir(exist_ok=True)
+            _write_weights(run, stage, path, trainer.averaged(), step, schedule)
+        if report is not None:
+            report(step, numbers)
+
+    trainer.run(reported, until)
     return write_bundle(run, stage, folder, trainer.averaged(), facts, trainer.step, schedule)
 
 
@@ -189,17 +224,37 @@ def write_bundle(
 ) -> Path:
     """Write a stage's weights after ``updates`` updates as one float16 bundle, with its card."""
     recipe, path = run.recipe, folder / BUNDLE_FILE
-    parts = {name: {k: half(v) for k, v in part.items()} for name, part in parts_of(averaged).items() if name in BUNDLED}
-    settings = deployed_settings(run, stage)
-    planned = "" if updates == schedule.steps else f" of {schedule.steps}"
-    name = recipe.name if stage is recipe.stages[-1] else f"{recipe.name}, stage {stage.name}"
-    save_bundle(path, parts, settings, trained=True, note=f"{name}, {updates}{planned} updates")
+    _write_weights(run, stage, path, averaged, updates, schedule)
     rows, hours = curves(folder / LOG_FILE)
     trained = {part: asdict(own) for part, own in stage.trained.items()}
-    training = {"about": recipe.about, "schedule": asdict(schedule), "trained": trained, **facts}
+    training = {
+        "about": recipe.about, "schedule": asdict(schedule), "trained": trained, "always_float32": stage.always_float32, **facts,
+    }  # fmt: skip
     data = {"pairs": "rendered scenes, split train", "sequences": len(PairDataset(run.data, "train").sequences), "form": asdict(run.form)}
-    ModelCard(f"OneFixer weights, recipe {name}: {recipe.about}", data, training, rows, hours).write(path)
+    ModelCard(f"OneFixer weights, recipe {name_of(run, stage)}: {recipe.about}", data, training, rows, hours).write(path)
     return path
+
+
+def is_written(run: FixerRun, stage: Stage, folder: Path, schedule: Schedule) -> bool:
+    """Whether a stage's bundle of all updates and its card are there; an earlier stop may have left those of fewer."""
+    path = folder / BUNDLE_FILE
+    card = path.with_suffix(".card.json")
+    return path.exists() and card.exists() and read_metadata(path).get("note") == _note(run, stage, schedule.steps, schedule)
+
+
+def name_of(run: FixerRun, stage: Stage) -> str:
+    """Return what a stage's weights are called: the recipe, and the stage where it is not the last."""
+    return run.recipe.name if stage is run.recipe.stages[-1] else f"{run.recipe.name}, stage {stage.name}"
+
+
+def _note(run: FixerRun, stage: Stage, updates: int, schedule: Schedule) -> str:
+    planned = "" if updates == schedule.steps else f" of {schedule.steps}"
+    return f"{name_of(run, stage)}, {updates}{planned} updates"
+
+
+def _write_weights(run: FixerRun, stage: Stage, path: Path, averaged: Weights, updates: int, schedule: Schedule) -> None:
+    parts = {name: {k: half(v) for k, v in part.items()} for name, part in parts_of(averaged).items() if name in BUNDLED}
+    save_bundle(path, parts, deployed_settings(run, stage), trained=True, note=_note(run, stage, updates, schedule))
 
 
 def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
@@ -266,4 +321,4 @@ def _from(report: Report | None, before: int) -> Report | None:
     return None if report is None else lambda step, numbers: report(before + step, numbers)
 
 
-__all__ = ["BUNDLE_FILE", "FixerRun", "Task", "deployed_settings", "half", "stage_inputs", "train_fixer", "write_bundle"]
+__all__ = ["BUNDLE_FILE", "FixerRun", "Task", "deployed_settings", "half", "stage_inputs", "train_fixer", "train_stage", "write_bundle"]

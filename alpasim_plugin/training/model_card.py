@@ -16,6 +16,7 @@ import torch
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.reading import read_json_lines
+from alpasim_plugin.training.trainer import CORE_S
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,6 @@ def curves(log: Path, points: int = 25) -> tuple[list[Mapping[str, float]], floa
     parts = [rows[i : i + size] for i in range(0, len(rows), size)]
     out: list[Mapping[str, float]] = []
     for part in parts:
-        keys = [key for key in part[-1] if key not in ("step", "s") and all(key in row for row in part)]
+        keys = [key for key in part[-1] if key not in ("step", "s", CORE_S) and all(key in row for row in part)]
         out.append({"step": part[-1]["step"], **{key: float(f"{sum(row[key] for row in part) / len(part):.5g}") for key in keys}})
     return out, sum(row.get("s", 0.0) for row in rows) / 3600

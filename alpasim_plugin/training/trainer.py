@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, Literal, Protocol, TypeVar
@@ -29,6 +29,7 @@ Batch = TypeVar("Batch")
 Loss = tuple[Tensor, Mapping[str, float]]  # loss, and values for the log
 
 STATE_FILE, LOG_FILE, BAD_FILE = "state.safetensors", "log.jsonl", "bad_batch.pt"
+CORE_S = "core_s"  # processor time of an update, all threads together: unlike the wall clock's "s" alike on an idle and on a busy machine
 CARRIED = "carried."
 
 
@@ -77,6 +78,10 @@ class Schedule:
         if self.decay == "exponential":
             return self.peak_lr * self.last_share**t
         return self.peak_lr * (self.last_share + (1 - self.last_share) * 0.5 * (1 + math.cos(math.pi * t)))
+
+    def of_length(self, steps: int) -> Schedule:
+        """Return the same for another number of updates: a twentieth of them is warm-up, and a checkpoint follows every fortieth."""
+        return replace(self, steps=steps, warmup=max(steps // 20, 1), save_every=max(steps // 40, 5))
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -168,6 +173,8 @@ class Trainer(Generic[Batch]):
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).exists():
             self._resume()
+        if self.ranks.is_first:
+            self._cut_log()
 
     def run(self, report: Callable[[int, Mapping[str, float]], None] | None = None, until: int | None = None) -> None:
         """Train to the schedule's end, or to update ``until``.
@@ -218,7 +225,7 @@ class Trainer(Generic[Batch]):
         write_safetensors(self.folder / STATE_FILE, tensors, meta)
 
     def _update(self) -> dict[str, float]:
-        began = time.perf_counter()
+        began, core_began = time.perf_counter(), time.process_time()
         self.optimiser.zero_grad(set_to_none=True)
         sums: dict[str, float] = {}
         n = self.schedule.accumulate
@@ -244,7 +251,7 @@ class Trainer(Generic[Batch]):
         self.step += 1
         self._kept = {} if self._carried is None else dict(self._carried.carried())  # only now: a failed update leaves the last one's
         self._update_average()
-        return {**sums, **norms, "lr": lr, "s": time.perf_counter() - began}
+        return {**sums, **norms, "lr": lr, "s": time.perf_counter() - began, CORE_S: time.process_time() - core_began}
 
     def _clip(self) -> dict[str, float]:
         """Clip the gradients of every part that has any, and return their norms."""
@@ -303,8 +310,6 @@ class Trainer(Generic[Batch]):
                 self._kept = {name: value[self.ranks.rows(len(value))] for name, value in self._kept.items()}
                 self._carried.carry(self._kept)
             self._take(tensors)
-        if self.ranks.is_first:
-            self._cut_log()
 
     def _take(self, tensors: Mapping[str, Tensor]) -> None:
         """Take weights, averages and moments from a checkpoint's tensors."""
@@ -320,9 +325,9 @@ class Trainer(Generic[Batch]):
                 self.optimiser.state[p] = {k: t if k == "step" else t.to(p.device) for k, t in moments.items()}
 
     def _cut_log(self) -> None:
-        """Drop log rows of updates after the checkpoint, which are repeated, and a last row that a kill cut short."""
+        """Drop log rows of updates after the checkpoint (without one, all), which are repeated, and a last row that a kill cut short."""
         path, doing = self.folder / LOG_FILE, "continuing a training log"
-        if path.exists():
+        if path.is_file():
             lines = read_text(path, doing).split("\n")[:-1]
             with parsing(doing, path, f"remove {path}; only the curves are lost", "not a training log"):
                 kept = [line for line in lines if parse_json(line, path, doing)["step"] <= self.step]

@@ -9,6 +9,7 @@ from typing import Any
 
 from evaluators.paper import wrong_map
 from evaluators.paper.claims import OURS
+from evaluators.paper.cost import Cost, cost_section, plot_cost
 from evaluators.paper.measured import Measured
 from evaluators.paper.position import DRIFTING, by_position, distance_by_position, drift, with_half
 from evaluators.paper.published import Published
@@ -17,7 +18,7 @@ from evaluators.paper.verdict import judge_claims
 from evaluators.video.charts import plot_by_frame
 from evaluators.video.summary import summarise
 
-WRONG_MAP, POSITION, DRIFT = "wrong-map.png", "by-position.png", "drift.png"  # figures beside the document
+WRONG_MAP, POSITION, DRIFT, COST = "wrong-map.png", "by-position.png", "drift.png", "cost.png"  # figures beside the document
 PERIOD_MS = 100.0  # between frames of the pairs
 TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a
 block waits for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
@@ -39,6 +40,7 @@ class Findings:
         units: ARM -> ``frames``, ``lookahead_frames`` and ``calls_per_frame`` of what it makes at a time.
         shifted: ``map-error`` with an arm for each configuration, and how far each is off.
         memory: Table of the peak memory of a training sample; empty where it was not measured.
+        cost: Quality against training time; None where it was not measured.
     """
 
     measured: Mapping[str, Measured]
@@ -46,6 +48,7 @@ class Findings:
     units: Mapping[str, Mapping[str, Any] | None]
     shifted: tuple[Measured, Mapping[str, wrong_map.Shift]] | None = None
     memory: str = ""
+    cost: Cost | None = None
 
 
 def document(published: Published, found: Findings, reasons: Mapping[int, str], command: str) -> str:
@@ -82,6 +85,7 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
         "Drift": drift(measured["cycle"], rows["cycle"]) + f"\n![Quality by frame]({DRIFT})" if "cycle" in rows else "",
         "Time": _times(measured["cycle"], found.units) if "cycle" in measured else "",
         "Memory": found.memory,
+        "Core-minutes to quality": "" if found.cost is None else cost_section(found.cost, COST),
         "The paper's claims": verdicts(judge_claims(measured), reasons),
     }
     parts += [f"## {heading}\n\n{text or 'Not run.'}\n" for heading, text in sections.items()]
@@ -92,6 +96,8 @@ def draw_figures(found: Findings, folder: Path) -> None:
     """Write the document's figures beside it: those of the protocols that were run."""
     if found.shifted is not None:
         wrong_map.plot(*found.shifted, folder / WRONG_MAP)
+    if found.cost is not None:
+        plot_cost(found.cost, folder / COST)
     for name, protocol, arms in ((POSITION, "under-trained", None), (DRIFT, "cycle", DRIFTING)):
         shown = [row for row in found.rows.get(protocol, ()) if arms is None or row["arm"] in arms]
         if shown:

@@ -32,7 +32,13 @@ SELF_FORCING = Stage(
     trained={"dit": STUDENT, "fake": CRITIC},
     decay="constant",
 )
-ONE_FORCING = replace(SELF_FORCING, objective=Distillation(adversarial=AdversarialTerm()), trained={**SELF_FORCING.trained, "head": CRITIC})
+# Its second regulariser divides differences of logits by .01, which bfloat16 rounds away.
+ONE_FORCING = replace(
+    SELF_FORCING,
+    objective=Distillation(adversarial=AdversarialTerm()),
+    trained={**SELF_FORCING.trained, "head": CRITIC},
+    always_float32=True,
+)
 
 
 def long_blocks(latents: int) -> Attention:

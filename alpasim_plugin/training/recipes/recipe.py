@@ -154,6 +154,7 @@ class Stage:
         last_share: Share of the peak that it falls to.
         latents: Latents from a clip's start; None for the whole clip.
         deployed: Settings of its weights that differ from the recipe's.
+        always_float32: Whether its forward passes are in float32 whatever the run's precision is.
     """
 
     name: str
@@ -161,12 +162,13 @@ class Stage:
     share: float = 1.0
     attention: Callable[[int], Attention] = causal
     seen: Seen = Seen()
-    start: Mapping[str, str] = field(default_factory=lambda: DIT)
-    trained: Mapping[str, PartSchedule] = field(default_factory=lambda: TRAINED_DIT)
+    start: Mapping[str, str] = field(default_factory=lambda: dict(DIT))
+    trained: Mapping[str, PartSchedule] = field(default_factory=lambda: dict(TRAINED_DIT))
     decay: Literal["cosine", "exponential", "constant"] = "cosine"
     last_share: float = 0.01
     latents: int | None = None
     deployed: Mapping[str, Any] = field(default_factory=dict)
+    always_float32: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:

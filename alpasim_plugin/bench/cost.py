@@ -1,0 +1,75 @@
+"""Quality against core-minutes of training: snapshots of our method and of the distilled arms, with the stages that they need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from alpasim_plugin.bench.quality import Variant
+from alpasim_plugin.bench.quality_run import evenly
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.parts import resolve
+from alpasim_plugin.training.arms.run import arms_of
+from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from alpasim_plugin.training.snapshots import core_seconds, snapshots_of
+from evaluators.paper.claims import DISTILLED, OURS
+from evaluators.paper.cost import Curve, Point
+
+DOING = "measuring quality against training time"
+SPLIT = "val"
+CLIPS, FRAMES = 8, 93  # the paper's clips are the length of its training clips
+ARMS = (OURS, *DISTILLED)
+
+
+def cost_curves(arms: Path) -> tuple[list[Curve], list[Variant]]:
+    """Return the curve of each arm that was trained, and the snapshots to measure, each once.
+
+    The snapshots of a stage that is no causal generator of short blocks, such as a teacher, are left out; its time counts.
+
+    Raises:
+        InputError: None of the arms was trained, or one without snapshots or processor times.
+    """
+    trained = arms_of(arms)
+    curves, variants = [], dict[str, Variant]()
+    for arm in (arm for arm in ARMS if arm in trained):
+        points, ends, before_s = list[Point](), dict[str, float](), 0.0
+        for stage in trained[arm]:
+            for label, variant, step, core_s in _snapshots(arms, stage):
+                points.append(Point(stage, step, (before_s + core_s) / 60, label))
+                variants[label] = variant
+            before_s += core_seconds(arms / stage)[-1]
+            ends[stage] = before_s / 60
+        curves.append(Curve(arm, tuple(points), ends))
+    if not curves:
+        found = f"none of {', '.join(ARMS)}"
+        raise InputError(DOING, str(arms), found, "train them: 'simrun train arms --only V9,self-forcing,one-forcing'")
+    return curves, list(variants.values())
+
+
+def _snapshots(arms: Path, stage: str) -> Iterator[tuple[str, Variant, int, float]]:
+    for snapshot in snapshots_of(arms / stage):
+        name, overrides = bundle_fixer(snapshot.path)
+        spec = resolve("fixer", name, overrides)
+        if isinstance(spec.settings, OneFixerSettings) and spec.settings.history != "finalise":
+            return  # a bidirectional network: the clip is one block
+        label = f"{stage.replace('/', ' ')} after {snapshot.step}"
+        yield label, Variant(label, spec), snapshot.step, snapshot.core_s
+
+
+def cost_clips(pairs: Path, clips: int | None, frames: int | None) -> tuple[list[PairSequence], int, str]:
+    """Return the clips of split ``val``, their common number of frames, and what they are in words.
+
+    Raises:
+        InputError: Fewer than two cycle renders.
+    """
+    sequences = [s for s in PairDataset(pairs, SPLIT).sequences if s.info["degradation"]["kind"] == "cycle"]
+    chosen = evenly(sequences, clips or CLIPS)
+    if len(chosen) < 2:
+        found = f"{len(chosen)} cycle renders, two are needed"
+        raise InputError(DOING, f"{pairs}, split {SPLIT}", found, "make such pairs: 'simrun train pairs SCENES --split val'")
+    shortest = min(len(sequence.clip) for sequence in chosen)
+    used = min(frames or FRAMES, shortest)
+    why = "" if used == (frames or FRAMES) else f" (the shortest clip has no more; the paper's have {FRAMES})"
+    return chosen, used, f"{len(chosen)} cycle renders of split {SPLIT}, {used} frames each{why}."

@@ -1,0 +1,229 @@
+"""``simrun train arms``: every arm of the paper's comparison, with the stages that arms have in common trained once."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+
+from alpasim_plugin.bench.arm_choice import Choice
+from alpasim_plugin.cli import training_options as options
+from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, choice_name, read_choice, tasks_of, work
+from alpasim_plugin.cli.train_fixer import PRECISIONS, named_weights
+from alpasim_plugin.errors import InputError
+from alpasim_plugin.runtime.dependent import run_dependent
+from alpasim_plugin.stopping import Stopped
+from alpasim_plugin.training.arms.budget import in_equal_time, related
+from alpasim_plugin.training.arms.plan import Plan, comparison, plan, training_names
+from alpasim_plugin.training.arms.run import ArmsRun, probe, write_plan
+from alpasim_plugin.training.clip_batches import BatchForm
+from alpasim_plugin.training.latent_clips import ClipForm
+from alpasim_plugin.training.recipes.recipe import Recipe
+from alpasim_plugin.training.recipes.registry import with_perceptual_weight
+from alpasim_plugin.training.snapshots import core_seconds
+from alpasim_plugin.training.trainer import Schedule
+from evaluators.paper.tables import markdown_table
+
+EVERY_S = 20.0  # between lines of progress
+EPILOG = """
+Examples:
+
+- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms --steps 400 --jobs 2`
+
+- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms-60 --budget minutes --minutes 60`
+
+- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/swept --sweep 1e-4,3e-4,1e-3 --sweep-steps 50 --only V9,difix`
+"""
+
+
+def arms(
+    data: options.Pairs,
+    vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder of the arms; the same command resumes it.")],
+    only: Annotated[str | None, typer.Option("--only", help="Comma-separated arms; by default all of docs/arms.md.")] = None,
+    weights: Annotated[
+        list[str] | None, typer.Option("--weights", help="base=FILE or base-bi=FILE: an initial network that is not trained. Repeatable.")
+    ] = None,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")] = 400,
+    base_steps: Annotated[int, typer.Option("--base-steps", min=1, help="Updates of base and of base-bi.")] = 400,
+    base_lr: Annotated[float, typer.Option("--base-lr", min=1e-7, help="Peak learning rate of base and base-bi.")] = 1e-3,
+    budget: Annotated[
+        Literal["updates", "minutes"], typer.Option("--budget", help="Updates as in the paper; or equal core-minutes for every arm.")
+    ] = "updates",
+    minutes: Annotated[float | None, typer.Option("--minutes", min=0.01, help="Core-minutes of every arm, all of its stages.")] = None,
+    probe_updates: Annotated[int, typer.Option("--probe-updates", min=5, help="Updates of every stage that are timed first.")] = 20,
+    sweep: Annotated[str | None, typer.Option("--sweep", help="Learning rates, comma-separated: the best on split val is the arm.")] = None,
+    sweep_steps: Annotated[int | None, typer.Option("--sweep-steps", min=1, help="U of the candidates; then the best in full.")] = None,
+    sweep_clips: Annotated[int | None, typer.Option("--sweep-clips", min=1, help="At most so many clips to choose by.")] = None,
+    clips: options.Clips = 4,
+    accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")] = 2,
+    latents: options.Latents = 12,
+    columns: Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")] = None,
+    stride: options.Stride = 24,
+    lr: options.PeakLr = 2e-4,
+    ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.99,
+    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper.")] = 10.0,
+    channels: Annotated[
+        Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: by amplitude in pixels, or equal.")
+    ] = "amplitude",
+    precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
+    snapshots: options.Snapshots = 8,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Stages at a time, each in a process with one thread.")] = 1,
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads, with one job.")] = 1,
+    seed: options.Seed = 0,
+    metric_weights: options.MetricWeights = None,
+    as_json: options.AsJson = False,
+    debug: options.Debug = False,
+) -> None:
+    """Train the systems of the paper's comparison into OUT/NAME, every stage that several have once; 'simrun bench paper' measures them."""
+    del debug
+    if jobs > 1 and threads > 1:
+        raise InputError(DOING, f"--jobs {jobs} --threads {threads}", "several threads in several processes", "leave one of them out")
+    if (minutes is None) == (budget == "minutes"):
+        found = "minutes without a number" if minutes is None else "a number of minutes for a budget of updates"
+        raise InputError(DOING, f"--budget {budget}", found, "write --budget minutes --minutes 60")
+    options.use_threads(threads)
+    schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
+    run = ArmsRun(
+        data, vae, out, ClipForm(latents, stride), BatchForm(clips, None, columns, seed), schedule,
+        replace(schedule, peak_lr=base_lr).of_length(base_steps), named_weights(None, weights or []), channels == "equal",
+        PRECISIONS[precision], snapshots, metric_weights,
+    )  # fmt: skip
+    recipes = tuple(with_perceptual_weight(recipe, perceptual) for recipe in comparison())
+    chosen = [recipe.name for recipe in recipes] if only is None else [name.strip() for name in only.split(",") if name.strip()]
+    swept = None if sweep is None else Sweep(rates_of(sweep), sweep_steps, sweep_clips)
+    if swept is None and (sweep_steps, sweep_clips) != (None, None):
+        raise InputError(DOING, "--sweep-steps, --sweep-clips", "no rates to choose from", "give --sweep 1e-4,3e-4,1e-3")
+    telling = Telling()
+    planned = plan(recipes, chosen, run.given)
+    run.clips(telling.encoded)
+    if minutes is not None:
+        recipes = equal_time(run, recipes, chosen, minutes, probe_updates, telling)
+        planned = plan(recipes, chosen, run.given)
+    write_plan(run, planned, {"budget": budget, "minutes": minutes})
+    tasks = list(tasks_of(run, planned, swept))
+    telling.begin(tasks, jobs)
+    try:
+        run_dependent(work, tasks, jobs, telling.heard)
+    except Stopped as stopped:
+        stopped.kept = f"{out} keeps finished stages and the last checkpoint of those begun; the same command resumes"
+        raise
+    rows = summary(run, planned, swept)
+    telling.say(table(rows))
+    if as_json:
+        print(json.dumps({"arms": rows}))
+
+
+def equal_time(
+    run: ArmsRun, recipes: Sequence[Recipe], chosen: Sequence[str], minutes: float, updates: int, telling: Telling
+) -> tuple[Recipe, ...]:
+    """Return the recipes with equal core-minutes, their updates timed where they are not yet."""
+    mine = related(recipes, chosen)
+    names = training_names(recipes)
+    wanted = {names[recipe.name, stage.name] for recipe in mine for stage in recipe.stages}
+    trainings = [one for one in plan(recipes, [recipe.name for recipe in recipes]).trainings if one.name in wanted]
+    seconds = probe(run, trainings, updates, lambda name, s: telling.say(f"{name}: {s:.3g} core-seconds an update"))
+    return in_equal_time(mine, names, seconds, minutes, run.schedule.steps)
+
+
+def rates_of(text: str) -> tuple[float, ...]:
+    """Return the learning rates of a sweep.
+
+    Raises:
+        InputError: Not at least two different positive numbers.
+    """
+    try:
+        rates = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        rates = ()
+    if len(set(rates)) < 2 or len(set(rates)) != len(rates) or min(rates) <= 0:
+        raise InputError(DOING, f"--sweep {text}", "not at least two different learning rates", "write for example --sweep 1e-4,3e-4,1e-3")
+    return rates
+
+
+class Telling:
+    """Progress on standard error: stages, losses, and the time left, from the mean time of an update of each stage so far."""
+
+    def __init__(self) -> None:
+        self.console, self.last_s = Console(stderr=True), time.monotonic()
+        self.total: dict[str, int] = {}  # updates by stage
+        self.updates: dict[str, int] = {}  # of unfinished stages: those still to make
+        self.taken: dict[str, list[float]] = defaultdict(list)
+        self.stages = self.jobs = 0
+
+    def say(self, text: str) -> None:
+        """Print a line as it is."""
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def encoded(self, done: int, count: int) -> None:
+        """Report the encoding of clips."""
+        if done == count or time.monotonic() - self.last_s > EVERY_S:
+            self.last_s = time.monotonic()
+            self.say(f"clips as latents, sequences: {done}/{count}")
+
+    def begin(self, tasks: Sequence[StageTask | ChoiceTask], jobs: int) -> None:
+        """Take the stages, and name those in another precision than the run's."""
+        self.jobs = jobs
+        self.updates = {task.name: task.updates for task in tasks if isinstance(task, StageTask)}
+        self.total, self.stages = dict(self.updates), len(self.updates)
+        self.say(f"{self.stages} stages, {sum(self.updates.values())} updates")
+        for task in tasks:
+            if isinstance(task, StageTask) and task.training.stage.always_float32 and task.run.precision is not None:
+                self.say(f"{task.name} is trained in float32, whatever --precision says")
+
+    def heard(self, name: str, said: Any) -> None:
+        """Report what a task says."""
+        if isinstance(said, Updated):
+            of = self.total[name]
+            self.taken[name].append(said.s)
+            self.updates[name] = of - said.step
+            if time.monotonic() - self.last_s > EVERY_S:
+                self.last_s = time.monotonic()
+                self.say(f"{name} {said.step}/{of}, loss {said.loss:.4g}; {self._left()}")
+        elif isinstance(said, Trained):
+            made = len(self.taken[name])
+            self.updates.pop(name)
+            done = self.stages - len(self.updates)
+            self.say(f"[{done}/{self.stages}] {name}: {f'{made} updates' if made else 'was finished'}; {self._left()}")
+        elif isinstance(said, Choice):
+            scores = "; ".join(f"{rate:g}: {score}" for rate, score in said.scores.items())
+            self.say(f"{name}: learning rate {said.rate:g} is the best ({scores}; {len(said.clips)} clips of val)")
+
+    def _left(self) -> str:
+        """Return the time left; a stage without an update yet is taken to be as fast as the others' mean."""
+        means = {one: sum(times) / len(times) for one, times in self.taken.items() if times}
+        if not means or not self.updates:
+            return "nothing left" if not self.updates else "time left not known yet"
+        usual = sum(means.values()) / len(means)
+        left_s = sum(means.get(one, usual) * count for one, count in self.updates.items())
+        return f"about {left_s / self.jobs / 60:.0f} min left"
+
+
+def summary(run: ArmsRun, planned: Plan, swept: Sweep | None) -> list[dict[str, Any]]:
+    """Return a row for every arm: its stages with their updates, core-minutes of all of them, its rate where one was chosen."""
+    rows: list[dict[str, Any]] = []
+    for arm, trainings in planned.arms.items():
+        times = {name: core_seconds(run.out / name) for name in trainings}
+        choice = None if swept is None else read_choice(run.out / f"{choice_name(arm)}.json")
+        rows.append({
+            "arm": arm, "stages": {name: len(found) for name, found in times.items()},
+            "core_minutes": sum(found[-1] for found in times.values()) / 60, "rate": None if choice is None else choice.rate,
+            "weights": str(run.bundle_of(arm)),
+        })  # fmt: skip
+    return rows
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the summary as text; a stage that several arms have counts for each."""
+    lines = []
+    for row in rows:
+        stages = " + ".join(f"{name} {updates}" for name, updates in row["stages"].items())
+        lines.append([row["arm"], stages, f"{row['core_minutes']:.2f}", "as given" if row["rate"] is None else f"{row['rate']:g}"])
+    return markdown_table(["arm", "stages and updates", "core-minutes", "learning rate"], lines)

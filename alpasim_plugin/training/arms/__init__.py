@@ -1,0 +1,1 @@
+"""The arms of the paper's comparison, trained as one whole."""

@@ -1,0 +1,119 @@
+"""`simrun train arms`: two arms with a stage in common, trained, resumed, measured against their time; and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.bench.cost import cost_curves
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.nets import TinyVAE
+from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from alpasim_plugin.training.arms.run import PROBE_FILE
+from alpasim_plugin.training.snapshots import core_seconds, snapshots_of
+from tests.training.pair_files import make
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("arms")
+    make(root / "pairs", "train", "a", frames=9)
+    for name in ("b", "c"):
+        sequence = make(root / "pairs", "val", name, frames=9)
+        path = sequence.folder / "sequence.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "degradation": {"kind": "cycle"}}))
+    TinyVAE.random(TinySizes(16, 16, 16, 16, 16)).save(root / "vae.safetensors")
+    return root
+
+
+def command(data: Path, *more: str, out: str = "arms", only: str = "omnidreams,self-forcing") -> list[str]:
+    fixed = ["--latents", "2", "--stride", "4", "--clips", "1", "--accumulate", "1", "--columns", "4", "--base-steps", "1"]
+    names = ["--vae", str(data / "vae.safetensors"), "--out", str(data / out), "--only", only]
+    return ["train", "arms", str(data / "pairs"), *names, *fixed, *more]
+
+
+def test_arms_share_a_stage_resume_and_are_measured_against_their_time(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train = command(data, "--steps", "2", "--snapshots", "2")
+    assert run_command([*train, "--json"]) == 0
+    got = capsys.readouterr()
+    rows = {row["arm"]: row for row in json.loads(got.out)["arms"]}
+    assert rows["self-forcing"]["stages"] == {"self-forcing/teacher": 2, "omnidreams": 2, "self-forcing": 2}
+    out = data / "arms"
+    assert sorted(path.parent.name for path in out.glob("*/fixer.safetensors")) == ["omnidreams", "self-forcing"]
+    assert [snapshot.step for snapshot in snapshots_of(out / "omnidreams")] == [1, 2]
+    card = json.loads((out / "self-forcing" / "fixer.card.json").read_text())["training"]
+    teacher = json.loads((out / "self-forcing" / "teacher" / "fixer.card.json").read_text())["training"]
+    assert (card["start"]["real"], card["start"]["dit"]) != (teacher["start"]["dit"], card["start"]["real"])
+
+    written = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
+    assert run_command(train) == 0
+    assert "was finished" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in written} == written
+    assert run_command([*train, "--lr", "1e-3"]) == 2
+    assert "it was begun as" in capsys.readouterr().err
+
+    (curve,), variants = cost_curves(out)
+    before = core_seconds(out / "self-forcing" / "teacher")[-1] / 60
+    assert [point.stage for point in curve.points] == ["omnidreams"] * 2 + ["self-forcing"] * 2, "the teacher's time counts alone"
+    assert before < curve.points[0].core_minutes < curve.core_minutes == pytest.approx(rows["self-forcing"]["core_minutes"])
+    assert len(variants) == 4
+
+    measure = ["bench", "paper", str(data / "pairs"), "--arms", str(out), "--only", "cost", "--out", str(data / "cost"), "--json"]
+    assert run_command(measure) == 0
+    text = (data / "cost" / "paper.md").read_text()
+    assert "9 frames each (the shortest clip has no more" in text
+    assert "| self-forcing | omnidreams | 1 |" in text
+    assert (data / "cost" / "cost.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_sweep_makes_the_best_candidate_the_arm_whatever_the_number_of_processes(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sweep = ["--steps", "2", "--snapshots", "1", "--sweep", "1e-4,3e-3", "--json"]
+    found = {}
+    for out, jobs in (("one", "1"), ("two", "2")):
+        assert run_command(command(data, *sweep, "--jobs", jobs, out=out, only="omnidreams")) == 0
+        row = json.loads(capsys.readouterr().out)["arms"][0]
+        arm = data / out / "omnidreams"
+        card = json.loads((arm / "fixer.card.json").read_text())["sweep"]
+        best = min(card["scores"], key=lambda rate: card["scores"][rate]["perceptual-syn"])
+        assert f"{row['rate']:g}" == f"{card['rate']:g}" == best
+        assert (arm / "fixer.safetensors").samefile(data / out / "sweep" / f"omnidreams@{best}" / "fixer.safetensors")
+        found[out] = card["scores"]
+    assert found["one"] == found["two"]
+    assert run_command(command(data, "--steps", "2", out="one", only="omnidreams")) == 2
+    assert "chosen by a sweep" in capsys.readouterr().err
+    assert run_command(command(data, *sweep, "--sweep-steps", "1", out="short", only="omnidreams")) == 0
+    row = json.loads(capsys.readouterr().out)["arms"][0]
+    assert row["stages"] == {"omnidreams": 2}
+    assert len(core_seconds(data / "short" / "sweep" / f"omnidreams@{row['rate']:g}")) == 1
+    assert json.loads((data / "short" / "omnidreams" / "fixer.card.json").read_text())["sweep"]["rate"] == row["rate"]
+
+
+@pytest.mark.slow
+def test_a_budget_of_minutes_is_kept_with_recorded_times(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train = command(data, "--budget", "minutes", "--minutes", "0.02", "--probe-updates", "5", "--json", out="timed")
+    assert run_command(train) == 0
+    rows = json.loads(capsys.readouterr().out)["arms"]
+    probed = (data / "timed" / PROBE_FILE).read_text()
+    assert {"self-forcing/teacher", "omnidreams", "self-forcing", "one-forcing"} == set(json.loads(probed)["seconds_of_update"])
+    assert run_command(train) == 0, "the same updates again, by the recorded times"
+    assert json.loads(capsys.readouterr().out)["arms"] == rows
+    assert (data / "timed" / PROBE_FILE).read_text() == probed
+
+
+@pytest.mark.parametrize(
+    ("more", "found"),
+    [
+        (["--budget", "minutes"], "minutes without a number"),
+        (["--minutes", "3"], "a number of minutes for a budget of updates"),
+        (["--jobs", "2", "--threads", "2"], "several threads in several processes"),
+        (["--sweep", "1e-4"], "not at least two different learning rates"),
+        (["--sweep-steps", "3"], "no rates to choose from"),
+        (["--weights", "init=x"], "no initial network"),
+    ],
+)
+def test_options_that_do_not_fit_together_are_refused(data: Path, capsys: pytest.CaptureFixture[str], more: list[str], found: str) -> None:
+    assert run_command(command(data, *more)) == 2
+    assert found in " ".join(capsys.readouterr().err.split())
