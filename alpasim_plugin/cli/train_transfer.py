@@ -13,10 +13,13 @@ from rich.console import Console
 
 from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.gaussians.fit.photographs import read_photographs
 from alpasim_plugin.runtime.parallel import parallel_map
+from alpasim_plugin.training.photograph_pairs import PhotographRecipe, make_photograph_pairs
 from alpasim_plugin.training.transfer_pairs import make_transfer_sequence
 from alpasim_plugin.training.transfer_scenes import SPLITS, Split, TransferScene, check_frozen, transfer_scene
 
+PHOTOGRAPHS_EPILOG = "Example: `simrun train photographs photos/ --out data/photographs`"
 TRANSFER_EPILOG = "Example: `simrun train transfer --out data/transfer --jobs 2`"
 
 
@@ -44,6 +47,37 @@ def transfer(
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"sequences": len(rows), "made": sum(bool(row["made"]) for row in rows), "rows": rows}))
+
+
+def photographs(
+    folder: Annotated[Path, typer.Argument(help="Folder with images and the transforms.json of Instant-NGP.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")],
+    name: Annotated[str | None, typer.Option("--name", help="Of the sequences; the folder's by default.")] = None,
+    split: Annotated[str, typer.Option("--split", help="Split of the sequences.")] = "test",
+    width: Annotated[int, typer.Option("--width", min=16, help="Pixels across, a multiple of 16.")] = 256,
+    every: Annotated[int, typer.Option("--every", min=2, help="Hold out every N-th photograph, in N ways: N sequences.")] = 5,
+    steps: Annotated[int, typer.Option("--steps", min=1, help="Updates of the fit; few leave it under-trained.")] = 300,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fit.")] = 0,
+    as_json: AsJson = False,
+    debug: Debug = False,
+) -> None:
+    """Fit an under-trained reconstruction to posed photographs and write it beside them as pairs; the map is black.
+
+    Photographs that the file lists and the folder lacks are named and left out.
+    """
+    del debug
+    console, rows = Console(stderr=True), []
+    found = read_photographs(folder, width)
+    if found.missing:
+        shown = ", ".join(found.missing[:5]) + (", ..." if len(found.missing) > 5 else "")
+        console.print(f"{len(found.missing)} of {found.listed} listed images are missing: {shown}", highlight=False, markup=False)
+    recipe = PhotographRecipe(width, every, steps, split=split, seed=seed)
+    for one in make_photograph_pairs(found, name or folder.resolve().name, out, recipe):
+        rows.append({"folder": str(one.folder), "made": one.made, "psnr_db": dict(one.psnr_db)})
+        quality = ", ".join(f"{key.replace('_', ' ')} {value:.2f} dB" for key, value in one.psnr_db.items())
+        console.print(f"{one.folder}{'' if one.made else ' (exists)'}: {quality}", highlight=False, markup=False, soft_wrap=True)
+    if as_json:
+        print(json.dumps({"sequences": len(rows), "missing": list(found.missing), "rows": rows}))
 
 
 def splits_of(text: str) -> list[Split]:
