@@ -18,6 +18,7 @@ from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
+from alpasim_plugin.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.parts import resolve
@@ -56,6 +57,7 @@ class PaperRun:
         seed: Of noise and swaps.
         filmed: Clips on the page.
         map_clips: Clips of the protocol ``map-error``.
+        transfer: What the protocol ``transfer`` is measured on; None: it is not.
     """
 
     pairs: Path
@@ -72,7 +74,8 @@ class PaperRun:
     seed: int = 0
     filmed: int = 2
     map_clips: int = 8
-    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop")
+    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "transfer")
+    transfer: TransferData | None = None
 
 
 @dataclass
@@ -136,6 +139,9 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
         out.measured["map-error"] = grouped(out.measured["map-error"])
     if "closed-loop" in run.protocols and run.drives is not None:
         out.measured["closed-loop"] = drives(run.drives)
+    if "transfer" in run.protocols and run.transfer is not None:
+        tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
+        out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
     return out
 
 

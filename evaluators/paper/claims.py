@@ -14,6 +14,7 @@ Relation = Literal["better", "not better", "close"]
 FD, PERCEPTUAL, CUBOID, XERR, LANE, JITTER = (
     "fd_syn_clip", "perceptual-syn", "cuboid_f1_syn", "lane_xerr_syn_m", "lane_f1_syn", "lane_jitter_syn_m",
 )  # fmt: skip
+MID, LAST = "perceptual-syn-mid", "perceptual-syn-last"
 MOTION, WARP, PSNR, SSIM, MS = "fvmd_lk", "warp_l1", "psnr_db", "ssim", "ms_per_frame"
 CLOSE = 0.10  # share of the second arm's value below which a difference counts as none
 
@@ -29,7 +30,7 @@ class Contest:
     """One comparison.
 
     Args:
-        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop`` or ``map-error``.
+        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop``, ``map-error`` or ``transfer``.
         metric: Ours.
         first, second: Arms.
         relation: ``better``: the paired difference favours the first; ``not better``: it does not; ``close``: its interval lies within a
@@ -144,6 +145,14 @@ CLAIMS: tuple[Claim, ...] = (
             *each("cycle", (MS,), OURS, ("3dgs-enhancer@8", "omnidreams@4", "artifixer-pre@4")),
             *each("map-error", (LANE,), "V9, lanes 0.50 m aside", ("V5",)),
             *each("map-error", (CUBOID,), "V9, boxes 0.35 m aside", ("V5",)),
+        ),
+    ),
+    Claim(
+        12, "Beyond driving and after fine-tuning OneFixer is best on PSNR, LPIPS in the middle and at the end, and FVMD; ArtiFixer is "
+        "best on Warp L1", "DL3DV table",
+        (
+            *each("transfer", (PSNR, MID, LAST, MOTION), OURS, ("difix", "artifixer")),
+            *each("transfer", (WARP,), "artifixer", ("difix", OURS)),
         ),
     ),
 )  # fmt: skip

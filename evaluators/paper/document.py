@@ -13,6 +13,7 @@ from evaluators.paper.claims import OURS
 from evaluators.paper.measured import Measured
 from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
+from evaluators.paper.transfer import transfer_section
 from evaluators.paper.verdict import judge_claims
 
 PERIOD_MS = 100.0  # between frames of the pairs
@@ -66,6 +67,7 @@ def document(
             parts.append("\n" + differences(mine, lead, [arm for arm in mine.arms if arm != lead], metrics))
         parts.append(f"\n{_counts(mine)}\n")
     parts.append("## A wrong map\n\n" + (_map_error(measured["map-error"]) if "map-error" in measured else "Not run.\n"))
+    parts.append(transfer_section(published, measured))
     parts.append("## By position\n\n" + (by_position(rows["under-trained"]) if "under-trained" in rows else "Not run.\n"))
     parts.append("## Time\n\n" + (_times(measured["cycle"], units) if "cycle" in measured else "Not run.\n"))
     parts.append("## The paper's claims\n\n" + verdicts(judge_claims(measured), reasons))

@@ -199,8 +199,10 @@ def _view(folder: Path, frame: dict[str, Any], T_world_camera: F64, width: int, 
     if rgb.shape[:2] != (full_h, full_w):
         raise InputError(DOING, where, f"{rgb.shape[1]}x{rgb.shape[0]} pixels, the file says {full_w}x{full_h}", "give the photographs as they were")
     if bend.any():
-        centred = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV counts from pixel centres
-        rgb = np.asarray(cv2.undistort(rgb, centred, bend), dtype=np.uint8)
+        centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
+        whole, _ = cv2.getOptimalNewCameraMatrix(K - centre, bend, (full_w, full_h), 0.0)  # shows only what the photograph shows
+        rgb = np.asarray(cv2.undistort(rgb, K - centre, bend, None, whole), dtype=np.uint8)
+        K = np.asarray(whole, dtype=np.float64) + centre
     height = round(full_h * width / full_w)
     small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
     kept = height // SIDE_PX * SIDE_PX

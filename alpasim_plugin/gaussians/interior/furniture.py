@@ -119,7 +119,7 @@ def plant(rng: Rng, height_m: float | None = None) -> Thing:
     """Return a plant in a pot."""
     h, pot = height_m or float(rng.uniform(0.9, 1.5)), plain(rng, chosen(rng, np.array([[0.66, 0.36, 0.24], [0.82, 0.80, 0.76], [0.3, 0.32, 0.36]])))
     r = 0.14 * h
-    n, stems = round(240 * (0.5 + h)), 9
+    n, stems = round(320 * (0.5 + h)), 9
     stem, s = rng.integers(stems, size=n), rng.random(n) ** 0.7
     lean, turn = rng.uniform(0.15, 0.42, stems) * h, rng.uniform(0, 2 * np.pi, stems)
     out = lean[stem] * s**1.5
@@ -131,7 +131,7 @@ def plant(rng: Rng, height_m: float | None = None) -> Thing:
     profile = [[0.7 * r, 0], [r, 0.28 * h], [1.06 * r, 0.28 * h], [1.06 * r, 0.31 * h], [0.9 * r, 0.31 * h], [0.0, 0.29 * h]]
     size = 0.5 * h
     return Thing(
-        (Turned((0, 0, 0), profile, pot), Leaves(means, normals, rgb, 0.05 * max(h, 0.5))),
+        (Turned((0, 0, 0), profile, pot), Leaves(means, normals, rgb, 0.065 * h ** 0.7)),
         (block((-0.7 * r, -0.7 * r, 0), (0.7 * r, 0.7 * r, 0.3 * h)), block((-0.3 * size, -0.3 * size, 0.5 * h), (0.3 * size, 0.3 * size, 0.95 * h))),
     )
 

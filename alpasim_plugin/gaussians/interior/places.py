@@ -40,12 +40,10 @@ class Place:
     Attributes:
         graph: Its Gaussians.
         walk: The camera's way.
-        has_sky: Whether the sky is seen.
     """
 
     graph: SceneGraph
     walk: Walk
-    has_sky: bool
 
 
 @dataclass(frozen=True)
@@ -68,20 +66,32 @@ class Standing:
         return corners.min(axis=0), corners.max(axis=0)
 
 
-def build_place(family: str, scene_id: str, seed: int) -> Place:
+@dataclass(frozen=True)
+class Plan:
+    """What stands where in which light, before it is covered with surfels."""
+
+    standing: tuple[Standing, ...]
+    light: Light
+    sky: Sky
+    walk: Walk
+
+
+def build_place(family: str, scene_id: str, seed: int, coarseness: float = 1.0) -> Place:
     """Build a place; the same family, name and seed give bit-identical Gaussians.
 
     Args:
         family: ``room``, ``table`` or ``path``.
         scene_id, seed: Key of the random streams.
+        coarseness: By what the size of surfels is multiplied; the place stays the same.
 
     Raises:
         KeyError: No such family.
     """
-    return FAMILIES[family](stream(scene_id, seed, f"interior.{family}"))
+    plan = FAMILIES[family](stream(scene_id, seed, f"interior.{family}"))
+    return Place(_assembled(plan.standing, plan.light, plan.sky, coarseness), plan.walk)
 
 
-def _assembled(standing: Sequence[Standing], light: Light, sky: Sky) -> SceneGraph:
+def _assembled(standing: Sequence[Standing], light: Light, sky: Sky, coarseness: float) -> SceneGraph:
     """Light everything and cut what is large into tiles."""
     blocks = [one.blocks() for one in standing]
     nodes: list[SceneNode] = []
@@ -89,10 +99,10 @@ def _assembled(standing: Sequence[Standing], light: Light, sky: Sky) -> SceneGra
         others = [b for k, many in enumerate(blocks) if k != i for b in many]
         levels = []
         for cell_m in one.cells_m:
-            surfels: Surfels = one.thing.surfels(cell_m).moved(one.T)
+            surfels: Surfels = one.thing.surfels(coarseness * cell_m).moved(one.T)
             cloud = surfels.cloud(light.colours(surfels, others))
             tile = np.floor(surfels.means / (LAWN_TILE_M if one.cells_m == LAWN_CELLS_M else WALL_TILE_M)).astype(np.int64) @ np.array([1, 1_009, 1_018_081])
-            levels.append((cell_m, cloud, tile))
+            levels.append((coarseness * cell_m, cloud, tile))
         if one.cells_m in (WALL_CELLS_M, LAWN_CELLS_M):
             nodes += nodes_by_tile(one.name, levels)
         else:
@@ -191,7 +201,7 @@ def _taken(standing: Sequence[Standing], turn: F64, at: float, width: float, dis
     return any(bool(np.all(a < high) and np.all(b > low)) for a, b in feet)
 
 
-def _room(rng: Rng) -> Place:
+def _room(rng: Rng) -> Plan:
     """Return a furnished room and a walk through its middle, past the furniture."""
     w, d, h = (float(v) for v in rng.uniform((4.4, 3.8, 2.4), (6.2, 5.2, 2.8)))
     standing, window_at = _along_walls(rng, w, d, h)
@@ -199,7 +209,7 @@ def _room(rng: Rng) -> Place:
     rug_T = upright(0, 0, 0, float(rng.uniform(-0.2, 0.2)))
     standing += [middle, Standing("rug", f.carpet(rng, (float(rng.uniform(1.8, 2.4)), float(rng.uniform(1.3, 1.8)))), rug_T)]
     standing += _objects(rng, middle, 3)
-    graph = _assembled([_shell(rng, w, d, h), *standing], _room_light(rng, w, d, h, window_at), _no_sky())
+    shell, light = _shell(rng, w, d, h), _room_light(rng, w, d, h, window_at)
     start, sweep = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.9, 1.5)) * (1 if rng.random() < 0.5 else -1)
     s = np.linspace(0, 1, 9)
     turn = start + sweep * s
@@ -207,7 +217,7 @@ def _room(rng: Rng) -> Place:
     eye = np.column_stack([np.column_stack([np.cos(turn), np.sin(turn)]) * radius, np.full(9, rng.uniform(1.35, 1.6))])
     across = turn + np.pi + rng.uniform(-0.5, 0.5) * np.sin(np.pi * s)
     target = np.column_stack([0.5 * w * np.cos(across), 0.5 * d * np.sin(across), np.full(9, rng.uniform(0.7, 1.0))])
-    return Place(graph, Walk(eye, target), False)
+    return Plan((shell, *standing), light, _no_sky(), Walk(eye, target))
 
 
 def _objects(rng: Rng, table: Standing, count: int) -> list[Standing]:
@@ -230,34 +240,34 @@ def _objects(rng: Rng, table: Standing, count: int) -> list[Standing]:
     return out
 
 
-def _table(rng: Rng) -> Place:
+def _table(rng: Rng) -> Plan:
     """Return a table full of objects in a room and a walk half around it."""
     w, d, h = (float(v) for v in rng.uniform((3.8, 3.6, 2.4), (5.0, 4.6, 2.7)))
     standing, window_at = _along_walls(rng, w, d, h)
     table = Standing("table", f.table(rng, (float(rng.uniform(1.0, 1.4)), float(rng.uniform(0.8, 1.0)))), upright(0, 0, 0, float(rng.uniform(0, np.pi))))
     objects = _objects(rng, table, int(rng.integers(7, 11)))
-    graph = _assembled([_shell(rng, w, d, h), *standing, table, *objects], _room_light(rng, w, d, h, window_at), _no_sky())
+    shell, light = _shell(rng, w, d, h), _room_light(rng, w, d, h, window_at)
     s = np.linspace(0, 1, 9)
     turn = float(rng.uniform(0, 2 * np.pi)) + float(rng.uniform(1.2, 2.2)) * s * (1 if rng.random() < 0.5 else -1)
     away = float(rng.uniform(1.0, 1.2)) + 0.1 * np.sin(2 * np.pi * s + float(rng.uniform(0, 6)))
     eye = np.column_stack([away * np.cos(turn), away * np.sin(turn), np.full(9, rng.uniform(1.2, 1.45))])
     target = np.column_stack([0.1 * np.cos(turn + 2), 0.1 * np.sin(turn + 2), np.full(9, 0.78)])
-    return Place(graph, Walk(eye, target), False)
+    return Plan((shell, *standing, table, *objects), light, _no_sky(), Walk(eye, target))
 
 
-def _path(rng: Rng) -> Place:
+def _path(rng: Rng) -> Plan:
     """Return a garden path with hedges, trees and a house, and a walk along it."""
     bend, length = float(rng.uniform(-0.05, 0.05)), 16.0
     cells = {"ground": WALL_CELLS_M, "lawn": LAWN_CELLS_M}
     standing = [Standing(name, thing, T, cells.get(name, GARDEN_CELLS_M)) for name, thing, T in garden_things(rng, bend, length)]
-    graph = _assembled(standing, daylight(rng), make_sky("clear" if rng.random() < 0.6 else "overcast", rng))
+    light, sky = daylight(rng), make_sky("clear" if rng.random() < 0.6 else "overcast", rng)
     s = np.linspace(0, 1, 9)
     x = 1.0 + float(rng.uniform(4.5, 6.5)) * s
     side = float(rng.uniform(-0.2, 0.2)) + bend * x**2
     eye = np.column_stack([x, side, np.full(9, rng.uniform(1.45, 1.65))])
     swing = float(rng.uniform(0.3, 1.2)) * np.sin(2 * np.pi * (0.7 * s + rng.random()))
     target = np.column_stack([x + 4.0, bend * (x + 4.0) ** 2 + swing, np.full(9, rng.uniform(0.8, 1.2))])
-    return Place(graph, Walk(eye, target), True)
+    return Plan(tuple(standing), light, sky, Walk(eye, target))
 
 
-FAMILIES: Mapping[str, Callable[[Rng], Place]] = {"room": _room, "table": _table, "path": _path}
+FAMILIES: Mapping[str, Callable[[Rng], Plan]] = {"room": _room, "table": _table, "path": _path}
