@@ -22,6 +22,7 @@ from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
 from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
+from alpasim_plugin.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -70,6 +71,7 @@ class PaperRun:
         seed: Of noise and swaps.
         filmed: Clips on the page.
         map_clips: Clips of the protocol ``map-error``.
+        transfer: What the protocol ``transfer`` is measured on; None: it is not.
     """
 
     pairs: Path
@@ -86,7 +88,8 @@ class PaperRun:
     seed: int = 0
     filmed: int = 2
     map_clips: int = 8
-    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory")
+    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer")
+    transfer: TransferData | None = None
 
 
 @dataclass
@@ -165,6 +168,9 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
         _open_loop(replace(run, frames=frames), "cost", clips, snapshots, frozenset(), told, out)
         out.cost = Cost(tuple(curves), out.measured["cost"], about)
         out.measured["cost"] = contested(out.cost)
+    if "transfer" in run.protocols and run.transfer is not None:
+        tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
+        out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
     return out
 
 

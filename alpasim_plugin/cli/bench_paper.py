@@ -15,6 +15,7 @@ from alpasim_plugin.atomic import write_json, write_text
 from alpasim_plugin.bench.judged import Judging
 from alpasim_plugin.bench.paper import DOING, PaperRun, compare_arms, findings
 from alpasim_plugin.bench.quality_run import Work
+from alpasim_plugin.bench.transfer import TransferData
 from alpasim_plugin.cli.training_options import whole_numbers
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, weights_folder
@@ -25,7 +26,7 @@ from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
 from evaluators.paper.verdict import judge_claims
 
-BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory")
+BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer")
 PROTOCOLS = (*BY_DEFAULT, "cost")
 EPILOG = """
 Examples:
@@ -50,6 +51,13 @@ def paper(
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     long: Annotated[Path | None, typer.Option("--long", help="Pairs of 900 frames for the second table; else those of DATA.")] = None,
     drives: Annotated[Path | None, typer.Option("--drives", help="Finished run folder of the closed loop, for the third table.")] = None,
+    transfer: Annotated[
+        Path | None, typer.Option("--transfer", help="Pairs beyond driving, for the table of the transfer (docs/pairs.md).")
+    ] = None,
+    transfer_arms: Annotated[
+        Path | None, typer.Option("--transfer-arms", help="Folder like --arms of the arms fine-tuned on them.")
+    ] = None,
+    photographs: Annotated[Path | None, typer.Option("--photographs", help="Pairs of photographs, measured the same way.")] = None,
     only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(BY_DEFAULT),
     clips: Annotated[int | None, typer.Option("--clips", min=2, help="At most so many clips a protocol, evenly chosen.")] = None,
     frames: Annotated[int | None, typer.Option("--frames", min=2, help="First frames of a clip; as in the paper by default.")] = None,
@@ -76,7 +84,8 @@ def paper(
     if judges is not None:
         judging = Judging(tuple(whole_numbers("--judges", judges, 0)), scenes, None, weights_folder(weights), judge_folder)
     run = PaperRun(
-        data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols
+        data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
+        None if transfer is None else TransferData(transfer, transfer_arms, photographs),
     )  # fmt: skip
     why = {} if reasons is None else read_reasons(reasons)  # before hours of measuring
     console = Console(stderr=True)

@@ -27,6 +27,7 @@ from alpasim_plugin.cli.train_perceptual_check import CHECK_EPILOG, perceptual_c
 from alpasim_plugin.cli.train_policy import POLICY_DATA_EPILOG, POLICY_EPILOG, policy, policy_data
 from alpasim_plugin.cli.train_splat import EPILOG as SPLAT_EXAMPLE
 from alpasim_plugin.cli.train_splat import splat
+from alpasim_plugin.cli.train_transfer import PHOTOGRAPHS_EPILOG, TRANSFER_EPILOG, photographs, transfer
 from alpasim_plugin.cli.train_video import VIDEO_EPILOG, video
 from alpasim_plugin.cli.training_options import AsJson, Debug, Progress, RunFolder, Seed, Steps
 from alpasim_plugin.fixers.bundle import load_tiny_vae
@@ -60,6 +61,8 @@ app.command("check-scenes", epilog=train_scenes.CHECK_EPILOG)(train_scenes.check
 app.command("reconstructions", epilog=train_pairs.RECONSTRUCTIONS_EPILOG)(train_pairs.reconstructions)
 app.command("pairs", epilog=train_pairs.PAIRS_EPILOG)(train_pairs.pairs)
 app.command("pairs-sheet", epilog=train_pairs.SHEET_EPILOG)(train_pairs.pairs_sheet)
+app.command("transfer", epilog=TRANSFER_EPILOG)(transfer)
+app.command("photographs", epilog=PHOTOGRAPHS_EPILOG)(photographs)
 app.command("video", epilog=VIDEO_EPILOG)(video)
 app.command("import-pairs", epilog=train_pairs.IMPORT_EPILOG)(train_pairs.import_pairs)
 

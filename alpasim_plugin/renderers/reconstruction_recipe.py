@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.types import Scenario
+from alpasim_plugin.types import Degradation, Scenario
 
 # By second of the log and camera, so that a longer drive is fitted no worse.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0
@@ -39,7 +39,17 @@ class ReconstructionRecipe:
 
 
 def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
-    """Return the recipe of a scenario's degradation.
+    """Return the recipe of a scenario's degradation, which is fitted to what its cameras saw along the log.
+
+    Raises:
+        InputError: The degradation is not one that fits a model.
+    """
+    t_us = scenario.ego_log.t_us
+    return recipe_for(scenario.degradation, (t_us[-1] - t_us[0]) * 1e-6 * max(1, len(scenario.cameras)))
+
+
+def recipe_for(amount: Degradation, watched_s: float) -> ReconstructionRecipe:
+    """Return the recipe of a degradation of what a camera watched for so many seconds.
 
     Few points, small views, no densification: a model that some seconds of one core can fit. Rates are higher than those of a whole fit,
     as a schedule of hundreds of steps needs.
@@ -47,11 +57,8 @@ def recipe_of(scenario: Scenario) -> ReconstructionRecipe:
     Raises:
         InputError: The degradation is not one that fits a model.
     """
-    amount = scenario.degradation
     if amount.kind not in ("reconstruction", "cycle"):
         raise InputError("fitting a reconstruction", f"degradation kind {amount.kind!r}", "nothing to fit", "say reconstruction or cycle")
-    t_us = scenario.ego_log.t_us
-    watched_s = (t_us[-1] - t_us[0]) * 1e-6 * max(1, len(scenario.cameras))
     points = min(MOST_POINTS, max(POINTS_PER_S, round(POINTS_PER_S * watched_s)))
     splat = SplatRecipe(
         steps=max(1, round(amount.share * min(MOST_STEPS, FULL_STEPS_PER_S * watched_s))),

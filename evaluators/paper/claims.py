@@ -14,6 +14,7 @@ Relation = Literal["better", "not better", "close"]
 FD, PERCEPTUAL, CUBOID, XERR, LANE, JITTER = (
     "fd_syn_clip", "perceptual-syn", "cuboid_f1_syn", "lane_xerr_syn_m", "lane_f1_syn", "lane_jitter_syn_m",
 )  # fmt: skip
+MID, LAST = "perceptual-syn-mid", "perceptual-syn-last"
 MOTION, WARP, PSNR, SSIM, MS, DRIFT = "fvmd_lk", "warp_l1", "psnr_db", "ssim", "ms_per_frame", "drift_psnr_db"
 CLOSE = 0.10  # share of the second arm's value below which a difference counts as none
 
@@ -30,7 +31,7 @@ class Contest:
     """One comparison.
 
     Args:
-        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop``, ``map-error`` or ``cost``.
+        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop``, ``map-error``, ``cost`` or ``transfer``.
         metric: Ours.
         first, second: Arms.
         relation: ``better``: the paired difference favours the first; ``not better``: it does not; ``close``: its interval lies within a
@@ -159,5 +160,13 @@ CLAIMS: tuple[Claim, ...] = (
         12, "A temporal Harmonizer that was trained on clean frames drifts on its own outputs; one trained on its own outputs does not",
         "drift figure",
         (Contest("cycle", DRIFT, "harmonizer-temporal", "harmonizer-temporal-teacher"),),
+    ),
+    Claim(
+        13, "Beyond driving and after fine-tuning OneFixer is best on PSNR, LPIPS in the middle and at the end, and FVMD; ArtiFixer is "
+        "best on Warp L1", "DL3DV table",
+        (
+            *each("transfer", (PSNR, MID, LAST, MOTION), OURS, ("difix", "artifixer")),
+            *each("transfer", (WARP,), "artifixer", ("difix", OURS)),
+        ),
     ),
 )  # fmt: skip

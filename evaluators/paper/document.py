@@ -14,6 +14,7 @@ from evaluators.paper.measured import Measured
 from evaluators.paper.position import DRIFTING, by_position, distance_by_position, drift, with_half
 from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
+from evaluators.paper.transfer import transfer_section
 from evaluators.paper.verdict import judge_claims
 from evaluators.video.charts import plot_by_frame
 from evaluators.video.summary import summarise
@@ -81,6 +82,7 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
         parts.append(f"\n{_counts(mine)}\n")
     sections = {
         "A wrong map": _map_errors(found),
+        "Beyond driving": transfer_section(published, measured),
         "By position": _positions(measured["under-trained"], rows["under-trained"]) if "under-trained" in rows else "",
         "Drift": drift(measured["cycle"], rows["cycle"]) + f"\n![Quality by frame]({DRIFT})" if "cycle" in rows else "",
         "Time": _times(measured["cycle"], found.units) if "cycle" in measured else "",

@@ -12,6 +12,8 @@ GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
 FACTS: dict[str, MetricInfo] = {
     PSNR: MetricInfo("dB", "higher", "mean", "peak signal-to-noise ratio of frames, identical ones count as 100 dB"),
     SSIM: MetricInfo("", "higher", "mean", "structural similarity of frames, 11x11 Gaussian, zero padded, per channel"),
+    "perceptual-syn-mid": MetricInfo("", "lower", "mean", "perceptual-syn of the middle tenth of a clip's frames"),
+    "perceptual-syn-last": MetricInfo("", "lower", "mean", "perceptual-syn of the last tenth of a clip's frames"),
     "perceptual-syn": MetricInfo("", "lower", "mean", "perceptual distance by the feature network that comes with the package; not LPIPS"),
     "lpips_alex": MetricInfo("", "lower", "mean", "LPIPS v0.1 with AlexNet"),
     "lpips_vgg": MetricInfo("", "lower", "mean", "LPIPS v0.1 with VGG-16"),
