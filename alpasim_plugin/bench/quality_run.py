@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from alpasim_plugin.atomic import atomic_file, write_bytes, write_json
-from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row, scene_of
+from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row
 from alpasim_plugin.bench.map_error import shifted_maps
 from alpasim_plugin.bench.quality import QualityClip, Variant, measure, row_key, run_variant
 from alpasim_plugin.errors import InputError
@@ -32,6 +32,7 @@ from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.training.pair_store import CONTENT, PairSequence
+from alpasim_plugin.training.seen_scene import scene_of
 from alpasim_plugin.types import U8
 from evaluators.judges.table import judged_markdown
 from evaluators.video.charts import plot_by_frame, plot_speed

@@ -70,6 +70,9 @@ def train_fixer_command(
         list[str] | None,
         typer.Option("--weights", help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained."),
     ] = None,
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.")
+    ] = None,
     steps: Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")] = 400,
     clips: options.Clips = 4,
     accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")] = 2,
@@ -122,8 +125,9 @@ def train_fixer_command(
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
     batches = BatchForm(clips, None, columns, seed)
     run = FixerRun(
-        settings, chosen, data, vae, named_weights(init, weights or []), form, batches, schedule, channels == "equal", PRECISIONS[precision]
-    )
+        settings, chosen, data, vae, named_weights(init, weights or []), form, batches, schedule, channels == "equal",
+        PRECISIONS[precision], scenes,
+    )  # fmt: skip
     progress = options.Progress(run.updates)
     distance = progress.perceptual_term(metric_weights) if run.perceptual else None
     encoded = partial(progress.prepared, "clips as latents, sequences")

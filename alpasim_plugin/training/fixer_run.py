@@ -32,7 +32,7 @@ from alpasim_plugin.training.recipes.recipe import GIVEN, Recipe, Stage, StageIn
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 BUNDLE_FILE = "fixer.safetensors"
-BUNDLED = ("dit", "vae")
+BUNDLED = ("dit", "vae", "prompt")
 TrainableSettings = OneFixerSettings | RenderStepSettings | NoiseWindowSettings
 Report = Callable[[int, Mapping[str, float]], None]
 
@@ -53,6 +53,7 @@ class FixerRun:
         schedule: Optimisation of a stage of share 1; its updates are the unit U.
         equal_channels: Whether flow matching weights all latent channels alike.
         precision: Of the forward passes: None is float32.
+        scenes: Folder of the scenes behind the pairs; recipes whose targets need depth ask for it.
     """
 
     settings: TrainableSettings
@@ -65,6 +66,7 @@ class FixerRun:
     schedule: Schedule
     equal_channels: bool = False
     precision: torch.dtype | None = None
+    scenes: Path | None = None
 
     def __post_init__(self) -> None:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
@@ -180,7 +182,7 @@ def stage_inputs(
     return StageInputs(
         run.settings.dit, run.settings.rope_ratios, stage.attention(latents), stage.seen, weights, vae, clips,
         replace(run.batches, latents=latents), stage.updates(run.schedule.steps), run.schedule.accumulate, run.equal_channels, distance,
-        run.settings,
+        run.settings, run.scenes,
     )  # fmt: skip
 
 
