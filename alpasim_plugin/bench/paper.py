@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from alpasim_plugin.bench.appearance import JUDGE_SEEDS, AppearanceRun, measure_appearance
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
@@ -22,6 +23,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.paper.appearance import OURS as APPEARANCE
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip
 from evaluators.video.summary import TRUTH
@@ -32,7 +34,7 @@ STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (
 OURS = "V9"  # the paper's own method on the backbone that the arms share
 SHIPPED = ("onefixer", "onefixer-dit-tiny")  # rows of their own in every table
 ABLATION = ("V1", "V2", "V3", "V3b", "V4", "V5", "V6", "V7", "V8", "V9")
-PAPER_LENGTH = {"cycle": 198, "under-trained": 900, "map-error": 198}
+PAPER_LENGTH = {"cycle": 198, "under-trained": 900, "map-error": 198, "appearance": 198}
 CURVES = ("psnr_db", "perceptual-syn", "warp_l1")
 Told = Callable[[str, int, int, Work, Mapping[str, Any]], None]
 
@@ -72,7 +74,7 @@ class PaperRun:
     seed: int = 0
     filmed: int = 2
     map_clips: int = 8
-    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop")
+    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "appearance")
 
 
 @dataclass
@@ -115,14 +117,21 @@ def arms_in(folder: Path) -> tuple[Variant, ...]:
     return tuple(found)
 
 
-def compare_arms(run: PaperRun, told: Told) -> Compared:
+def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str], None]) -> Compared:
     """Measure every arm under every protocol that is asked for.
+
+    Args:
+        run: What is compared, on what, how.
+        told: Called after every clip of an arm.
+        told_clip: Called after every clip of the appearance experiment: its number, their count, its name.
 
     Raises:
         InputError: No clip for a protocol.
     """
     out = Compared()
     arms = (Variant(RAW), *(Variant(name, resolve("fixer", name, ())) for name in SHIPPED), *arms_in(run.arms))
+    plain = tuple(arm for arm in arms if arm.label == OURS)
+    arms = tuple(arm for arm in arms if arm.label != APPEARANCE)  # it has a protocol of its own
     out.units = {arm.label: unit_of(arm) for arm in arms}
     for name in ("cycle", "under-trained"):
         if name in run.protocols:
@@ -136,7 +145,19 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
         out.measured["map-error"] = grouped(out.measured["map-error"])
     if "closed-loop" in run.protocols and run.drives is not None:
         out.measured["closed-loop"] = drives(run.drives)
+    bundle = run.arms / APPEARANCE / BUNDLE
+    if "appearance" in run.protocols and bundle.is_file():
+        out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
+
+
+def _appearance(run: PaperRun, bundle: Path, plain: tuple[Variant, ...]) -> AppearanceRun:
+    """Return how the appearance experiment is measured: on cycle renders, with the judges of both seeds where none are named."""
+    sequences = _sequences(run, "cycle")
+    judging = run.judging or Judging(JUDGE_SEEDS, run.scenes)
+    shown = frozenset(s.name for s in evenly(sequences, run.filmed))
+    frames = run.frames or PAPER_LENGTH["appearance"]
+    return AppearanceRun(sequences, bundle, plain, run.scenes, run.out / "appearance", judging, frames, run.seed, run.jobs, shown)
 
 
 def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:

@@ -25,7 +25,7 @@ from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
 from evaluators.paper.verdict import judge_claims
 
-PROTOCOLS = ("cycle", "under-trained", "map-error", "closed-loop")
+PROTOCOLS = ("cycle", "under-trained", "map-error", "closed-loop", "appearance")
 EPILOG = """
 Examples:
 
@@ -83,7 +83,11 @@ def paper(
         if not as_json:
             console.print(f"{protocol} {i}/{n} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
 
-    found = compare_arms(run, told)
+    def told_clip(i: int, n: int, name: str) -> None:
+        if not as_json:
+            console.print(f"appearance {i}/{n} {name}")
+
+    found = compare_arms(run, told, told_clip)
     rows = {name: [row_of(work) for work in works] for name, works in found.works.items()}
     judged = judge_claims(found.measured)
     command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"

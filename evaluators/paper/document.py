@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from evaluators.aggregate.intervals import t_interval
+from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import OURS
 from evaluators.paper.measured import Measured
 from evaluators.paper.published import Published
@@ -68,6 +69,7 @@ def document(
     parts.append("## A wrong map\n\n" + (_map_error(measured["map-error"]) if "map-error" in measured else "Not run.\n"))
     parts.append("## By position\n\n" + (by_position(rows["under-trained"]) if "under-trained" in rows else "Not run.\n"))
     parts.append("## Time\n\n" + (_times(measured["cycle"], units) if "cycle" in measured else "Not run.\n"))
+    parts.append("## Night, fog and snow\n\n" + appearance_section(published, measured))
     parts.append("## The paper's claims\n\n" + verdicts(judge_claims(measured), reasons))
     return "\n".join(parts)
 
