@@ -1,10 +1,10 @@
-"""The paper's appearance experiment on our clips: one fixer asked for night, fog and snow, beside the same formulas on other systems' output.
+"""The paper's appearance experiment on our clips: one fixer asked for night, fog and snow, beside the formulas on other systems' output.
 
-Arms by style: ``appearance``, the fixer with the style's prompt; ``V9 + formula`` and ``3dgs + formula``, the controls; and the styled target
-itself. Controls and target are made with the simulator's depth of the clean frames and its lamps, which no fixer sees. Style and lanes are
-judged by the frozen judges, lanes against those found on the *clear* clean frames, pictures against the styled target.
+Arms by style: ``appearance``, the fixer with the style's prompt; ``V9 + formula`` and ``3dgs + formula``, the controls; and the styled
+target itself. Controls and target are made with the simulator's depth of the clean frames and its lamps, which no fixer sees. Style and
+lanes are judged by the frozen judges, lanes against those found on the *clear* clean frames, pictures against the styled target.
 
-    OUT/clips/CLIP.json      the values of a clip under all arms and styles
+    OUT/clips/CLIP.json         the values of a clip under all arms and styles
     OUT/sheets/CLIP-STYLE.png   what they look like, for a few clips
 """
 
