@@ -12,8 +12,9 @@ from torch import nn
 from alpasim_plugin.judge_types import Cuboid, Lane3D
 from alpasim_plugin.nets.judges.detect import find_cuboids, find_lanes
 from alpasim_plugin.nets.judges.files import JudgeName
-from alpasim_plugin.nets.judges.style_net import STYLES, StyleNet, style_probabilities
+from alpasim_plugin.nets.judges.style_net import StyleNet, style_probabilities
 from alpasim_plugin.nets.judges.video_net import VideoNet, window_features
+from alpasim_plugin.nets.styles import STYLES
 from alpasim_plugin.training.judges.labels import Labels
 from alpasim_plugin.types import F64, U8, CameraSpec
 from evaluators.judges.clip import cuboid_values, lane_values

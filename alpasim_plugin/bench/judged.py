@@ -17,7 +17,8 @@ from alpasim_plugin.nets.judges.detect import find_cuboids, find_lanes
 from alpasim_plugin.nets.judges.files import NAMES, check_digests, file_name, load_judge
 from alpasim_plugin.nets.judges.video_net import FRAMES, VideoNet, window_features
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.types import F64, U8, CameraSpec, Scenario
+from alpasim_plugin.training.seen_scene import scene_of
+from alpasim_plugin.types import F64, U8, CameraSpec
 from evaluators.judges.clip import cuboid_values, lane_values
 from evaluators.judges.cuboids import cuboid_f1
 from evaluators.judges.external import read_detections, read_tracks
@@ -26,7 +27,6 @@ from evaluators.judges.frechet import frechet_distance, halves, swap_test
 from evaluators.judges.fvmd import FVMD, RIDGE, histograms, motion_features
 from evaluators.judges.lane_jitter import lane_jitter_m
 from evaluators.judges.lanes import score_clip
-from scenarios.load import load_scenario
 
 DOING = "judging clips"
 REFERENCE = "truth"  # folder of detections on the clean frames
@@ -78,19 +78,6 @@ def camera_of(sequence: PairSequence, scenes: Path | None) -> CameraSpec:
     if "T_rig_camera" in info:
         return CameraSpec("camera", int(info["width"]), int(info["height"]), np.array(info["K"]), np.array(info["T_rig_camera"]))
     return scene_of(sequence, scenes).cameras[0]
-
-
-def scene_of(sequence: PairSequence, scenes: Path | None) -> Scenario:
-    """Return the scene behind a sequence of pairs, from the folder that `simrun train scenes` wrote.
-
-    Raises:
-        InputError: It is not there.
-    """
-    path = None if scenes is None else scenes / str(sequence.info.get("split")) / f"{sequence.name}.yaml"
-    if path is None or not path.is_file():
-        found = "its scene, or the mounting of its camera, is asked for, and there is no scene"
-        raise InputError(DOING, str(sequence.folder), found, "name the folder of its scenes with --scenes")
-    return load_scenario(path)
 
 
 def judge_clip(

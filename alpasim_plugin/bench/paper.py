@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from alpasim_plugin.atomic import write_json
+from alpasim_plugin.bench.appearance import JUDGE_SEEDS, AppearanceRun, measure_appearance
 from alpasim_plugin.bench.cost import cost_clips, cost_curves
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
@@ -28,6 +29,7 @@ from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from evaluators.paper.appearance import OURS as APPEARANCE
 from evaluators.paper.cost import Cost, contested
 from evaluators.paper.document import Findings
 from evaluators.paper.measured import Measured, from_rows
@@ -42,7 +44,7 @@ OURS = "V9"  # the paper's own method on the backbone that the arms share
 SHIPPED = ("onefixer", "onefixer-dit-tiny")  # rows of their own in every table
 ABLATION = ("V1", "V2", "V3", "V3b", "V4", "V5", "V6", "V7", "V8", "V9")
 UNCONDITIONED = ("V5", "artifixer")  # trained with a black map; without a map's input
-PAPER_LENGTH = {"cycle": 198, "under-trained": 900, "map-error": 198}
+PAPER_LENGTH = {"cycle": 198, "under-trained": 900, "map-error": 198, "appearance": 198}
 SHIFTS = {shift.label: shift for shift in CONFIGURATIONS}
 MEMORY = """Peak memory of forward and backward of one training sample above that of the network and its inputs, and the time of the second
 of two runs: 256x144, one clip, the rollout on own history with the perceptual term on its last k latents, without decoding.
@@ -88,7 +90,7 @@ class PaperRun:
     seed: int = 0
     filmed: int = 2
     map_clips: int = 8
-    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer")
+    protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer", "appearance")
     transfer: TransferData | None = None
 
 
@@ -138,14 +140,21 @@ def arms_in(folder: Path) -> tuple[Variant, ...]:
     return tuple(found)
 
 
-def compare_arms(run: PaperRun, told: Told) -> Compared:
+def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str], None]) -> Compared:
     """Measure every arm under every protocol that is asked for.
+
+    Args:
+        run: What is compared, on what, how.
+        told: Called after every clip of an arm.
+        told_clip: Called after every clip of the appearance experiment: its number, their count, its name.
 
     Raises:
         InputError: No clip for a protocol.
     """
     out = Compared()
     arms = (Variant(RAW), *(Variant(name, resolve("fixer", name, ())) for name in SHIPPED), *arms_in(run.arms))
+    plain = tuple(arm for arm in arms if arm.label == OURS)
+    arms = tuple(arm for arm in arms if arm.label != APPEARANCE)  # it has a protocol of its own
     out.units = {arm.label: unit_of(arm) for arm in arms}
     for name in ("cycle", "under-trained"):
         if name in run.protocols:
@@ -171,6 +180,9 @@ def compare_arms(run: PaperRun, told: Told) -> Compared:
     if "transfer" in run.protocols and run.transfer is not None:
         tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
+    bundle = run.arms / APPEARANCE / BUNDLE
+    if "appearance" in run.protocols and bundle.is_file():
+        out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
 
 
@@ -204,6 +216,15 @@ def training_memory(path: Path) -> list[MemoryCell]:
     cells = measure_memory(settings, MEMORY_LATENTS, MEMORY_HORIZONS, clips=1, rows=18, columns=32)
     write_json(path, [cell._asdict() for cell in cells])
     return cells
+
+
+def _appearance(run: PaperRun, bundle: Path, plain: tuple[Variant, ...]) -> AppearanceRun:
+    """Return how the appearance experiment is measured: on cycle renders, with the judges of both seeds where none are named."""
+    sequences = _sequences(run, "cycle")
+    judging = run.judging or Judging(JUDGE_SEEDS, run.scenes)
+    shown = frozenset(s.name for s in evenly(sequences, run.filmed))
+    frames = run.frames or PAPER_LENGTH["appearance"]
+    return AppearanceRun(sequences, bundle, plain, run.scenes, run.out / "appearance", judging, frames, run.seed, run.jobs, shown)
 
 
 def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from alpasim_plugin.atomic import atomic_file, write_bytes, write_json
-from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row, scene_of
+from alpasim_plugin.bench.judged import Judging, camera_of, judge_clip, judge_sets, paper_row
 from alpasim_plugin.bench.map_error import shifted_maps
 from alpasim_plugin.bench.quality import QualityClip, Variant, measure, row_key, run_variant
 from alpasim_plugin.errors import InputError
@@ -32,6 +32,7 @@ from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.training.pair_store import CONTENT, PairSequence
+from alpasim_plugin.training.seen_scene import scene_of
 from alpasim_plugin.types import U8
 from evaluators.judges.table import judged_markdown
 from evaluators.video.charts import plot_by_frame, plot_speed
@@ -259,7 +260,7 @@ def finish(work: Work) -> dict[str, Any]:
         with atomic_file(work.features_file) as partial, partial.open("wb") as file:
             np.savez(file, **cast("dict[str, Any]", features))
     if work.filmed:
-        frames = {f"{i:04d}": _encoded(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, FILM_QUALITY)) for i, frame in enumerate(result.video)}
+        frames = {f"{i:04d}": encoded(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, FILM_QUALITY)) for i, frame in enumerate(result.video)}
         work.film_file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(work.film_file) as partial, partial.open("wb") as file:
             np.savez(file, **cast("dict[str, Any]", frames))
@@ -327,10 +328,11 @@ def write_results(summary: dict[str, Any], done: Sequence[Work], out: Path) -> N
 
 
 def _write_png(path: Path, rgb: U8) -> None:
-    write_bytes(path, _encoded(".png", rgb).tobytes())
+    write_bytes(path, encoded(".png", rgb).tobytes())
 
 
-def _encoded(kind: str, rgb: U8, options: Sequence[int] = ()) -> U8:
+def encoded(kind: str, rgb: U8, options: Sequence[int] = ()) -> U8:
+    """Return a picture ``(H, W, 3)`` as the bytes of a file of a kind, such as ``.png``."""
     done, encoded = cv2.imencode(kind, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), list(options))
     assert done
     return np.asarray(encoded, dtype=np.uint8)

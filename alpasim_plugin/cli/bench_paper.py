@@ -26,7 +26,7 @@ from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
 from evaluators.paper.verdict import judge_claims
 
-BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer")
+BY_DEFAULT = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer", "appearance")
 PROTOCOLS = (*BY_DEFAULT, "cost")
 EPILOG = """
 Examples:
@@ -95,7 +95,11 @@ def paper(
         if not as_json:
             console.print(f"{protocol} {i}/{n} {work.variant.label} {work.folder.name}" + ("" if psnr is None else f" {psnr:.2f} dB"))
 
-    found = compare_arms(run, told)
+    def told_clip(i: int, n: int, name: str) -> None:
+        if not as_json:
+            console.print(f"appearance {i}/{n} {name}")
+
+    found = compare_arms(run, told, told_clip)
     made = findings(found)
     judged = judge_claims(found.measured)
     command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"

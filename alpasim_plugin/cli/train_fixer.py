@@ -70,6 +70,9 @@ def train_fixer_command(
         list[str] | None,
         typer.Option("--weights", help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained."),
     ] = None,
+    scenes: Annotated[
+        Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.")
+    ] = None,
     steps: Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")] = 400,
     clips: options.Clips = 4,
     accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")] = 2,
@@ -123,7 +126,7 @@ def train_fixer_command(
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
     batches = BatchForm(clips, None, columns, seed)
     files, equal = named_weights(init, weights or []), channels == "equal"
-    run = FixerRun(settings, chosen, data, vae, files, form, batches, schedule, equal, PRECISIONS[precision], snapshots)
+    run = FixerRun(settings, chosen, data, vae, files, form, batches, schedule, equal, PRECISIONS[precision], snapshots, scenes)
     progress = options.Progress(run.updates)
     progress.float32(run.precision, run.stages())
     distance = progress.perceptual_term(metric_weights) if run.perceptual else None

@@ -1,9 +1,9 @@
 """Weights of a fixer in one safetensors file: its networks, and the settings they were trained with.
 
 Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers (``block``, ``render-step``,
-``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and ``prompt.text``. The header holds
-``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the settings that the weights were trained with. Only safetensors
-is read: a pickle is refused.
+``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is not the autoencoder's) and ``prompt.text``, or ``prompt.NAME`` for
+each of several learned prompts. The header holds ``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the settings
+that the weights were trained with. Only safetensors is read: a pickle is refused.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def save_bundle(
 
     Args:
         path: A ``.safetensors`` file.
-        parts: State dicts by part: ``generator``; or ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``:
-            tokens, text_width).
+        parts: State dicts by part: ``generator``; or ``dit`` and ``vae``, and where there are any ``decoder`` and ``prompt`` (``text``,
+            or a name for each of several: tokens, text_width).
         settings: What the weights were trained with.
         trained: Whether they were learned.
         note: Description for labels.

@@ -114,7 +114,7 @@ def decode(
     Returns:
         Frames like ``render``, not clipped to [-1, 1], and the decoder's state after them.
     """
-    if settings.decoder.kind != "render":
+    if not settings.shows_render:
         return networks.decoder.decode_next(z, state, clamp=False)
     assert isinstance(networks.decoder, TinyVAE), "settings allow no other decoder to see the render"
     return networks.decoder.decode_next(z, state, render=render, opacity=opacity, clamp=False)
@@ -173,15 +173,43 @@ class Parts:
 
     def prompt(self, sizes: DiTSizes) -> Tensor:
         """Return the prompt's features ``(1, tokens, text_width)``; a zero token for untrained weights."""
-        given = self.tensors("prompt")
+        given, name = self.tensors("prompt"), self.prompt_name
+        if name is not None:
+            return self.named_prompt(name, sizes)
         if given is None:
             if self.trained and self.bundle is None:
                 self.refuse("prompt", "its transformer needs the features of the prompt that it was trained with")
             return torch.zeros(1, 1, sizes.text_width)
         text = given[0].get("text")
+        if text is None and given[0]:
+            found = f"its weights learned several prompts: {', '.join(sorted(given[0]))}"
+            raise InputError(DOING, given[1], found, f"choose one: --set fixer.prompt={min(given[0])}")
         if text is None or text.ndim != 2 or text.shape[1] != sizes.text_width:
             found = "no tensor 'text'" if text is None else f"text is {list(text.shape)}"
             raise InputError(DOING, given[1], found, f"give 'text' of shape [tokens, {sizes.text_width}]")
+        return text.float()[None]
+
+    @property
+    def prompt_name(self) -> str | None:
+        """Name of the learned prompt that is asked for."""
+        return self.settings.prompt if isinstance(self.settings, OneFixerSettings) else None
+
+    def named_prompt(self, name: str, sizes: DiTSizes) -> Tensor:
+        """Return a learned prompt ``(1, tokens, text_width)`` by its name.
+
+        Raises:
+            InputError: The weights have learned none, or none of that name.
+        """
+        given = self.tensors("prompt")
+        known = {} if given is None else {key: value for key, value in given[0].items() if key != "text"}
+        if name not in known:
+            source = self.settings.name if given is None else given[1]
+            found = f"its weights learned the prompts {', '.join(sorted(known))}" if known else "its weights learned no prompts"
+            do = "choose one of these" if known else "leave fixer.prompt out, or give a bundle of 'simrun train fixer --recipe appearance'"
+            raise InputError("choosing a prompt", f"{source}, fixer.prompt={name}", found, do)
+        text = known[name]
+        if text.ndim != 2 or text.shape[1] != sizes.text_width:
+            raise InputError(DOING, f"prompt {name}", f"shape {list(text.shape)}", f"give [tokens, {sizes.text_width}]")
         return text.float()[None]
 
     def vae(self) -> Codec:

@@ -73,7 +73,8 @@ class OneFixer(Fixer):
         self.blocks = BlockRule(1, 1) if settings.history == "none" else BlockRule.of_latents(settings.block_latents)
         self.trained = self.networks.trained
         at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
-        self.label = f"{settings.name}{at}, {self.networks.note}"
+        prompt = "" if settings.prompt is None else f", prompt {settings.prompt}"
+        self.label = f"{settings.name}{at}, {self.networks.note}{prompt}"
         self.reset(seed)
 
     @property

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from alpasim_plugin.config import apply_overrides, load_yaml, validate
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import schedule
+from alpasim_plugin.nets.styles import CLEAR
 from alpasim_plugin.yaml_marks import Document
 
 DOING = "reading the settings of a fixer"
@@ -133,7 +134,7 @@ class WeightsSettings(Part):
     dit: str | None = Field(default=None, description="The transformer alone.")
     vae: str | None = Field(default=None, description="The autoencoder alone.")
     decoder: str | None = Field(default=None, description="The tiny Wan decoder.")
-    prompt: str | None = Field(default=None, description="Safetensors with 'text' (tokens, text_width).")
+    prompt: str | None = Field(default=None, description="Safetensors with 'text' (tokens, text_width), or with a prompt under each name.")
     sha256: DigestSettings = Field(default=DigestSettings(), description="Expected digests by the keys above.")
 
     def path(self, part: str) -> Path | None:
@@ -184,6 +185,11 @@ class LatentFixerSettings(FixerSettings):
     fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
 
     @property
+    def shows_render(self) -> bool:
+        """Whether the decoder sees the render."""
+        return self.decoder.kind == "render"
+
+    @property
     @abstractmethod
     def network_times(self) -> tuple[float, ...]:
         """Time inputs of the network's denoising steps, 0 to 1000."""
@@ -224,12 +230,20 @@ class OneFixerSettings(LatentFixerSettings):
     )
     render_input: bool = Field(default=False, description="Whether the render's latents are a condition beside the map's.")
     opacity_input: bool = Field(default=False, description="Whether every block of the transformer embeds the opacity (ArtiFixer).")
+    prompt: str | None = Field(
+        default=None, description="Name of a prompt that its weights learned, such as night; recipe appearance has clear, night, fog, snow."
+    )
     graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
 
     @property
     def network_times(self) -> tuple[float, ...]:
         """Time inputs of the network's denoising steps, 0 to 1000."""
         return tuple(level.t for level in schedule.from_names(self.steps))
+
+    @property
+    def shows_render(self) -> bool:
+        """Whether the decoder sees the render; in another appearance than the render's, its detail would show the clear day through."""
+        return super().shows_render and self.prompt in (None, CLEAR)
 
     @property
     def finalises(self) -> bool:

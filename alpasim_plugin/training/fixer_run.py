@@ -34,7 +34,7 @@ from alpasim_plugin.training.snapshots import snapshot_file, snapshot_steps
 from alpasim_plugin.training.trainer import LOG_FILE, Schedule, Trainer
 
 BUNDLE_FILE = "fixer.safetensors"
-BUNDLED = ("dit", "vae")
+BUNDLED = ("dit", "vae", "prompt")
 TrainableSettings = OneFixerSettings | RenderStepSettings | NoiseWindowSettings
 Report = Callable[[int, Mapping[str, float]], None]
 
@@ -56,6 +56,7 @@ class FixerRun:
         equal_channels: Whether flow matching weights all latent channels alike.
         precision: Of the forward passes: None is float32. A stage that is always trained in float32 ignores it.
         snapshots: Weights that are kept of every stage at equal intervals (`snapshots`); equal weights come out with any number.
+        scenes: Folder of the scenes behind the pairs; recipes whose targets need depth ask for it.
     """
 
     settings: TrainableSettings
@@ -69,6 +70,7 @@ class FixerRun:
     equal_channels: bool = False
     precision: torch.dtype | None = None
     snapshots: int = 0
+    scenes: Path | None = None
 
     def __post_init__(self) -> None:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
@@ -215,7 +217,7 @@ def stage_inputs(
     return StageInputs(
         run.settings.dit, run.settings.rope_ratios, stage.attention(latents), stage.seen, weights, vae, clips,
         replace(run.batches, latents=latents), stage.updates(run.schedule.steps), run.schedule.accumulate, run.equal_channels, distance,
-        run.settings,
+        run.settings, run.scenes,
     )  # fmt: skip
 
 

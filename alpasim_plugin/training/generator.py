@@ -15,7 +15,7 @@ from alpasim_plugin.training.clip_batches import ClipBatches
 from alpasim_plugin.training.perceptual_term import DecodedDistance
 from alpasim_plugin.training.recipes.recipe import StageInputs
 from alpasim_plugin.training.recipes.start import channel_weights_of, transformer_of
-from alpasim_plugin.training.shared_rollout import Objectives, Perceptual, Sample, losses
+from alpasim_plugin.training.shared_rollout import Losses, Objectives, Perceptual, Sample, losses
 from alpasim_plugin.training.trainer import Loss
 
 
@@ -113,9 +113,13 @@ class SharedRolloutTask:
             self.net, s, self.text, self.objectives(index), perceptual,
             block_latents=attention.block_latents, window=attention.window, channel_weights=self.channel_weights,
         )  # fmt: skip
-        parts = {"flow": made.flow, "perceptual": made.perceptual}
-        numbers = {name: float(value.detach()) for name, value in parts.items() if value is not None}
-        if made.rollout is not None:
-            numbers["rollout"] = float((made.rollout - s.z_0).square().mean())
-        numbers["render"] = float((s.z_r - s.z_0).square().mean())
-        return made.total, numbers
+        return made.total, logged(made, s)
+
+
+def logged(made: Losses, s: Sample) -> dict[str, float]:
+    """Return what the log holds of a batch: its terms, and the mean squared errors of rollout and render."""
+    parts = {"flow": made.flow, "perceptual": made.perceptual}
+    numbers = {name: float(value.detach()) for name, value in parts.items() if value is not None}
+    if made.rollout is not None:
+        numbers["rollout"] = float((made.rollout - s.z_0).square().mean())
+    return numbers | {"render": float((s.z_r - s.z_0).square().mean())}

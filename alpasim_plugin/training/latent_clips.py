@@ -94,6 +94,7 @@ class LatentClips:
 
     Attributes:
         digest: Of everything the latents depend on: autoencoder, form, and the sequences in their order.
+        folder: Of the latents of this autoencoder and form.
 
     Raises:
         InputError: No sequence, one that is too short for a clip, or sequences of several image sizes.
@@ -115,8 +116,8 @@ class LatentClips:
             raise InputError(DOING, "the pairs", found, "give a folder with the sequences of one size")
         encoder = digest(vae, form)
         self.form, self.digest = form, f"{encoder}-{pairs_digest(sequences)}"
-        self._folder = folder / encoder
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder / encoder
+        self.folder.mkdir(parents=True, exist_ok=True)
         self._where: list[tuple[PairSequence, F16, int]] = []
         for done, sequence in enumerate(sequences):
             array = self._latents(sequence, vae)
@@ -134,7 +135,7 @@ class LatentClips:
         return LatentClip(z_r, z_0, z_map, z[3 * CHANNELS :], sequence, i // 2 * self.form.stride, bool(i % 2))
 
     def _latents(self, sequence: PairSequence, vae: TinyVAE) -> F16:
-        path = self._folder / f"{sequence.name}-{sequence.content[:12]}.npy"
+        path = self.folder / f"{sequence.name}-{sequence.content[:12]}.npy"
         if not path.exists():
             write_array(path, encode_sequence(sequence, vae, self.form), "writing training data")
         return np.asarray(np.load(path, mmap_mode="r"))

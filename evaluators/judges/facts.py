@@ -18,13 +18,13 @@ CLIP_FACTS: dict[str, MetricInfo] = {
     LANE_XERR_30: MetricInfo("m", "lower", "mean", "the same up to 30 m"),
     LANE_JITTER: MetricInfo("m", "lower", "mean", "jitter of lanes 40 m ahead from frame to frame, by our lane judge"),
     LANE_JITTER_20: MetricInfo("m", "lower", "mean", "the same 20 m ahead"),
+    STYLE_ACC: MetricInfo("", "higher", "mean", "share of frames in the wanted style, by our style judge"),
     CUBOID_F1: MetricInfo("", "higher", "mean", "overlap of vehicles' outlines with those on the clean frames, by our cuboid judge"),
 }
 SET_FACTS: dict[str, MetricInfo] = {
     FD_16: MetricInfo("", "lower", "mean", "Frechet distance of our video judge's features, windows of 16 frames; not FVD"),
     FD_CLIP: MetricInfo("", "lower", "mean", "the same with one vector a clip; fewer clips than 128 dimensions: mostly bias"),
     FVMD_LK: MetricInfo("", "lower", "mean", "Frechet distance of motion histograms of Lucas-Kanade tracks; not FVMD"),
-    STYLE_ACC: MetricInfo("", "higher", "mean", "share of frames in the wanted style, by our style judge"),
 }
 # The paper's names, and what the user must supply for each. Without it the cell is null; no metric of ours stands in for it.
 PAPER: Mapping[str, str] = {

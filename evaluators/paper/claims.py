@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from evaluators.judges.facts import STYLE_ACC, of_seed
+
 Relation = Literal["better", "not better", "close"]
 FD, PERCEPTUAL, CUBOID, XERR, LANE, JITTER = (
     "fd_syn_clip", "perceptual-syn", "cuboid_f1_syn", "lane_xerr_syn_m", "lane_f1_syn", "lane_jitter_syn_m",
@@ -31,11 +33,13 @@ class Contest:
     """One comparison.
 
     Args:
-        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop``, ``map-error``, ``cost`` or ``transfer``.
+        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop``, ``map-error``, ``cost``, ``transfer`` or
+            ``appearance``.
         metric: Ours.
         first, second: Arms.
         relation: ``better``: the paired difference favours the first; ``not better``: it does not; ``close``: its interval lies within a
             tenth of the second's value.
+        bound: A value in the second arm's place, which is then named by it.
     """
 
     protocol: str
@@ -43,6 +47,12 @@ class Contest:
     first: str
     second: str
     relation: Relation = "better"
+    bound: float | None = None
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Arms that must have been measured."""
+        return (self.first,) if self.bound is not None else (self.first, self.second)
 
 
 @dataclass(frozen=True)
@@ -167,6 +177,14 @@ CLAIMS: tuple[Claim, ...] = (
         (
             *each("transfer", (PSNR, MID, LAST, MOTION), OURS, ("difix", "artifixer")),
             *each("transfer", (WARP,), "artifixer", ("difix", OURS)),
+        ),
+    ),
+    Claim(
+        14, "Asked for night, fog or snow, OneFixer renders the style and keeps lanes better than editing systems; here: the style in nine "
+        "frames of ten, lanes not below the raw render's by the formula (editing systems cannot be run here)", "appearance table",
+        (
+            *(Contest("appearance", metric, "appearance", "0.9", bound=0.9) for metric in (STYLE_ACC, of_seed(STYLE_ACC, 1))),
+            *(Contest("appearance", metric, "3dgs + formula", "appearance", "not better") for metric in (LANE, of_seed(LANE, 1))),
         ),
     ),
 )  # fmt: skip

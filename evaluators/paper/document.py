@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluators.paper import wrong_map
+from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import OURS
 from evaluators.paper.cost import Cost, cost_section, plot_cost
 from evaluators.paper.measured import Measured
@@ -83,6 +84,7 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
     sections = {
         "A wrong map": _map_errors(found),
         "Beyond driving": transfer_section(published, measured),
+        "Night, fog and snow": appearance_section(published, measured),
         "By position": _positions(measured["under-trained"], rows["under-trained"]) if "under-trained" in rows else "",
         "Drift": drift(measured["cycle"], rows["cycle"]) + f"\n![Quality by frame]({DRIFT})" if "cycle" in rows else "",
         "Time": _times(measured["cycle"], found.units) if "cycle" in measured else "",

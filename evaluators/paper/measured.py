@@ -112,6 +112,19 @@ class Measured:
             favours = better * int(np.sign(found.centre))
         return Difference(metric, first, second, found.centre, found.low, found.high, None, len(clips), favours)
 
+    def margin(self, metric: str, arm: str, bound: float) -> Difference:
+        """Return by how much an arm exceeds a bound on average, as a difference from it.
+
+        Raises:
+            EvaluatorError: Fewer than two clips.
+        """
+        clips = self._shared(metric, arm)
+        found = t_interval([self.values[arm][clip][metric] - bound for clip in clips], "clips")
+        better = {"higher": 1, "lower": -1}.get(info(metric).direction, 0)
+        decided = found.low is not None and found.high is not None and not found.low < 0.0 < found.high
+        favours = better * (1 if found.centre >= 0 else -1) if decided else 0
+        return Difference(metric, arm, f"{bound:g}", found.centre, found.low, found.high, None, len(clips), favours)
+
     def _shared(self, metric: str, *arms: str) -> list[str]:
         sides = [self.clips(arm, metric) for arm in arms]
         shared = [clip for clip in sides[0] if all(clip in side for side in sides[1:])]

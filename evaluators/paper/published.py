@@ -47,6 +47,7 @@ class _Table(_Part):
     protocol: str
     metrics: tuple[str, ...]
     rows: dict[str, str]
+    no_counterpart: tuple[str, ...] = ()
 
 
 class _File(_Part):
@@ -64,12 +65,14 @@ class PaperTable:
         title, protocol: As headings.
         metrics: Names of its columns.
         rows: ARM -> METRIC -> the printed number; a cell that is not printed is not there.
+        no_counterpart: Rows of systems that cannot be run here.
     """
 
     title: str
     protocol: str
     metrics: tuple[str, ...]
     rows: Mapping[str, Mapping[str, Printed]]
+    no_counterpart: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ def published(path: Path | None = None) -> Published:
         if unknown := [metric for metric in table.metrics if metric not in file.metrics]:
             raise InputError(DOING, f"{path}, table {name}", f"metrics {', '.join(unknown)}", "describe them under 'metrics'")
         rows = {arm: _row(text, table.metrics, f"{path}, table {name}, row {arm}") for arm, text in table.rows.items()}
-        tables[name] = PaperTable(table.title, table.protocol, table.metrics, rows)
+        tables[name] = PaperTable(table.title, table.protocol, table.metrics, rows, table.no_counterpart)
     return Published(file.source, tables, file.metrics)
 
 

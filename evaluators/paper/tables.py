@@ -11,6 +11,7 @@ from evaluators.paper.verdict import Judged, Result
 from evaluators.video.table import DIGITS, SCALE
 
 NOT_RUN = "not run"
+NO_COUNTERPART = "no counterpart here"
 SET_DIGITS = {"fd_syn_clip": 2, "fd_syn_16": 2, "fvmd_lk": 0}
 ARROWS = {"higher": "↑", "lower": "↓"}
 
@@ -25,30 +26,34 @@ def paper_against_ours(published: Published, table: str, measured: Measured) -> 
     rows = [["", "*ours*", *(f"`{ours}`" if (ours := published.ours(m)) else "-" for m in printed.metrics)]]
     for arm, cells in printed.rows.items():
         rows.append([f"**{arm}**", "paper", *(cells[m].text if m in cells else "not reported" for m in printed.metrics)])
-        rows.append(["", "ours", *_line_of(published, printed.metrics, arm, measured)])
+        missing = NO_COUNTERPART if arm in printed.no_counterpart else NOT_RUN
+        rows.append(["", "ours", *_line_of(published, printed.metrics, arm, measured, missing)])
     others = [arm for arm in measured.arms if arm not in printed.rows]
     rows += [[f"**{arm}**", "ours", *_line_of(published, printed.metrics, arm, measured)] for arm in others]
     title = f"{printed.title} ({printed.protocol}; {published.source})"
     return f"**{title}**\n\n" + markdown_table(head, rows)
 
 
-def _line_of(published: Published, metrics: Sequence[str], arm: str, measured: Measured) -> list[str]:
+def _line_of(published: Published, metrics: Sequence[str], arm: str, measured: Measured, missing: str = NOT_RUN) -> list[str]:
     if arm not in measured.values:
-        return [NOT_RUN, *[""] * (len(metrics) - 1)]
+        return [missing, *[""] * (len(metrics) - 1)]
     return [_ours(published.metrics[metric], arm, measured) for metric in metrics]
 
 
 def _ours(metric: PaperMetric, arm: str, measured: Measured) -> str:
-    if metric.ours is None:
-        return "-"
-    if not measured.has(arm, metric.ours):
+    return "-" if metric.ours is None else interval_text(measured, arm, metric.ours, metric.scale)
+
+
+def interval_text(measured: Measured, arm: str, metric: str, scale: float = 1.0) -> str:
+    """Return an arm's mean with the half-width of its interval, ``null`` where it was not measured on two clips."""
+    if not measured.has(arm, metric):
         return "null"
-    found = measured.mean(arm, metric.ours)
-    digits = 1 if metric.scale > 1 else (DIGITS | SET_DIGITS).get(metric.ours, 3)
-    text = f"{found.centre * metric.scale:.{digits}f}"
+    found = measured.mean(arm, metric)
+    digits = 1 if scale > 1 else (DIGITS | SET_DIGITS).get(metric, 3)
+    text = f"{found.centre * scale:.{digits}f}"
     if found.low is None or found.high is None:
         return text
-    return f"{text}±{(found.high - found.low) / 2 * metric.scale:.{digits}f}"
+    return f"{text}±{(found.high - found.low) / 2 * scale:.{digits}f}"
 
 
 def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Sequence[str]) -> str:

@@ -66,11 +66,14 @@ def _judged(claim: Claim, measured: Mapping[str, Measured]) -> Judged:
 def _result(contest: Contest, measured: Measured | None) -> Result:
     if measured is None:
         return Result(contest, "not measured", None, f"protocol {contest.protocol}")
-    for arm in (contest.first, contest.second):
+    for arm in contest.arms:
         if not measured.has(arm, contest.metric):
             missing = f"{contest.metric} of {arm}" if arm in measured.values else f"arm {arm}"
             return Result(contest, "not measured", None, missing)
-    found = measured.difference(contest.metric, contest.first, contest.second)
+    if contest.bound is None:
+        found = measured.difference(contest.metric, contest.first, contest.second)
+    else:
+        found = measured.margin(contest.metric, contest.first, contest.bound)
     return Result(contest, _outcome(contest, found, measured), found)
 
 

@@ -46,7 +46,7 @@ def test_tables_verdicts_and_a_page_and_nothing_is_measured_twice(
     ]
     assert run_command([*command, "--json"]) == 0
     verdicts = json.loads(capsys.readouterr().out)
-    assert [one["verdict"] for one in verdicts] == ["not measured"] * 11
+    assert [one["verdict"] for one in verdicts] == ["not measured"] * 12
     text = (out / "paper.md").read_text()
     assert "**3dgs** | ours" in text
     assert "**onefixer** | ours" in text

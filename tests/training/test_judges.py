@@ -12,7 +12,7 @@ import torch
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.judge_types import FORWARD_M, Cuboid, cuboid_corners
 from alpasim_plugin.nets.judges.cuboid_net import decode
-from alpasim_plugin.training.judges.appearance import SeenFrame, restyle, vehicle_lamps
+from alpasim_plugin.training.appearance import SeenFrame, restyle, vehicle_lamps
 from alpasim_plugin.training.judges.cuboid import CuboidRecipe, CuboidTask, cuboid_cells
 from alpasim_plugin.training.judges.frames import LabelledFrames, chosen
 from alpasim_plugin.training.judges.labels import Labels, for_training

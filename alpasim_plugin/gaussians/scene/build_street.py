@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from alpasim_plugin.gaussians.cloud import GaussianCloud
@@ -163,11 +165,19 @@ def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
     return np.asarray(free)
 
 
-def _poles(site: Site, houses: Houses) -> list[Item]:
-    """Set lamp poles along the road and the poles that the map names."""
+class LampPosts(NamedTuple):
+    """Lamp posts along the road: feet, tops of the masts and tips of the arms ``(N, 3)``, metres, world; ``plan (N, 2)`` on the ground."""
+
+    plan: F64
+    foot: F64
+    top: F64
+    tip: F64
+
+
+def lamp_posts(site: Site, houses: Houses) -> LampPosts:
+    """Return the lamp posts of a scene, a function of the scene alone; the lamps hang at the tips."""
     spacing = site.scenario.environment.poles_spacing_m
-    feet: list[F64] = []
-    arms: list[F64] = []
+    feet, arms = [np.zeros((0, 2))], [np.zeros((0, 2))]
     rng = site.rng("poles")
     if spacing > 0:
         for line in contours(site, 0.7 if not site.highway else 2.0, 60.0):
@@ -175,15 +185,20 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
             free = _free(site, houses, spot.xy, 0.3)
             feet.append(spot.xy[free])
             arms.append(-spot.away[free])
-    mapped = [p for p in site.scenario.lane_map.poles if len(p) > 1]
-    at = np.concatenate(feet) if feet else np.zeros((0, 2))
-    if len(at) == 0 and not mapped:
-        return []
-    arm = np.concatenate(arms) if arms else at
+    at, arm = np.concatenate(feet), np.concatenate(arms)
     foot = site.world(at)
     top = foot + np.array([0, 0, 6.8])
     tip = site.world(at + 1.7 * arm)
     tip[:, 2] = top[:, 2] + 0.35
+    return LampPosts(at, foot, top, tip)
+
+
+def _poles(site: Site, houses: Houses) -> list[Item]:
+    """Set lamp posts along the road and the poles that the map names."""
+    at, foot, top, tip = lamp_posts(site, houses)
+    mapped = [p for p in site.scenario.lane_map.poles if len(p) > 1]
+    if len(at) == 0 and not mapped:
+        return []
     starts = [foot, top, *[p[:-1] for p in mapped]]
     ends = [top, tip, *[p[1:] for p in mapped]]
     start, end = np.concatenate(starts), np.concatenate(ends)

@@ -1,6 +1,6 @@
 """The style judge: is a frame of a clear day, night, fog or snow?
 
-It is trained on clean frames and their targets by fixed formulas (`training/judges/appearance.py`), at 128x72.
+It is trained on clean frames and their targets by fixed formulas (`training/appearance.py`), at 128x72.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.nets.styles import STYLES
 from alpasim_plugin.types import F32, F64, U8
 
-STYLES = ("clear", "night", "fog", "snow")
 HEIGHT, WIDTH = 72, 128
 
 

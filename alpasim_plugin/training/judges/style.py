@@ -14,20 +14,18 @@ from torch import Tensor
 
 from alpasim_plugin.atomic import atomic_file
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.gaussians.scene.degrade import log_actors
-from alpasim_plugin.judge_types import cuboid_corners
 from alpasim_plugin.nets.judges.layers import initialise
-from alpasim_plugin.nets.judges.style_net import STYLES, StyleNet, style_input
+from alpasim_plugin.nets.judges.style_net import StyleNet, style_input
+from alpasim_plugin.nets.styles import STYLES
 from alpasim_plugin.reading import parsing
-from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.training.judges.appearance import SeenFrame, restyle, vehicle_lamps
+from alpasim_plugin.training.appearance import restyle
 from alpasim_plugin.training.judges.frames import WIDTH_PX, jitter_colours
 from alpasim_plugin.training.judges.labels import TRAINING_SPLITS
-from alpasim_plugin.training.judges.truth import vehicle_cuboids
 from alpasim_plugin.training.pairs import offset_from_log
+from alpasim_plugin.training.seen_scene import SeenScene
 from alpasim_plugin.training.trainer import Loss
-from alpasim_plugin.types import F32, U8, RenderRequest, Scenario
+from alpasim_plugin.types import F32, U8, Scenario
 from scenarios.load import load_scenario
 
 FRAMES_A_SCENE = 6
@@ -125,16 +123,11 @@ def styled_frames(scenes: Sequence[Path], kept: Path, report: Callable[[int, int
 
 
 def _render(scenario: Scenario) -> U8:
-    camera, renderer = scenario.cameras[0], make_renderer("clean", scenario, seed=0, threads=1)
+    camera = scenario.cameras[0]
+    scene = SeenScene(scenario, camera, with_street_lights=False)
     out: list[list[U8]] = [[] for _ in STYLES]
     for t_us in np.linspace(scenario.start_us, scenario.end_us, FRAMES_A_SCENE).astype(np.int64):
-        T = offset_from_log(scenario, int(t_us), 0.0) @ camera.T_rig_camera
-        poses = log_actors(scenario, int(t_us))
-        made = renderer.render(RenderRequest(int(t_us), camera, np.stack([T, T]), poses))
-        if made.depth is None:
-            raise InputError("rendering frames for a judge", "renderer 'clean'", "frames without depth", "choose a renderer that gives it")
-        lamps = vehicle_lamps([cuboid_corners(c) for c in vehicle_cuboids(scenario, poses, T)])
-        seen = SeenFrame(made.rgb, made.depth, camera.K, T, int(t_us), lamps)
+        seen = scene.frame(int(t_us), offset_from_log(scenario, int(t_us), 0.0) @ camera.T_rig_camera)
         for frames, style in zip(out, STYLES, strict=True):
             frames.append(restyle(seen, style, scenario.scene_id, 0))
     return np.stack([np.stack(frames) for frames in out])

@@ -15,9 +15,11 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.flow_matching import FlowMatching
 from alpasim_plugin.training.generator import SharedRollout
 from alpasim_plugin.training.recipes.ablation import ABLATION
+from alpasim_plugin.training.recipes.appearance import APPEARANCE
 from alpasim_plugin.training.recipes.causal_arms import CAUSAL_ARMS
 from alpasim_plugin.training.recipes.image_arms import IMAGE_ARMS
 from alpasim_plugin.training.recipes.recipe import Attention, Objective, Recipe, whole_clip
+from alpasim_plugin.training.styled_rollout import StyledRollout
 
 
 def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
@@ -34,7 +36,7 @@ def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
     return MappingProxyType(found)
 
 
-RECIPES = by_name((*ABLATION, *CAUSAL_ARMS, *IMAGE_ARMS))
+RECIPES = by_name((*ABLATION, *CAUSAL_ARMS, *IMAGE_ARMS, APPEARANCE))
 
 
 def recipe_of(name: str) -> Recipe:
@@ -49,14 +51,14 @@ def recipe_of(name: str) -> Recipe:
 
 
 def with_perceptual_weight(recipe: Recipe, weight: float) -> Recipe:
-    """Return a recipe with another weight lambda of the shared rollout's perceptual term; others keep their papers' weights.
+    """Return a recipe with another weight lambda of the shared rollouts' perceptual term; others keep their papers' weights.
 
     Raises:
         InputError: A negative weight.
     """
 
     def weighted(objective: Objective) -> Objective:
-        return objective.weighted(weight) if isinstance(objective, SharedRollout) else objective
+        return objective.weighted(weight) if isinstance(objective, SharedRollout | StyledRollout) else objective
 
     return _with_objectives(recipe, weighted)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.errors import EvaluatorError, InputError
+from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import CLAIMS, Claim, Contest
 from evaluators.paper.document import Findings, document, draw_figures
 from evaluators.paper.measured import Measured, from_rows
@@ -104,15 +105,58 @@ def test_one_lost_contest_refutes_and_a_missing_arm_leaves_it_open() -> None:
     assert verdict_of(measured, Contest("closed-loop", "offroad", "a", "b")) == "not measured"
 
 
+@pytest.mark.parametrize(("level", "verdict"), [(0.97, "holds"), (0.85, "does not hold"), (0.9, "undecided at our scale")])
+def test_a_contest_with_a_bound_asks_whether_the_mean_is_shown_to_be_on_one_side(level: float, verdict: str) -> None:
+    measured = Measured({"a": {clip: {"style_acc_syn": level + (0.02 if i % 2 else -0.02)} for i, clip in enumerate(CLIPS)}})
+    assert verdict_of(measured, Contest("cycle", "style_acc_syn", "a", "0.9", bound=0.9)) == verdict
+    exact = Measured({"a": {clip: {"style_acc_syn": level} for clip in CLIPS}})
+    assert exact.margin("style_acc_syn", "a", 0.9).difference == pytest.approx(level - 0.9)
+
+
+def appearances(accuracy: float, lanes: float) -> dict[str, Measured]:
+    """Return the protocols of the appearance experiment with given values of our arm."""
+    rng = np.random.default_rng(2)
+    rows = {"appearance": (accuracy, lanes), "3dgs + formula": (0.99, 0.6), "target": (1.0, 0.8)}
+    values = {
+        arm: {
+            clip: {
+                **dict.fromkeys(("style_acc_syn", "style_acc_syn.seed1"), style),
+                **dict.fromkeys(("lane_f1_syn", "lane_f1_syn.seed1"), f1),
+            }
+            for clip, f1 in zip(CLIPS, f1 + 0.01 * rng.normal(size=len(CLIPS)), strict=True)
+        }
+        for arm, (style, f1) in rows.items()
+    }
+    return {name: Measured(values, reference="target") for name in ("appearance", "appearance-night", "appearance-fog", "appearance-snow")}
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "lanes", "verdict"), [(0.97, 0.7, "holds"), (0.97, 0.5, "does not hold"), (0.6, 0.7, "does not hold")]
+)
+def test_the_claim_on_appearance_asks_for_style_and_lanes(accuracy: float, lanes: float, verdict: str) -> None:
+    assert judge_claims(appearances(accuracy, lanes))[-1].verdict == verdict
+
+
+def test_the_section_on_appearance_has_the_papers_rows_and_every_style() -> None:
+    text = appearance_section(published(), appearances(0.97, 0.7))
+    assert "| **cosmos3** | paper | .962 | .992 | .098 | .632 |" in text
+    assert text.count("no counterpart here |") == 2
+    for style in ("night", "fog", "snow"):
+        assert f"| **{style}**, appearance | 0.970" in text
+        assert f"| **{style}**, target | 1.000" in text
+    assert "Fog, paired over clips" in text
+    assert appearance_section(published(), {}) == ""
+
+
 def test_claims_name_arms_and_metrics_that_there_are() -> None:
-    known = {arm for table in published().tables.values() for arm in table.rows} | {"3dgs", "harmonizer-temporal-teacher"}
+    known = {arm for table in published().tables.values() for arm in table.rows} | {"3dgs", "3dgs + formula", "harmonizer-temporal-teacher"}
     measured_as = {metric.ours for metric in published().metrics.values()} | {"ms_per_frame", "drift_psnr_db", "fd_syn_16"}
     for claim in CLAIMS:
         assert claim.contests
         for contest in claim.contests:
-            assert {contest.first.partition(",")[0], contest.second.partition(",")[0]} <= known, claim.number
-            assert contest.metric in measured_as
-    assert [claim.number for claim in CLAIMS] == list(range(1, 14))
+            assert {arm.partition(",")[0] for arm in contest.arms} <= known, claim.number
+            assert contest.metric.removesuffix(".seed1") in measured_as
+    assert [claim.number for claim in CLAIMS] == list(range(1, 15))
 
 
 def test_the_table_has_the_papers_line_above_ours_and_null_where_nothing_stands_in() -> None:
@@ -143,7 +187,7 @@ def test_a_document_says_what_was_not_run() -> None:
     found: Published = published()
     findings = Findings({"under-trained": Measured(from_rows(rows))}, {"under-trained": rows}, {})
     text = document(found, findings, {}, "simrun bench paper")
-    assert text.count("Not run.") == 9
+    assert text.count("Not run.") == 10
     assert "Claim 3** was not measured: protocol cycle" in text
     windows = by_position(rows).splitlines()
     assert "| 0 to 92 | 93 to 189 |" in windows[0]

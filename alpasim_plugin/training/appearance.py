@@ -12,12 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.styles import CLEAR, STYLES
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F32, F64, U8
 
+VERSION = 1  # of the formulas: targets of another version are made anew
 FAR_M = 1000.0  # depth of what has none
 FOG_PER_M = (0.03, 0.06)
 NIGHT_RGB = np.array([0.62, 0.74, 1.0], dtype=np.float32)
+STREET_LIGHTS_M = 80.0  # as far as street lights are drawn
+STREET_LIGHT_RGB = np.array([1.0, 0.84, 0.58])
 HEADLIGHT_M = 18.0  # reach of the ego's own lamps
 FLAKES = 260
 BOX_M = np.array([16.0, 9.0, 14.0])  # of flakes around the camera's line of sight: x, y, z
@@ -50,10 +54,10 @@ def restyle(frame: SeenFrame, style: str, scene_id: str, seed: int) -> U8:
     Raises:
         InputError: No such style.
     """
-    if style == "clear":
+    if style == CLEAR:
         return np.array(frame.rgb)
     if style not in _FORMULAS:
-        raise InputError("restyling a frame", f"style {style!r}", "no such style", f"choose clear, {', '.join(_FORMULAS)}")
+        raise InputError("restyling a frame", f"style {style!r}", "no such style", f"choose one of {', '.join(STYLES)}")
     image = frame.rgb.astype(np.float32) / np.float32(255)
     made = _FORMULAS[style](frame, image, stream(scene_id, seed, f"appearance.{style}"))
     return np.asarray(np.clip(np.rint(made * 255), 0, 255), dtype=np.uint8)
@@ -133,6 +137,13 @@ def _with_flakes(frame: SeenFrame, image: F32, world: F64) -> F32:
 
 
 _FORMULAS = {"night": night, "fog": fog, "snow": snow}
+
+
+def lights_of_posts(world: F64, T_world_camera: F64) -> F64:
+    """Return the street lights within 80 m ahead as lamps ``(N, 6)`` of the camera, from their places ``(N, 3)`` in the world."""
+    at = (world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    seen = at[(at[:, 2] > 0) & (at[:, 2] < STREET_LIGHTS_M)]
+    return np.concatenate([seen, np.tile(STREET_LIGHT_RGB, (len(seen), 1))], axis=1)
 
 
 def vehicle_lamps(corners: Sequence[F64]) -> F64:
