@@ -69,7 +69,7 @@ def run(
     video: Annotated[Literal["none", "failures", "all"], typer.Option("--video", help="Write front.mp4.")] = "none",
     images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
     overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="Override a scenario key, or with `fixer.` a fixer's: key=value. Repeatable.")
+        list[str] | None, typer.Option("--set", help="Override a scenario key, key=value, or with [RENDERER:]fixer. a fixer's. Repeatable.")
     ] = None,
     timeline: Annotated[
         Literal["scenario", "alpasim"],
@@ -161,14 +161,21 @@ def split_policies(text: str) -> list[str]:
 
 
 def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Separate the overrides of scenarios from those of fixers, which start with ``fixer.``.
+    """Separate the overrides of scenarios from those of fixers: ``fixer.KEY=VALUE``, or ``RENDERER:fixer.KEY=VALUE`` for one of them.
 
     Example:
-        >>> split_overrides(["timing.warmup_us=400000", "fixer.mode=chunk"])
-        (('timing.warmup_us=400000',), ('mode=chunk',))
+        >>> split_overrides(["timing.warmup_us=400000", "fixer.mode=chunk", "difix:fixer.weights.bundle=d.safetensors"])
+        (('timing.warmup_us=400000',), ('mode=chunk', 'difix:weights.bundle=d.safetensors'))
     """
-    of_scene = tuple(text for text in overrides if not text.startswith(FIXER_PREFIX))
-    return of_scene, tuple(text.removeprefix(FIXER_PREFIX) for text in overrides if text.startswith(FIXER_PREFIX))
+    of_scene, of_fixer = [], []
+    for text in overrides:
+        key, equals, value = text.partition("=")
+        renderer, fixer, rest = key.rpartition(FIXER_PREFIX)
+        if fixer and (not renderer or renderer.endswith(":")):
+            of_fixer.append(renderer + rest + equals + value)
+        else:
+            of_scene.append(text)
+    return tuple(of_scene), tuple(of_fixer)
 
 
 def parse_seeds(text: str) -> list[int]:

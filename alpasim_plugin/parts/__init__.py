@@ -7,7 +7,19 @@ A name is resolved once, into a `PartSpec` that carries the part's identity; a w
 from alpasim_plugin.members import complete
 from alpasim_plugin.parts.build import build
 from alpasim_plugin.parts.registry import find, names
-from alpasim_plugin.parts.resolve import RendererSpec, resolve, resolve_renderer, unidentified
+from alpasim_plugin.parts.resolve import RendererSpec, overrides_of, resolve, resolve_renderer, unidentified
 from alpasim_plugin.parts.spec import PartSpec, digest
 
-__all__ = ["PartSpec", "RendererSpec", "build", "complete", "digest", "find", "names", "resolve", "resolve_renderer", "unidentified"]
+__all__ = [
+    "PartSpec",
+    "RendererSpec",
+    "build",
+    "complete",
+    "digest",
+    "find",
+    "names",
+    "overrides_of",
+    "resolve",
+    "resolve_renderer",
+    "unidentified",
+]

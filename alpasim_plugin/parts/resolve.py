@@ -95,11 +95,13 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
 
     Args:
         name: Renderer and fixer as `resolve` takes them: ``clean``, ``onefixer@2``, ``onefixer+my.module:MyRenderer``.
-        overrides: ``KEY=VALUE`` of the fixer's settings; ignored where there is none.
+        overrides: ``KEY=VALUE`` of the fixer's settings, ignored where there is none; ``RENDERER:KEY=VALUE`` counts for the renderer of
+            that name alone.
 
     Raises:
         InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one without the weights that it needs.
     """
+    overrides = overrides_of(name, overrides)
     front, plus, base = name.partition("+")
     if not plus:
         if front in entries("renderer") or "://" in front or (is_target(front) and not _is_fixer(front)):
@@ -110,6 +112,18 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     if not is_target(front):
         _require_fixer(name, front, bool(plus))
     return RendererSpec(name, resolve("renderer", base), _in_the_loop(resolve("fixer", front, overrides)))
+
+
+def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
+    """Return the settings of one renderer's fixer: those for all, then those for it alone.
+
+    Example:
+        >>> overrides_of("difix", ["difix:window=2", "precision=bf16", "gsfix3d:steps=4"])
+        ('precision=bf16', 'window=2')
+    """
+    named = [(text.partition("=")[0].rpartition(":")[0], text) for text in overrides]
+    own = (text[len(label) + 1 :] for label, text in named if label == renderer)
+    return (*(text for label, text in named if not label), *own)
 
 
 def split_steps(name: str) -> tuple[str, int | None]:

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import resolve_renderer
+from alpasim_plugin.parts import overrides_of, resolve_renderer
 from alpasim_plugin.runtime.contents import read_run_json
 from alpasim_plugin.runtime.manifests import inspect_rollout
 from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan, refuse_commands
@@ -92,7 +92,8 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
     options = _options(info)
     refuse_commands([row["policy"]], DOING, str(root))
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a fixer.
-    own = options if resolve_renderer(row["renderer"], options.fixer).fixer is not None else replace(options, fixer=())
+    has_fixer = resolve_renderer(row["renderer"], options.fixer).fixer is not None
+    own = replace(options, fixer=overrides_of(row["renderer"], options.fixer) if has_fixer else ())
     plan = make_plan([ref], [row["renderer"]], [row["policy"]], [int(row["seed"])], own)
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row["scene"])

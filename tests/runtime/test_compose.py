@@ -13,6 +13,7 @@ import pytest
 from alpasim_plugin import make_renderer
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.chunk import ChunkRenderer
+from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.parts import resolve, resolve_renderer, spec
@@ -119,6 +120,16 @@ def test_one_renderer_under_two_names_is_refused() -> None:
 def test_settings_for_a_fixer_that_is_not_there_are_refused() -> None:
     with pytest.raises(InputError, match="no fixer among the renderers"):
         plan(("3dgs",), ("mode=chunk",))
+    with pytest.raises(InputError, match="no fixer of that name among the renderers"):
+        plan(("3dgs", "identity+clean"), ("identity:mode=chunk",))
+    with pytest.raises(InputError, match="no fixer of that name among the renderers"):
+        plan(("3dgs", "identity+clean"), ("3dgs:mode=chunk",))
+
+
+def test_a_setting_for_one_renderer_is_that_of_its_fixer_alone() -> None:
+    names = ("identity+clean", "identity")
+    settings = [spec.fixer.settings for spec in plan(names, ("tolerance_m=0.5", "identity+clean:mode=chunk")).renderers if spec.fixer]
+    assert [(of.mode, of.tolerance_m) for of in settings if isinstance(of, FixerSettings)] == [("chunk", 0.5), ("speculative", 0.5)]
 
 
 @pytest.mark.parametrize(
