@@ -25,6 +25,7 @@ from alpasim_plugin.training.arms.plan import Plan, comparison, plan, training_n
 from alpasim_plugin.training.arms.run import ArmsRun, probe, write_plan
 from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.latent_clips import ClipForm
+from alpasim_plugin.training.recipes.appearance import APPEARANCE
 from alpasim_plugin.training.recipes.recipe import Recipe
 from alpasim_plugin.training.recipes.registry import with_perceptual_weight
 from alpasim_plugin.training.snapshots import core_seconds
@@ -47,6 +48,7 @@ def arms(
     data: options.Pairs,
     vae: Annotated[Path, typer.Option("--vae", help="Trained autoencoder ('simrun train vae'), or a fixer's bundle.")],
     out: Annotated[Path, typer.Option("--out", help="Folder of the arms; the same command resumes it.")],
+    scenes: Annotated[Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes; the arm appearance needs it.")] = None,
     only: Annotated[str | None, typer.Option("--only", help="Comma-separated arms; by default all of docs/arms.md.")] = None,
     weights: Annotated[
         list[str] | None, typer.Option("--weights", help="base=FILE or base-bi=FILE: an initial network that is not trained. Repeatable.")
@@ -94,14 +96,17 @@ def arms(
     run = ArmsRun(
         data, vae, out, ClipForm(latents, stride), BatchForm(clips, None, columns, seed), schedule,
         replace(schedule, peak_lr=base_lr).of_length(base_steps), named_weights(None, weights or []), channels == "equal",
-        PRECISIONS[precision], snapshots, metric_weights,
+        PRECISIONS[precision], snapshots, metric_weights, scenes,
     )  # fmt: skip
     recipes = tuple(with_perceptual_weight(recipe, perceptual) for recipe in comparison())
+    telling = Telling()
     chosen = [recipe.name for recipe in recipes] if only is None else [name.strip() for name in only.split(",") if name.strip()]
+    if only is None and scenes is None:
+        chosen.remove(APPEARANCE.name)
+        telling.say(f"{APPEARANCE.name} is left out: its targets need the depth of the scenes; give --scenes for it")
     swept = None if sweep is None else Sweep(rates_of(sweep), sweep_steps, sweep_clips)
     if swept is None and (sweep_steps, sweep_clips) != (None, None):
         raise InputError(DOING, "--sweep-steps, --sweep-clips", "no rates to choose from", "give --sweep 1e-4,3e-4,1e-3")
-    telling = Telling()
     planned = plan(recipes, chosen, run.given)
     run.clips(telling.encoded)
     if minutes is not None:

@@ -53,6 +53,7 @@ class ArmsRun:
         precision: Of the forward passes: None is float32.
         snapshots: Kept of every stage.
         metric_weights: Folder of LPIPS weights for the perceptual term.
+        scenes: Folder of the pairs' scenes, for arms whose targets need depth.
     """
 
     data: Path
@@ -67,6 +68,7 @@ class ArmsRun:
     precision: torch.dtype | None = None
     snapshots: int = 0
     metric_weights: Path | None = None
+    scenes: Path | None = None
 
     def bundle_of(self, training: str) -> Path:
         """Return the weights of a training, given or made."""
@@ -88,7 +90,7 @@ class ArmsRun:
         chosen = self.initial if recipe.name in INITIAL.values() else self.schedule
         return FixerRun(
             settings, recipe, self.data, self.vae, weights, self.form, self.batches, schedule or chosen, self.equal_channels,
-            self.precision, self.snapshots,
+            self.precision, self.snapshots, self.scenes,
         )  # fmt: skip
 
 
