@@ -32,6 +32,7 @@ from alpasim_plugin.training.trainer import Schedule
 from evaluators.paper.tables import markdown_table
 
 EVERY_S = 20.0  # between lines of progress
+SHORT_S = 120.0  # a time left that is given in seconds
 EPILOG = """
 Examples:
 
@@ -203,7 +204,8 @@ class Telling:
             return "nothing left" if not self.updates else "time left not known yet"
         usual = sum(means.values()) / len(means)
         left_s = sum(means.get(one, usual) * count for one, count in self.updates.items())
-        return f"about {left_s / self.jobs / 60:.0f} min left"
+        left_s /= self.jobs
+        return f"about {left_s:.0f} s left" if left_s < SHORT_S else f"about {left_s / 60:.0f} min left"
 
 
 def summary(run: ArmsRun, planned: Plan, swept: Sweep | None) -> list[dict[str, Any]]:
