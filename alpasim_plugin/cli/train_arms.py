@@ -18,6 +18,7 @@ from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, choice_name, read_choice, tasks_of, work
 from alpasim_plugin.cli.train_fixer import PRECISIONS, named_weights
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.image_distance import distance_for_training
 from alpasim_plugin.runtime.dependent import run_dependent
 from alpasim_plugin.stopping import Stopped
 from alpasim_plugin.training.arms.budget import in_equal_time, related
@@ -104,6 +105,7 @@ def arms(
         raise InputError(DOING, "--sweep-steps, --sweep-clips", "no rates to choose from", "give --sweep 1e-4,3e-4,1e-3")
     telling = Telling()
     planned = plan(recipes, chosen, run.given)
+    telling.say(f"perceptual term: {distance_for_training(metric_weights)[0]}")
     run.clips(telling.encoded)
     if minutes is not None:
         recipes = equal_time(run, recipes, chosen, minutes, probe_updates, telling)
