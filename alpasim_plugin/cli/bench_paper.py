@@ -96,6 +96,7 @@ def paper(
     write_text(out / "paper.md", document(published(), found.measured, rows, found.units, why, command, cost))
     if found.cost is not None:
         plot_cost(found.cost, out / COST_FIGURE)
+        console.print(f"cost: {found.cost.about}", highlight=False)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
     verdicts = [
         {"number": one.claim.number, "verdict": one.verdict, "contests": [asdict(result) for result in one.results]} for one in judged

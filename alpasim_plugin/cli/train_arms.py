@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -146,7 +147,7 @@ def rates_of(text: str) -> tuple[float, ...]:
         rates = tuple(float(part) for part in text.split(","))
     except ValueError:
         rates = ()
-    if len(set(rates)) < 2 or len(set(rates)) != len(rates) or min(rates) <= 0:
+    if len(rates) < 2 or len(set(rates)) != len(rates) or not all(0 < rate < math.inf for rate in rates):
         raise InputError(DOING, f"--sweep {text}", "not at least two different learning rates", "write for example --sweep 1e-4,3e-4,1e-3")
     return rates
 
