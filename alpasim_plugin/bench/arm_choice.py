@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.atomic import write_json
+from alpasim_plugin.atomic import disk_error, temporary_path, write_bytes, write_json
 from alpasim_plugin.bench.quality import Variant
 from alpasim_plugin.bench.quality_run import QualityRun, evenly, row_of
 from alpasim_plugin.errors import InputError
@@ -115,7 +115,7 @@ def take(candidate: Path, arm: Path, choice: Choice) -> None:
         raise InputError(DOING, str(arm), "an arm that was trained without a sweep", do)
     for path in [candidate / BUNDLE_FILE, *sorted((candidate / SNAPSHOTS).glob("*.safetensors"))]:
         _link(path, arm / path.relative_to(candidate))
-    shutil.copyfile(candidate / LOG_FILE, arm / LOG_FILE)
+    write_bytes(arm / LOG_FILE, (candidate / LOG_FILE).read_bytes())
     write_card(candidate, arm, choice)
 
 
@@ -128,9 +128,15 @@ def write_card(candidate: Path, arm: Path, choice: Choice) -> None:
 def _link(path: Path, to: Path) -> None:
     if to.exists() and to.samefile(path):
         return
-    to.parent.mkdir(parents=True, exist_ok=True)
-    to.unlink(missing_ok=True)
+    partial = temporary_path(to)
     try:
-        os.link(path, to)
-    except OSError:  # a file system without hard links
-        shutil.copyfile(path, to)
+        to.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(path, partial)
+        except OSError:  # a file system without hard links, or a full one, which the copy reports
+            shutil.copyfile(path, partial)
+        partial.replace(to)
+    except OSError as error:
+        raise disk_error(to, error) from error
+    finally:
+        partial.unlink(missing_ok=True)

@@ -105,6 +105,8 @@ def paper(
     command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"
     write_text(out / "paper.md", document(published(), made, why, command))
     draw_figures(made, out)
+    if found.cost is not None:
+        console.print(f"cost: {found.cost.about}", highlight=False)
     facts = {"command": command, "hardware": hardware(), "versions": versions(), "judges": judging and judging.identity["judges"]}
     verdicts = [
         {"number": one.claim.number, "verdict": one.verdict, "contests": [asdict(result) for result in one.results]} for one in judged

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,7 @@ from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, choice_name, read_choice, tasks_of, work
 from alpasim_plugin.cli.train_fixer import PRECISIONS, named_weights
 from alpasim_plugin.errors import InputError
+from alpasim_plugin.nets.image_distance import distance_for_training
 from alpasim_plugin.runtime.dependent import run_dependent
 from alpasim_plugin.stopping import Stopped
 from alpasim_plugin.training.arms.budget import in_equal_time, related
@@ -33,6 +35,7 @@ from alpasim_plugin.training.trainer import Schedule
 from evaluators.paper.tables import markdown_table
 
 EVERY_S = 20.0  # between lines of progress
+SHORT_S = 120.0  # a time left that is given in seconds
 EPILOG = """
 Examples:
 
@@ -108,6 +111,7 @@ def arms(
     if swept is None and (sweep_steps, sweep_clips) != (None, None):
         raise InputError(DOING, "--sweep-steps, --sweep-clips", "no rates to choose from", "give --sweep 1e-4,3e-4,1e-3")
     planned = plan(recipes, chosen, run.given)
+    telling.say(f"perceptual term: {distance_for_training(metric_weights)[0]}")
     run.clips(telling.encoded)
     if minutes is not None:
         recipes = equal_time(run, recipes, chosen, minutes, probe_updates, telling)
@@ -148,7 +152,7 @@ def rates_of(text: str) -> tuple[float, ...]:
         rates = tuple(float(part) for part in text.split(","))
     except ValueError:
         rates = ()
-    if len(set(rates)) < 2 or len(set(rates)) != len(rates) or min(rates) <= 0:
+    if len(rates) < 2 or len(set(rates)) != len(rates) or not all(0 < rate < math.inf for rate in rates):
         raise InputError(DOING, f"--sweep {text}", "not at least two different learning rates", "write for example --sweep 1e-4,3e-4,1e-3")
     return rates
 
@@ -208,7 +212,8 @@ class Telling:
             return "nothing left" if not self.updates else "time left not known yet"
         usual = sum(means.values()) / len(means)
         left_s = sum(means.get(one, usual) * count for one, count in self.updates.items())
-        return f"about {left_s / self.jobs / 60:.0f} min left"
+        left_s /= self.jobs
+        return f"about {left_s:.0f} s left" if left_s < SHORT_S else f"about {left_s / 60:.0f} min left"
 
 
 def summary(run: ArmsRun, planned: Plan, swept: Sweep | None) -> list[dict[str, Any]]:

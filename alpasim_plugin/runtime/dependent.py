@@ -55,8 +55,10 @@ def run_dependent(work: Callable[[T, Say], None], tasks: Sequence[T], jobs: int,
 
     Raises:
         InfrastructureError: A process ended before its work.
+        ValueError: A task before one that it depends on.
         The first exception of ``work``; what still runs is ended.
     """
+    _check_order(tasks)
     if jobs <= 1:
         for task in tasks:
             work(task, lambda said, name=task.name: heard(name, said))  # type: ignore[misc]
@@ -73,6 +75,12 @@ def run_dependent(work: Callable[[T, Say], None], tasks: Sequence[T], jobs: int,
                     left.discard(one.name)
     finally:
         _end(running)
+
+
+def _check_order(tasks: Sequence[Task]) -> None:
+    for i, task in enumerate(tasks):
+        if early := {one.name for one in tasks[i:]}.intersection(task.after):
+            raise ValueError(f"task {task.name} comes before {', '.join(sorted(early))}, which it depends on")
 
 
 def _start(work: Callable[[T, Say], None], task: T) -> _Running:

@@ -20,8 +20,8 @@ METRICS = (FD_16, FVMD_LK, "psnr_db", "perceptual-syn")
 COLUMNS, DPI = 2, 110
 COLOURS = {OURS: "C3", "self-forcing": "C0", "one-forcing": "C2"}
 HOW = """Core-minutes are processor time of the updates alone, all stages of an arm in turn, a shared one counted for each; the initial
-networks and the evaluation do not count. A distilled arm's teacher is no causal network, so its time counts and its curve begins with the
-student's first snapshot. One seed."""
+networks and the evaluation do not count. A distilled arm's teacher is no causal network: its time counts, and the arm's curve begins with
+the student's first snapshot; curves of arms with that stage in common coincide there. One seed."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,9 @@ def cost_section(cost: Cost, figure: str) -> str:
     for curve in curves:
         for point in curve.points:
             values = [_value(measured, point.label, metric) for metric in shown]
-            rows.append([curve.arm, point.stage, str(point.updates), f"{point.core_minutes:.2f}", *values])
+            rows.append([curve.arm, point.stage, str(point.updates), _minutes(point.core_minutes), *values])
     head = ["arm", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[info(m).direction]}" for m in shown)]
-    ends = "".join(f"- {curve.arm}: {', '.join(f'{name} to {end:.2f}' for name, end in curve.ends.items())}\n" for curve in curves)
+    ends = "".join(f"- {curve.arm}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves)
     return (
         f"{HOW}\n\n{cost.about}\n\n![Quality against core-minutes, borders of stages dashed]({figure})\n\n"
         f"Ends of stages, core-minutes:\n\n{ends}\n{markdown_table(head, rows)}\n{_halves(curves)}"
@@ -128,9 +128,13 @@ def _halves(curves: Sequence[Curve]) -> str:
         if ours is None or curve is ours:
             continue
         point, half = ours.at(curve.core_minutes / 2), curve.core_minutes / 2
-        found = "no snapshot" if point is None else f"the snapshot of {point.updates} updates, {point.core_minutes:.2f}"
-        lines.append(f"- Within half of the core-minutes of {curve.arm} ({half:.2f}), {OURS} has {found}.\n")
+        found = "no snapshot" if point is None else f"the snapshot of {point.updates} updates, {_minutes(point.core_minutes)}"
+        lines.append(f"- Within half of the core-minutes of {curve.arm} ({_minutes(half)}), {OURS} has {found}.\n")
     return "".join(lines)
+
+
+def _minutes(value: float) -> str:
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
 def _value(measured: Measured, label: str, metric: str) -> str:

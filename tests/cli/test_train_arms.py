@@ -110,6 +110,7 @@ def test_a_budget_of_minutes_is_kept_with_recorded_times(data: Path, capsys: pyt
         (["--minutes", "3"], "a number of minutes for a budget of updates"),
         (["--jobs", "2", "--threads", "2"], "several threads in several processes"),
         (["--sweep", "1e-4"], "not at least two different learning rates"),
+        (["--sweep", "1e-4,nan"], "not at least two different learning rates"),
         (["--sweep-steps", "3"], "no rates to choose from"),
         (["--weights", "init=x"], "no initial network"),
     ],

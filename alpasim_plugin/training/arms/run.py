@@ -155,8 +155,8 @@ def probe(run: ArmsRun, trainings: Sequence[Training], updates: int, told: Calla
     known: dict[str, Any] = {"options": options, "seconds_of_update": {}}
     if path.exists():
         known = read_json_object(path, DOING)
-        if known["options"] != options:
-            raise InputError(DOING, str(path), f"times measured with {known['options']}, this is {options}", "choose another folder")
+        if (begun := known.get("options")) != options:
+            raise InputError(DOING, str(path), f"times measured with {begun}, this is {options}", "choose another folder")
     seconds = dict(known["seconds_of_update"])
     for training in trainings:
         if training.name not in seconds:

@@ -10,7 +10,8 @@ import pytest
 
 from alpasim_plugin.errors import EvaluatorError, InputError
 from evaluators.paper.appearance import appearance_section
-from evaluators.paper.claims import CLAIMS, Claim, Contest
+from evaluators.paper.claims import CLAIMS, Claim, Contest, within
+from evaluators.paper.cost import Cost, Curve, Point, contested, cost_section
 from evaluators.paper.document import Findings, document, draw_figures
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip, render_side_by_side
@@ -234,6 +235,20 @@ def test_drift_sets_both_trainings_of_the_temporal_arm_side_by_side(tmp_path: Pa
     assert {one.claim.number: one.verdict for one in judge_claims({"cycle": measured})}[12] == "holds"
     draw_figures(Findings({}, {"cycle": rows}, {}), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["drift.png"]
+def test_training_time_is_compared_at_our_last_snapshot_within_half_of_the_others() -> None:
+    ours = Curve("V9", tuple(Point("V9", i, float(i), f"V9 after {i}") for i in (1, 2, 3, 4)), {"V9": 4.0})
+    student, dmd = Point("omnidreams", 1, 3.0, "student"), Point("self-forcing", 1, 5.0, "dmd")
+    theirs = Curve("self-forcing", (student, dmd), {"teacher": 2.0, "omnidreams": 3.0, "self-forcing": 5.0})
+    quick = Curve("one-forcing", (Point("one-forcing", 1, 1.5, "quick"),), {"one-forcing": 1.5})
+    shift = {"V9 after 1": 0.0, "V9 after 2": 0.4, "V9 after 3": 0.6, "V9 after 4": 0.8, "student": 0.1, "dmd": 0.2, "quick": 0.0}
+    cost = Cost((ours, theirs, quick), arms(**shift), "12 clips.")
+    measured = contested(cost)
+    assert set(measured.arms) == {"V9", "self-forcing", "one-forcing", within("self-forcing")}, "no snapshot of ours within 0.75"
+    assert measured.difference("psnr_db", within("self-forcing"), "self-forcing").difference == pytest.approx(0.2, abs=0.1)
+    text = cost_section(cost, "cost.png")
+    assert "self-forcing (2.5), V9 has the snapshot of 2 updates, 2." in text
+    assert "one-forcing (0.75), V9 has no snapshot." in text
+    assert "- self-forcing: teacher to 2, omnidreams to 3, self-forcing to 5" in text
 
 
 def test_a_page_holds_every_frame_and_refuses_films_of_other_lengths() -> None:
