@@ -51,7 +51,9 @@ def paper(
     transfer: Annotated[
         Path | None, typer.Option("--transfer", help="Pairs beyond driving, for the table of the transfer (docs/pairs.md).")
     ] = None,
-    transfer_arms: Annotated[Path | None, typer.Option("--transfer-arms", help="Folder like --arms of the arms fine-tuned on them.")] = None,
+    transfer_arms: Annotated[
+        Path | None, typer.Option("--transfer-arms", help="Folder like --arms of the arms fine-tuned on them.")
+    ] = None,
     photographs: Annotated[Path | None, typer.Option("--photographs", help="Pairs of photographs, measured the same way.")] = None,
     only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(PROTOCOLS),
     clips: Annotated[int | None, typer.Option("--clips", min=2, help="At most so many clips a protocol, evenly chosen.")] = None,
@@ -80,7 +82,7 @@ def paper(
         judging = Judging(tuple(whole_numbers("--judges", judges, 0)), scenes, None, weights_folder(weights), judge_folder)
     run = PaperRun(
         data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
-        None if transfer is None else TransferData(transfer, transfer_arms, photographs),
+        None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames),
     )  # fmt: skip
     why = {} if reasons is None else read_reasons(reasons)  # before hours of measuring
     console = Console(stderr=True)

@@ -87,9 +87,11 @@ def splits_of(text: str) -> list[Split]:
         InputError: An unknown split.
     """
     names = [name.strip() for name in text.split(",")]
-    known: list[Split] = [name for name in SPLITS for given in names if given == name]
+    known: list[Split] = [name for name in SPLITS if name in names]
     if len(known) != len(names):
-        raise InputError("making pairs beyond driving", f"--split {text}", "no such split, or one twice", f"choose from {', '.join(SPLITS)}")
+        raise InputError(
+            "making pairs beyond driving", f"--split {text}", "no such split, or one twice", f"choose from {', '.join(SPLITS)}"
+        )
     return sorted(known, key=names.index)
 
 

@@ -20,6 +20,7 @@ from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.photographs import Match, Photographs, matches, resized, triangulated
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.geometry import inverse
 from alpasim_plugin.image_metrics import psnr_db
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.pair_store import Pair, PairSequence, is_made, write_sequence
@@ -78,7 +79,9 @@ class PhotographPairs:
     psnr_db: Mapping[str, float]
 
 
-def make_photograph_pairs(photographs: Photographs, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1) -> Iterator[PhotographPairs]:
+def make_photograph_pairs(
+    photographs: Photographs, name: str, out: Path, recipe: PhotographRecipe, threads: int = 1
+) -> Iterator[PhotographPairs]:
     """Write the sequences ``out/SPLIT/NAME_PHASE``; equal ones are kept.
 
     Args:
@@ -92,16 +95,16 @@ def make_photograph_pairs(photographs: Photographs, name: str, out: Path, recipe
         InputError: Too few photographs, or none that overlap.
     """
     if len(photographs.views) < 2 * recipe.every:
-        found = f"{len(photographs.views)} photographs for every {recipe.every}th to be held out"
-        raise InputError(DOING, name, found, "give more photographs, or hold out more of them")
-    found: list[Match] | None = None
+        few = f"{len(photographs.views)} photographs for every {recipe.every}th to be held out"
+        raise InputError(DOING, name, few, "give more photographs, or hold out more of them")
+    matched: list[Match] | None = None
     for phase in range(recipe.every):
         folder = out / recipe.split / f"{name}_{phase}"
         info = _info(photographs, name, recipe, phase)
         made = not is_made(folder, info)
         if made:
-            found = matches(photographs.views) if found is None else found
-            graph = _fitted(photographs, found, recipe, phase, name, threads)
+            matched = matches(photographs.views) if matched is None else matched
+            graph = _fitted(photographs, matched, recipe, phase, name, threads)
             shown = [graph.render(view.camera, {}, threads) for view in photographs.views]
             images = [(one.to_uint8(), np.rint(one.alpha * 255).clip(0, 255).astype(np.uint8)) for one in shown]
             psnr = _psnr(photographs, [image for image, _ in images], set(info["held_out"]))
@@ -135,11 +138,14 @@ def _fitted(photographs: Photographs, found: list[Match], recipe: PhotographReci
 
 def _psnr(photographs: Photographs, images: list[U8], held_out: set[int]) -> dict[str, float]:
     values = [psnr_db(image, view.rgb) for image, view in zip(images, photographs.views, strict=True)]
-    groups = {"held_out": [v for i, v in enumerate(values) if i in held_out], "fitted": [v for i, v in enumerate(values) if i not in held_out]}
+    groups = {
+        "held_out": [v for i, v in enumerate(values) if i in held_out],
+        "fitted": [v for i, v in enumerate(values) if i not in held_out],
+    }
     return {key: round(float(np.mean(group)), 3) for key, group in groups.items()}
 
 
 def _frames(photographs: Photographs, images: list[tuple[U8, U8]]) -> Iterator[Pair]:
     for i, (view, (image, opacity)) in enumerate(zip(photographs.views, images, strict=True)):
-        pose = np.linalg.inv(view.camera.T_camera_world)
+        pose = inverse(view.camera.T_camera_world)
         yield Pair(image, view.rgb, opacity, np.zeros_like(image), pose, i * PERIOD_US)

@@ -58,7 +58,9 @@ def test_a_block_hides_what_is_behind_it_and_nothing_else() -> None:
     np.testing.assert_array_equal(reached(points, np.array([0.0, 0, 9.0]), np.ones(4, dtype=bool), *arrays), [False, False, True, True])
     np.testing.assert_array_equal(reached(points, np.array([0.0, 0, 9.0]), np.zeros(4, dtype=bool), *arrays), [False] * 4)
     np.testing.assert_allclose(nearest(points, *arrays, 5.0), [0.9, 0.9, np.hypot(0.9, 0.9 - np.sqrt(0.5)), 0.4], atol=1e-9)
-    np.testing.assert_array_equal(nearest(points, *_arrays([turned])[:0] or (np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3))), 5.0), 5.0)
+    np.testing.assert_array_equal(
+        nearest(points, *_arrays([turned])[:0] or (np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3))), 5.0), 5.0
+    )
 
 
 def test_a_floor_is_darker_in_the_shadow() -> None:

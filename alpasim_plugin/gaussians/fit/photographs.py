@@ -118,7 +118,9 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
     return out
 
 
-def triangulated(views: Sequence[PosedView], found: Sequence[Match], used: Sequence[int], most: int, rng: np.random.Generator) -> GaussianCloud:
+def triangulated(
+    views: Sequence[PosedView], found: Sequence[Match], used: Sequence[int], most: int, rng: np.random.Generator
+) -> GaussianCloud:
     """Return start Gaussians at the points that views place consistently.
 
     Args:
@@ -143,7 +145,9 @@ def triangulated(views: Sequence[PosedView], found: Sequence[Match], used: Seque
     count = sum(map(len, points))
     if count < 10:
         found_text = f"{count} points that two photographs place consistently"
-        raise InputError("starting from photographs", f"{len(used)} photographs", found_text, "give photographs that overlap, in order along the way")
+        raise InputError(
+            "starting from photographs", f"{len(used)} photographs", found_text, "give photographs that overlap, in order along the way"
+        )
     kept = rng.permutation(count)[:most]
     return cloud_from_points(np.concatenate(points)[kept], np.concatenate(colours)[kept])
 
@@ -191,13 +195,17 @@ def _view(folder: Path, frame: dict[str, Any], T_world_camera: F64, width: int, 
         full_w, full_h = int(frame["w"]), int(frame["h"])
         K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], dtype=np.float64)
         bend = np.array([float(frame.get(key) or 0.0) for key in MODEL])
+        if not np.isfinite([*K.ravel(), *bend]).all() or min(K[0, 0], K[1, 1]) <= 0:
+            raise ValueError("intrinsics that are not finite, or no focal length")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines"
         raise InputError(DOING, where, f"{type(error).__name__}: {error}", do) from error
     file = folder / str(frame["file_path"])
     rgb: U8 = decode_image(read_bytes(file, DOING, SOURCE_BYTES), str(file), DOING)[..., ::-1]
     if rgb.shape[:2] != (full_h, full_w):
-        raise InputError(DOING, where, f"{rgb.shape[1]}x{rgb.shape[0]} pixels, the file says {full_w}x{full_h}", "give the photographs as they were")
+        raise InputError(
+            DOING, where, f"{rgb.shape[1]}x{rgb.shape[0]} pixels, the file says {full_w}x{full_h}", "give the photographs as they were"
+        )
     if bend.any():
         centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
         whole, _ = cv2.getOptimalNewCameraMatrix(K - centre, bend, (full_w, full_h), 0.0)  # shows only what the photograph shows

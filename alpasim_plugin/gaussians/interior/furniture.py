@@ -13,7 +13,15 @@ from alpasim_plugin.types import F64
 WOODS = np.array([[0.62, 0.43, 0.26], [0.45, 0.29, 0.17], [0.74, 0.58, 0.40], [0.33, 0.22, 0.15], [0.80, 0.76, 0.70]])
 CLOTHS = np.array([[0.28, 0.38, 0.50], [0.58, 0.28, 0.22], [0.36, 0.44, 0.30], [0.70, 0.63, 0.52], [0.40, 0.36, 0.40], [0.72, 0.52, 0.20]])
 BRIGHT = np.array(
-    [[0.75, 0.18, 0.14], [0.15, 0.35, 0.62], [0.85, 0.68, 0.18], [0.20, 0.48, 0.28], [0.90, 0.88, 0.82], [0.50, 0.22, 0.48], [0.12, 0.12, 0.14]]
+    [
+        [0.75, 0.18, 0.14],
+        [0.15, 0.35, 0.62],
+        [0.85, 0.68, 0.18],
+        [0.20, 0.48, 0.28],
+        [0.90, 0.88, 0.82],
+        [0.50, 0.22, 0.48],
+        [0.12, 0.12, 0.14],
+    ]
 )
 
 
@@ -117,7 +125,10 @@ def lamp(rng: Rng) -> Thing:
 
 def plant(rng: Rng, height_m: float | None = None) -> Thing:
     """Return a plant in a pot."""
-    h, pot = height_m or float(rng.uniform(0.9, 1.5)), plain(rng, chosen(rng, np.array([[0.66, 0.36, 0.24], [0.82, 0.80, 0.76], [0.3, 0.32, 0.36]])))
+    h, pot = (
+        height_m or float(rng.uniform(0.9, 1.5)),
+        plain(rng, chosen(rng, np.array([[0.66, 0.36, 0.24], [0.82, 0.80, 0.76], [0.3, 0.32, 0.36]]))),
+    )
     r = 0.14 * h
     n, stems = round(320 * (0.5 + h)), 9
     stem, s = rng.integers(stems, size=n), rng.random(n) ** 0.7
@@ -131,8 +142,11 @@ def plant(rng: Rng, height_m: float | None = None) -> Thing:
     profile = [[0.7 * r, 0], [r, 0.28 * h], [1.06 * r, 0.28 * h], [1.06 * r, 0.31 * h], [0.9 * r, 0.31 * h], [0.0, 0.29 * h]]
     size = 0.5 * h
     return Thing(
-        (Turned((0, 0, 0), profile, pot), Leaves(means, normals, rgb, 0.065 * h ** 0.7)),
-        (block((-0.7 * r, -0.7 * r, 0), (0.7 * r, 0.7 * r, 0.3 * h)), block((-0.3 * size, -0.3 * size, 0.5 * h), (0.3 * size, 0.3 * size, 0.95 * h))),
+        (Turned((0, 0, 0), profile, pot), Leaves(means, normals, rgb, 0.065 * h**0.7)),
+        (
+            block((-0.7 * r, -0.7 * r, 0), (0.7 * r, 0.7 * r, 0.3 * h)),
+            block((-0.3 * size, -0.3 * size, 0.5 * h), (0.3 * size, 0.3 * size, 0.95 * h)),
+        ),
     )
 
 
@@ -151,8 +165,12 @@ def on_wall(rng: Rng, kind: str, size_m: tuple[float, float], foot_m: float) -> 
     """
     w, h = size_m
     makers: Mapping[str, Callable[[], list[Part]]] = {
-        "picture": lambda: list(box((-w / 2, -0.03, foot_m), (w / 2, 0.0, foot_m + h), wood(rng, WOODS[3]), front=painting(rng, size_m, BRIGHT))),
-        "door": lambda: list(box((-w / 2, -0.03, foot_m), (w / 2, 0.0, foot_m + h), wood(rng, WOODS[4]), front=panelled(rng, WOODS[4], size_m, 1, 3))),
+        "picture": lambda: list(
+            box((-w / 2, -0.03, foot_m), (w / 2, 0.0, foot_m + h), wood(rng, WOODS[3]), front=painting(rng, size_m, BRIGHT))
+        ),
+        "door": lambda: list(
+            box((-w / 2, -0.03, foot_m), (w / 2, 0.0, foot_m + h), wood(rng, WOODS[4]), front=panelled(rng, WOODS[4], size_m, 1, 3))
+        ),
         "window": lambda: _curtained(rng, size_m, foot_m),
     }
     return Thing(tuple(makers[kind]()))

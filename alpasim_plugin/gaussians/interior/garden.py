@@ -78,7 +78,7 @@ def hedge(rng: Rng) -> Thing:
 
 
 def _leaves(rng: Rng, means: F64, rgb: F64, size_m: float) -> Leaves:
-    normals = rng.standard_normal(means.shape) + [0, 0, 0.5]
+    normals = rng.standard_normal(means.shape) + np.array([0, 0, 0.5])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Leaves(means, normals, rgb * rng.uniform(0.6, 1.7, (len(means), 1)), size_m)
 
@@ -139,7 +139,9 @@ def house(rng: Rng) -> Thing:
         pane = plain(rng, (0.22, 0.28, 0.34), 0.15)
         parts.append(Panel((x - w / 2, -0.02, 1.0), (w, 0, 0), (0, 0, h), pane, 0.3))
         frame = plain(rng, (0.86, 0.85, 0.82), 0.01)
-        for a, b in (((x - w / 2 - 0.06, 0.94), (x + w / 2 + 0.06, 1.0)), ((x - w / 2 - 0.06, 2.2), (x + w / 2 + 0.06, 2.26)),
-                     ((x - 0.025, 1.0), (x + 0.025, 2.2)), ((x - w / 2 - 0.06, 1.0), (x - w / 2, 2.2)), ((x + w / 2, 1.0), (x + w / 2 + 0.06, 2.2))):  # fmt: skip
+        left, right = x - w / 2, x + w / 2
+        bars = [((left - 0.06, z), (right + 0.06, z + 0.06)) for z in (0.94, 2.2)]
+        bars += [((u, 1.0), (u + 0.055, 2.2)) for u in (left - 0.055, x - 0.0275, right)]
+        for a, b in bars:
             parts += box((a[0], -0.06, a[1]), (b[0], 0.0, b[1]), frame)
     return Thing(tuple(parts), (block(low, high),))

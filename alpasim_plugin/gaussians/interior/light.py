@@ -45,7 +45,7 @@ class Light:
     walls: tuple[F64, F64] | None = None
 
     def colours(self, surfels: Surfels, blocks: Sequence[Block]) -> F64:
-        """Return the lit colours ``(N, 3)`` of surfels among blocks that throw shadows; those of the surfels' own thing are not among them."""
+        """Return the lit colours ``(N, 3)`` of surfels among blocks that throw shadows, those of their own thing left out."""
         p, n = surfels.means + LIFT_M * surfels.normals, surfels.normals
         stacked = _stacked(blocks)
         total = np.asarray(self.ambient) * self._open(p, stacked)[:, None] * (0.85 + 0.15 * n[:, 2:])

@@ -177,7 +177,9 @@ def window(rng: Rng, size_m: tuple[float, float]) -> Paint:
         hills = v < horizon + 0.05 * ridge(3 * u + 9, 0 * v)
         green = np.array([0.42, 0.52, 0.34]) * (1 + 0.22 * foliage(x / 0.06, y / 0.06))[:, None]
         rgb = np.where(hills[:, None], green, sky)
-        bar = (np.minimum(np.minimum(u, 1 - u) * size_m[0], np.minimum(v, 1 - v) * size_m[1]) < 0.06) | (np.abs(u - 0.5) * size_m[0] < 0.025)
+        bar = (np.minimum(np.minimum(u, 1 - u) * size_m[0], np.minimum(v, 1 - v) * size_m[1]) < 0.06) | (
+            np.abs(u - 0.5) * size_m[0] < 0.025
+        )
         bar |= np.abs(v - 0.55) * size_m[1] < 0.02
         return np.asarray(np.where(bar[:, None], [0.86, 0.85, 0.82], rgb))
 

@@ -41,12 +41,18 @@ def vase(rng: Rng) -> Thing:
     radius = np.interp(z, [0, 0.28, 0.55, 0.85, 1.0], widths)
     radius = np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
     low = float(widths[:3].min())
-    return Thing((Turned((0, 0, 0), np.column_stack([radius, z * h]), glaze(rng)),), (block((-0.7 * low, -0.7 * low, 0), (0.7 * low, 0.7 * low, h)),))
+    return Thing(
+        (Turned((0, 0, 0), np.column_stack([radius, z * h]), glaze(rng)),), (block((-0.7 * low, -0.7 * low, 0), (0.7 * low, 0.7 * low, h)),)
+    )
 
 
 def bottle(rng: Rng) -> Thing:
     """Return a bottle with a label."""
-    h, r, glass = float(rng.uniform(0.24, 0.31)), float(rng.uniform(0.033, 0.042)), chosen(rng, np.array([[0.13, 0.28, 0.16], [0.30, 0.17, 0.08], [0.5, 0.6, 0.62]]))
+    h, r, glass = (
+        float(rng.uniform(0.24, 0.31)),
+        float(rng.uniform(0.033, 0.042)),
+        chosen(rng, np.array([[0.13, 0.28, 0.16], [0.30, 0.17, 0.08], [0.5, 0.6, 0.62]])),
+    )
     label, base = printed(rng, (0.88, 0.85, 0.76), (2 * np.pi * r, 0.09)), plain(rng, glass)
 
     def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -96,7 +102,9 @@ def book_stack(rng: Rng) -> Thing:
         w, d, h = (float(v) for v in rng.uniform((0.20, 0.14, 0.022), (0.27, 0.19, 0.045)))
         dx, dy = rng.uniform(-0.015, 0.015, 2)
         cover = printed(rng, chosen(rng, BRIGHT), (w, d))
-        parts += box((dx - w / 2, dy - d / 2, z), (dx + w / 2, dy + d / 2, z + h), pages, top=cover, front=printed(rng, chosen(rng, BRIGHT), (w, h)))
+        parts += box(
+            (dx - w / 2, dy - d / 2, z), (dx + w / 2, dy + d / 2, z + h), pages, top=cover, front=printed(rng, chosen(rng, BRIGHT), (w, h))
+        )
         z += h
     return Thing(tuple(parts), (block((-0.1, -0.07, 0), (0.1, 0.07, z)),))
 
@@ -107,7 +115,9 @@ def toy_blocks(rng: Rng) -> Thing:
     for x, z in ((-1, 0), (0, 0), (1, 0), (-0.5, 1), (0.5, 1), (0, 2)):
         low = np.array([(x - 0.48) * s, -0.48 * s, z * s])
         parts += box(low, low + 0.96 * s, plain(rng, chosen(rng, BRIGHT), 0.04) if rng.random() < 0.7 else wood(rng, chosen(rng, WOODS)))
-    return Thing(tuple(parts), (block((-1.4 * s, -0.4 * s, 0), (1.4 * s, 0.4 * s, s)), block((-0.9 * s, -0.4 * s, s), (0.9 * s, 0.4 * s, 2 * s))))
+    return Thing(
+        tuple(parts), (block((-1.4 * s, -0.4 * s, 0), (1.4 * s, 0.4 * s, s)), block((-0.9 * s, -0.4 * s, s), (0.9 * s, 0.4 * s, 2 * s)))
+    )
 
 
 def small_plant(rng: Rng) -> Thing:

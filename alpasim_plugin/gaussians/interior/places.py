@@ -1,4 +1,4 @@
-"""Whole places: a furnished room, a table with objects in a room, a garden path; each with the way along which somebody carries a camera."""
+"""Whole places: a furnished room, a table with objects, a garden path; each with the way along which somebody carries a camera."""
 
 from __future__ import annotations
 
@@ -101,7 +101,9 @@ def _assembled(standing: Sequence[Standing], light: Light, sky: Sky, coarseness:
         for cell_m in one.cells_m:
             surfels: Surfels = one.thing.surfels(coarseness * cell_m).moved(one.T)
             cloud = surfels.cloud(light.colours(surfels, others))
-            tile = np.floor(surfels.means / (LAWN_TILE_M if one.cells_m == LAWN_CELLS_M else WALL_TILE_M)).astype(np.int64) @ np.array([1, 1_009, 1_018_081])
+            tile = np.floor(surfels.means / (LAWN_TILE_M if one.cells_m == LAWN_CELLS_M else WALL_TILE_M)).astype(np.int64) @ np.array(
+                [1, 1_009, 1_018_081]
+            )
             levels.append((coarseness * cell_m, cloud, tile))
         if one.cells_m in (WALL_CELLS_M, LAWN_CELLS_M):
             nodes += nodes_by_tile(one.name, levels)
@@ -244,7 +246,9 @@ def _table(rng: Rng) -> Plan:
     """Return a table full of objects in a room and a walk half around it."""
     w, d, h = (float(v) for v in rng.uniform((3.8, 3.6, 2.4), (5.0, 4.6, 2.7)))
     standing, window_at = _along_walls(rng, w, d, h)
-    table = Standing("table", f.table(rng, (float(rng.uniform(1.0, 1.4)), float(rng.uniform(0.8, 1.0)))), upright(0, 0, 0, float(rng.uniform(0, np.pi))))
+    table = Standing(
+        "table", f.table(rng, (float(rng.uniform(1.0, 1.4)), float(rng.uniform(0.8, 1.0)))), upright(0, 0, 0, float(rng.uniform(0, np.pi)))
+    )
     objects = _objects(rng, table, int(rng.integers(7, 11)))
     shell, light = _shell(rng, w, d, h), _room_light(rng, w, d, h, window_at)
     s = np.linspace(0, 1, 9)

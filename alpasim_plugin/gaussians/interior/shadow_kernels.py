@@ -1,5 +1,8 @@
 """Loops over points and blocks: which points a light reaches, and how far the nearest block is."""
 
+# Numba's decorators are untyped.
+# mypy: disable-error-code="untyped-decorator"
+
 from __future__ import annotations
 
 import numpy as np
