@@ -11,8 +11,8 @@ import numpy as np
 
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.quality import RAW, Variant
-from alpasim_plugin.bench.quality_run import QualityRun, Work, features_of, row_of
-from alpasim_plugin.training.pair_store import PairDataset, PairSequence
+from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, row_of
+from alpasim_plugin.training.pair_store import PairDataset
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.transfer import COMPARED, PHOTOGRAPHS, TRANSFER, ZERO_SHOT, clip_values
 from evaluators.video.summary import TRUTH
@@ -31,11 +31,15 @@ class TransferData:
         pairs: Folder that `simrun train transfer` wrote; its split ``test`` is measured.
         arms: Folder with ``NAME/fixer.safetensors`` of the arms that were fine-tuned on its split ``train``; None: none was.
         photographs: Folder that `simrun train photographs` wrote; None: no photographs are measured.
+        clips: At most so many clips of each, evenly chosen.
+        frames: First frames of a clip; None: all.
     """
 
     pairs: Path
     arms: Path | None = None
     photographs: Path | None = None
+    clips: int | None = None
+    frames: int | None = None
 
 
 def measure_transfer(
@@ -63,19 +67,21 @@ def measure_transfer(
         *(replace(arm, label=arm.label + ZERO_SHOT) for arm in untuned if arm.label in COMPARED),
         *(arm for arm in tuned if arm.label in COMPARED),
     ]
+    # Judges without seeds: nobody is asked for lanes or vehicles, features of motion alone are kept.
     sources = {TRANSFER: data.pairs} | ({} if data.photographs is None else {PHOTOGRAPHS: data.photographs})
-    return {name: _measured(name, PairDataset(folder, SPLIT).sequences, arms, out, seed, jobs, told) for name, folder in sources.items()}
+    found = {}
+    for name, folder in sources.items():
+        sequences = evenly(PairDataset(folder, SPLIT).sequences, data.clips)
+        run = QualityRun(sequences, tuple(arms), out / name, frames=data.frames or MOST_FRAMES, seed=seed, jobs=jobs, judging=Judging(()))
+        found[name] = _measured(name, run, told)
+    return found
 
 
-def _measured(
-    name: str, sequences: Sequence[PairSequence], arms: Sequence[Variant], out: Path, seed: int, jobs: int, told: Told
-) -> Measured:
-    # Without seeds no judge of lanes or vehicles is asked: only features of motion are kept.
-    run = QualityRun(sequences, tuple(arms), out / name, frames=MOST_FRAMES, seed=seed, jobs=jobs, judging=Judging(()))
+def _measured(name: str, run: QualityRun, told: Told) -> Measured:
     works = run.works()
     for i, (work, row) in enumerate(run.finished(works), start=1):
         told(name, i, len(works), work, row)
-    counted = {s.name: s.info.get("held_out") for s in sequences}
+    counted = {s.name: s.info.get("held_out") for s in run.sequences}
     values = from_rows([row_of(work) for work in works])
     features: dict[str, dict[str, dict[str, Any]]] = {}
     for work in works:
@@ -85,4 +91,4 @@ def _measured(
         kinds = features_of(work)
         found = {metric: vectors(kinds, key, whole) for metric, key, whole in set_metrics([kinds])}
         features.setdefault(arm, {})[clip] = {metric: x for metric, x in found.items() if len(x)}
-    return Measured(values, features, TRUTH, seed)
+    return Measured(values, features, TRUTH, run.seed)

@@ -85,7 +85,7 @@ def paper(
         judging = Judging(tuple(whole_numbers("--judges", judges, 0)), scenes, None, weights_folder(weights), judge_folder)
     run = PaperRun(
         data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
-        None if transfer is None else TransferData(transfer, transfer_arms, photographs),
+        None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames),
     )  # fmt: skip
     why = {} if reasons is None else read_reasons(reasons)  # before hours of measuring
     console = Console(stderr=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -47,15 +47,17 @@ def make_transfer_sequence(scene: TransferScene, folder: Path, threads: int = 1)
     }  # fmt: skip
     if is_made(folder, info):
         return False
-    write_sequence(folder, pair_frames(scene, camera, threads), scene.frames, info)
+    write_sequence(folder, pair_frames(scene, camera, threads, range(scene.frames)), scene.frames, info)
     return True
 
 
-def pair_frames(scene: TransferScene, camera: PinholeCamera, threads: int) -> Iterator[Pair]:
-    """Yield the frames of a scene in order of time; the semantic map is black."""
+def pair_frames(scene: TransferScene, camera: PinholeCamera, threads: int, wanted: Iterable[int]) -> Iterator[Pair]:
+    """Yield the ``wanted`` frames of a scene in their order; the semantic map is black."""
     place = build_place(scene.family, scene.scene_id, scene.seed)
     graph, sky = _reconstruction(scene, place, camera, threads)
-    for i, T_world_camera in enumerate(poses(scene, place, scene.frames, SHOWN)):
+    walk = poses(scene, place, scene.frames, SHOWN)
+    for i in wanted:
+        T_world_camera = walk[i]
         view = PinholeCamera.from_pose(camera.width, camera.height, camera.K, T_world_camera)
         damaged = graph.render(view, {}, threads)
         opacity = np.rint(np.maximum(damaged.alpha, sky.share(view)) * 255).clip(0, 255).astype(np.uint8)

@@ -17,13 +17,14 @@ TRANSFER, PHOTOGRAPHS = "transfer", "transfer-photographs"
 COMPARED = (OURS, "difix", "artifixer")  # the arms of the paper's table that are trained here
 ZERO_SHOT = " zero shot"  # ends the name of an arm that was trained on driving alone; a plain name is fine-tuned, as in the paper
 METRICS = (PSNR, PERCEPTUAL, MID, LAST, WARP, FVMD_LK)
-HOW = f"""Arms with a plain name were fine-tuned on the 32 training scenes; `{ZERO_SHOT.strip()}` means trained on driving alone, and `onefixer` and
-`onefixer-dit-tiny` are as shipped. The map is black for all. The paper fine-tunes OneFixer and takes the others' published weights; here all
-are fine-tuned alike. `{MID}` and `{LAST}` are means over the middle and the last tenth of a clip's frames, as we define them; the paper does not say.
+HOW = f"""Arms with a plain name were fine-tuned on the 32 training scenes; `{ZERO_SHOT.strip()}` means trained on driving alone;
+`onefixer` and `onefixer-dit-tiny` are as shipped. The map is black for all. The paper fine-tunes OneFixer and takes the others' published
+weights; here all are fine-tuned alike. `{MID}` and `{LAST}` are means over the middle and the last tenth of a
+clip's frames, as we define them; the paper does not say.
 """
-PHOTOGRAPHED = """One real place: every photograph is held out in one of the clips, and PSNR and perceptual distance count held-out photographs alone.
-Intervals are over the clips, which show the same place: they say how sure the numbers are for it and nothing about other places. Between two
-photographs the camera moves far, so Warp L1 and `fvmd_lk` measure jumps more than flicker.
+PHOTOGRAPHED = """One real place: every photograph is held out in one of the clips, and PSNR and perceptual distance count held-out
+photographs alone. Intervals are over the clips, which show the same place: they say how sure the numbers are for it and nothing about other
+places. Between two photographs the camera moves far, so Warp L1 and `fvmd_lk` measure jumps more than flicker.
 """
 
 

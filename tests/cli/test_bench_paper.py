@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from alpasim_plugin.bench import paper as bench_paper
+from alpasim_plugin.bench import transfer as bench_transfer
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.nets import DiTSizes, TinyVAE
@@ -54,6 +56,55 @@ def test_tables_verdicts_and_a_page_and_nothing_is_measured_twice(
     assert page.count('class="arm"') == 3
     rows = {path: path.stat().st_mtime_ns for path in out.rglob("clips/*/*.json")}
     assert len(rows) == 2 * 2 * 3
+    assert run_command(command) == 0
+    assert {path: path.stat().st_mtime_ns for path in rows} == rows
+
+
+def test_the_transfer_is_measured_zero_shot_and_tuned_beside_the_papers_table(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_paper, "SHIPPED", ("onefixer",))
+    monkeypatch.setattr(bench_transfer, "SHIPPED", ("3dgs", "onefixer"))
+    for folder, count in (("beyond", 2), ("photos", 2)):
+        for i in range(count):
+            sequence = make(tmp_path / folder, "test", f"{folder}-{i}", frames=20)
+            path = sequence.folder / "sequence.json"
+            lens = {"width": 48, "height": 32, "K": np.diag([40.0, 40.0, 1.0]).tolist(), "T_rig_camera": np.eye(4).tolist()}
+            held_out = {"held_out": list(range(i, 20, 2))} if folder == "photos" else {}
+            path.write_text(json.dumps({**json.loads(path.read_text()), "camera": lens, **held_out}))
+    settings = small_settings("window=3")
+    parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
+    for folder in ("arms", "tuned"):
+        (tmp_path / folder / "V9").mkdir(parents=True)
+        save_bundle(tmp_path / folder / "V9" / bench_paper.BUNDLE, parts, settings, trained=True, note="random")
+    where = {name: str(tmp_path / name) for name in ("arms", "beyond", "photos", "tuned", "out")}
+    command = [
+        "bench",
+        "paper",
+        str(data),
+        "--split",
+        "val",
+        "--only",
+        "transfer",
+        "--arms",
+        where["arms"],
+        "--out",
+        where["out"],
+        "--json",
+    ]
+    command += ["--transfer", where["beyond"], "--transfer-arms", where["tuned"], "--photographs", where["photos"]]
+    assert run_command(command) == 0
+    claim = json.loads(capsys.readouterr().out)[-1]
+    assert (claim["number"], claim["verdict"]) == (12, "not measured")  # difix and artifixer were not trained
+    text = (tmp_path / "out" / "paper.md").read_text()
+    section = text[text.index("## Beyond driving") : text.index("## By position")]
+    assert "| **V9** | paper | .0201 | 2326 | .126 | .136 | 22.6 |" in section
+    ours = section[section.index("| **V9** | paper") :].splitlines()[1]
+    assert ours.count("±") == 4  # all but the distance of sets, which has no interval
+    assert "**V9 zero shot** | ours" in section
+    assert "### Photographs" in section
+    rows = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("clips/*/*.json")}
+    assert len(rows) == 2 * 2 * 5
     assert run_command(command) == 0
     assert {path: path.stat().st_mtime_ns for path in rows} == rows
 

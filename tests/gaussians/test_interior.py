@@ -47,6 +47,17 @@ def test_nobody_carries_a_camera_through_furniture(family: str) -> None:
         assert gaps.min() > 0.1, seed
 
 
+@pytest.mark.parametrize("family", ["room", "table"])
+def test_furniture_along_the_walls_stands_neither_in_other_furniture_nor_in_the_middle(family: str) -> None:
+    for seed in range(8):
+        feet = [one.footprint() for one in FAMILIES[family](rng(seed)).standing if one.name.startswith("wall")]
+        assert len(feet) >= 4, seed
+        for i, (low, high) in enumerate(feet):
+            assert np.any(low > 0.75) or np.any(high < -0.75), seed
+            for other_low, other_high in feet[:i]:
+                assert np.any(other_low > high - 0.02) or np.any(other_high < low + 0.02), seed
+
+
 def _arrays(blocks: list[Block]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array([b.T[:3, :3] for b in blocks]), np.array([b.T[:3, 3] for b in blocks]), np.array([b.half for b in blocks])
 

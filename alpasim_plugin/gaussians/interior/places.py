@@ -19,6 +19,7 @@ from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky, make_sky
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.types import F64
 
+MIDDLE_M = 0.8  # half the side of the square in the middle of a room that furniture along the walls leaves free
 CELL_PX = 2.5  # cells stay below so many pixels; things are nearer than in a street
 WALL_CELLS_M, THING_CELLS_M, SMALL_CELLS_M = (0.02, 0.05), (0.014, 0.035), (0.006, 0.015)  # levels of detail
 GARDEN_CELLS_M, LAWN_CELLS_M = (0.022, 0.06), (0.08, 0.2)
@@ -196,9 +197,11 @@ def _extent(thing: Thing) -> tuple[F64, F64]:
 
 
 def _taken(standing: Sequence[Standing], turn: F64, at: float, width: float, distance: float, depth: float) -> bool:
-    """Return whether furniture of another wall stands where this one would."""
+    """Return whether this one would stand in the middle of the room, or where furniture of another wall stands."""
     ends = turn @ np.array([[at, distance, 0, 1], [at + width, distance - depth - 0.05, 0, 1]]).T
     low, high = ends[:2].min(axis=1), ends[:2].max(axis=1)
+    if np.all(low < MIDDLE_M) and np.all(high > -MIDDLE_M):
+        return True
     feet = [one.footprint() for one in standing if one.thing.blocks]
     return any(bool(np.all(a < high) and np.all(b > low)) for a, b in feet)
 

@@ -235,6 +235,8 @@ def test_drift_sets_both_trainings_of_the_temporal_arm_side_by_side(tmp_path: Pa
     assert {one.claim.number: one.verdict for one in judge_claims({"cycle": measured})}[12] == "holds"
     draw_figures(Findings({}, {"cycle": rows}, {}), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["drift.png"]
+
+
 def test_training_time_is_compared_at_our_last_snapshot_within_half_of_the_others() -> None:
     ours = Curve("V9", tuple(Point("V9", i, float(i), f"V9 after {i}") for i in (1, 2, 3, 4)), {"V9": 4.0})
     student, dmd = Point("omnidreams", 1, 3.0, "student"), Point("self-forcing", 1, 5.0, "dmd")
