@@ -26,7 +26,7 @@ from alpasim_plugin.bench.quality import RAW, QualityClip, Variant, row_key, run
 from alpasim_plugin.bench.quality_run import encoded, identity, quality_clip, shown_frames
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.nets.image_distance import available, load_distance, weights_folder
+from alpasim_plugin.nets.image_distance import ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.nets.judges.detect import find_lanes
 from alpasim_plugin.nets.judges.files import check_digests, file_name, load_judge
 from alpasim_plugin.nets.judges.style_net import StyleNet, style_probabilities
@@ -173,7 +173,7 @@ def _finish(work: _Work) -> Row:
 
 def _key(run: AppearanceRun, clip: QualityClip) -> str:
     """Return the digest of everything that determines a row."""
-    networks = {name: identity(name, None) for name in PICTURES if name in available(None)}
+    networks: dict[str, str] = {name: identity(name, None) for name in available(None) if name in PICTURES}
     variants = [prompted(run.bundle, style) for style in STYLES[1:]] + list(run.plain)
     keys = [row_key(clip, variant, run.seed, "cpu", networks) for variant in variants]
     facts = [VERSION, keys, judges_of(run.judging), sorted(run.judging.seeds)]
@@ -204,7 +204,7 @@ class _Judged:
             found |= {of_seed(metric, seed): lanes[metric] for metric in LANES}
         if target is not None:
             folder = weights_folder(None)
-            networks = {name: load_distance(name, folder) for name in PICTURES if name in available(None)}
+            networks: dict[str, ImageDistance] = {name: load_distance(name, folder) for name in available(None) if name in PICTURES}
             means = clip_quality(video, target, networks).means
             found |= {metric: means[metric] for metric in PICTURES}
         return {metric: value for metric, value in found.items() if value is not None}

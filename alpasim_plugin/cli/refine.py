@@ -69,10 +69,11 @@ def refine(
             print(untrained_notice(made.label), file=sys.stderr)
         return made
 
+    limited = settings.keeps_appearance and not (anyway or opacity or sdmap)
     files = RefineFiles(source, out, opacity, sdmap, compare, overwrite)
     try:
         with frame_progress(quiet or as_json) as show:
-            summary = refine_video(files, session, show, None if anyway or opacity or sdmap else ChangeLimit())
+            summary = refine_video(files, session, show, ChangeLimit() if limited else None)
     except Stopped as stop:
         stop.kept = "nothing was written; the same command starts again"
         raise

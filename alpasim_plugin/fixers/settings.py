@@ -73,6 +73,11 @@ class FixerSettings(Part):
         return False
 
     @property
+    def keeps_appearance(self) -> bool:
+        """Whether the output is meant to look like the render; a fixer asked for another appearance changes every pixel."""
+        return True
+
+    @property
     def unit(self) -> Unit | None:
         """What the fixer makes at a time and what that costs, for tables; None where it does not say."""
         return None
@@ -243,7 +248,12 @@ class OneFixerSettings(LatentFixerSettings):
     @property
     def shows_render(self) -> bool:
         """Whether the decoder sees the render; in another appearance than the render's, its detail would show the clear day through."""
-        return super().shows_render and self.prompt in (None, CLEAR)
+        return super().shows_render and self.keeps_appearance
+
+    @property
+    def keeps_appearance(self) -> bool:
+        """Whether no prompt asks for another appearance than the render's."""
+        return self.prompt in (None, CLEAR)
 
     @property
     def finalises(self) -> bool:

@@ -76,4 +76,5 @@ class StyledLatents:
         video: U8 = sequence.clip.cut(clip.start, frames).rgb_gt
         made = [restyle_video(video, seen, style, str(sequence.info.get("scene_id", sequence.name))) for style in FORMULAS]
         both = torch.stack([torch.stack([to_tensor(v, mirrored) for mirrored in (False, True)]) for v in made])
-        return np.asarray(self.vae.encode(both.flatten(0, 1)).unflatten(0, both.shape[:2]).half().numpy())
+        z = self.vae.encode(both.flatten(0, 1))
+        return np.asarray(z.view(*both.shape[:2], *z.shape[1:]).half().numpy())

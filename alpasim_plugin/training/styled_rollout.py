@@ -24,7 +24,7 @@ from alpasim_plugin.training.generator import logged
 from alpasim_plugin.training.perceptual_term import DecodedDistance, Distance
 from alpasim_plugin.training.recipes.recipe import StageInputs
 from alpasim_plugin.training.recipes.start import channel_weights_of, transformer_of
-from alpasim_plugin.training.shared_rollout import Objectives, Sample, losses
+from alpasim_plugin.training.shared_rollout import Objectives, Perceptual, Sample, losses
 from alpasim_plugin.training.styled_latents import StyledLatents
 from alpasim_plugin.training.trainer import Loss
 
@@ -90,7 +90,8 @@ class StyledBatch(NamedTuple):
     opacity: Tensor
 
 
-class StyledDistance(NamedTuple):
+@dataclass(frozen=True)
+class StyledDistance:
     """The perceptual term of a batch in several styles: the mean over clips.
 
     Clear clips are decoded with the render, as at deployment. In another style the render's detail is of other weather, so the decoder does
@@ -147,7 +148,9 @@ class StyledRolloutTask:
     def loss(self, batch: StyledBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""
         del index
-        perceptual = None if self.inputs.distance is None else StyledDistance(self.vae, self.inputs.distance[1], batch)
+        perceptual: Perceptual | None = None
+        if self.inputs.distance is not None:
+            perceptual = StyledDistance(self.vae, self.inputs.distance[1], batch)
         attention = self.inputs.attention
         made = losses(
             self.net, batch.sample, self.prompts(batch.styles), self.config.objectives, perceptual,

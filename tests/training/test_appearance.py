@@ -185,6 +185,7 @@ def test_the_bundle_renders_what_the_prompt_asks_for_and_is_clear_by_itself(bund
     night, out = fixed(bundle, "prompt=night")
     assert night.label.endswith("prompt night")
     assert not night.settings.shows_render
+    assert not night.settings.keeps_appearance, "refine does not take it for damage"
     assert (out != plain).any()
     weights = [net.networks.dit.state_dict() for net in (session, night)]
     assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items()), "the embeddings alone differ"
