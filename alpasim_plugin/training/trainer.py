@@ -76,7 +76,7 @@ class Schedule:
         if self.decay == "constant":
             return self.peak_lr
         if self.decay == "exponential":
-            return self.peak_lr * self.last_share**t
+            return self.peak_lr * math.pow(self.last_share, t)
         return self.peak_lr * (self.last_share + (1 - self.last_share) * 0.5 * (1 + math.cos(math.pi * t)))
 
     def of_length(self, steps: int) -> Schedule:
