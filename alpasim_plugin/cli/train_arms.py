@@ -56,7 +56,7 @@ def arms(
     weights: Annotated[
         list[str] | None, typer.Option("--weights", help="base=FILE or base-bi=FILE: an initial network that is not trained. Repeatable.")
     ] = None,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")] = 400,
+    steps: options.Unit = 400,
     base_steps: Annotated[int, typer.Option("--base-steps", min=1, help="Updates of base and of base-bi.")] = 400,
     base_lr: Annotated[float, typer.Option("--base-lr", min=1e-7, help="Peak learning rate of base and base-bi.")] = 1e-3,
     budget: Annotated[
@@ -68,17 +68,15 @@ def arms(
     sweep_steps: Annotated[int | None, typer.Option("--sweep-steps", min=1, help="U of the candidates; then the best in full.")] = None,
     sweep_clips: Annotated[int | None, typer.Option("--sweep-clips", min=1, help="At most so many clips to choose by.")] = None,
     clips: options.Clips = 4,
-    accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")] = 2,
+    accumulate: options.Accumulate = 2,
     latents: options.Latents = 12,
-    columns: Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")] = None,
+    columns: options.Columns = None,
     stride: options.Stride = 24,
     lr: options.PeakLr = 2e-4,
-    ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.99,
-    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper.")] = 10.0,
-    channels: Annotated[
-        Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: by amplitude in pixels, or equal.")
-    ] = "amplitude",
-    precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
+    ema: options.Ema = 0.99,
+    perceptual: options.Perceptual = 10.0,
+    channels: options.Channels = "amplitude",
+    precision: options.Precision = "fp32",
     snapshots: options.Snapshots = 8,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Stages at a time, each in a process with one thread.")] = 1,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Torch threads, with one job.")] = 1,

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 import typer
@@ -73,14 +73,14 @@ def train_fixer_command(
     scenes: Annotated[
         Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.")
     ] = None,
-    steps: Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")] = 400,
+    steps: options.Unit = 400,
     clips: options.Clips = 4,
-    accumulate: Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")] = 2,
+    accumulate: options.Accumulate = 2,
     latents: options.Latents = 12,
-    columns: Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")] = None,
+    columns: options.Columns = None,
     stride: options.Stride = 24,
     lr: options.PeakLr = 2e-4,
-    ema: Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")] = 0.99,
+    ema: options.Ema = 0.99,
     source_share: Annotated[
         float, typer.Option("--source-share", min=0.0, max=0.8, help="Recipe base: share of positions at t = 1, the start of sampling.")
     ] = 0.35,
@@ -91,10 +91,8 @@ def train_fixer_command(
     block: Annotated[int | None, typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's.")] = None,
     window: Annotated[int | None, typer.Option("--window", min=1, help="Attention window in latents, instead of the recipe's.")] = None,
     sink: Annotated[int | None, typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's.")] = None,
-    perceptual: Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper.")] = 10.0,
-    channels: Annotated[
-        Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: by amplitude in pixels, or equal.")
-    ] = "amplitude",
+    perceptual: options.Perceptual = 10.0,
+    channels: options.Channels = "amplitude",
     class_colour_augmentation: Annotated[
         bool,
         typer.Option(
@@ -104,7 +102,7 @@ def train_fixer_command(
     ] = True,
     recolour: Annotated[bool, typer.Option("--recolour/--no-recolour", hidden=True, help="Former name of the option above.")] = True,
     stop_at: Annotated[int | None, typer.Option("--stop-at", min=1, help="Stop after this update and write the weights.")] = None,
-    precision: Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")] = "fp32",
+    precision: options.Precision = "fp32",
     snapshots: options.Snapshots = 0,
     threads: options.Threads = None,
     seed: options.Seed = 0,

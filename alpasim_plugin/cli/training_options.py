@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 import typer
@@ -29,6 +29,15 @@ Stride = Annotated[int, typer.Option("--stride", min=1, help="Frames between the
 PeakLr = Annotated[float, typer.Option("--lr", min=1e-7, help="Peak learning rate.")]
 Threads = Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads.")]
 Snapshots = Annotated[int, typer.Option("--snapshots", min=0, help="Bundles of every stage to keep, at equal intervals of its updates.")]
+Unit = Annotated[int, typer.Option("--steps", min=1, help="U: updates of a stage of share 1.")]
+Accumulate = Annotated[int, typer.Option("--accumulate", min=1, help="Batches per update.")]
+Columns = Annotated[int | None, typer.Option("--columns", min=2, help="Crop to this width, in latents of 8 pixels.")]
+Ema = Annotated[float, typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights.")]
+Perceptual = Annotated[float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual loss; 10 in the paper.")]
+Channels = Annotated[
+    Literal["amplitude", "equal"], typer.Option("--channels", help="Weights of latent channels: by amplitude in pixels, or equal.")
+]
+Precision = Annotated[Literal["fp32", "bf16"], typer.Option("--precision", help="Precision of the forward passes.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of weights, sampling and noise.")]
 MetricWeights = Annotated[
     Path | None, typer.Option("--metric-weights", help="Folder with LPIPS weights for the perceptual term; otherwise perceptual-syn.")
