@@ -49,7 +49,7 @@ def interval_text(measured: Measured, arm: str, metric: str, scale: float = 1.0)
     if not measured.has(arm, metric):
         return "null"
     found = measured.mean(arm, metric)
-    digits = 1 if scale > 1 else (DIGITS | SET_DIGITS).get(metric, 3)
+    digits = 1 if scale > 1 else 4 if metric in SCALE else (DIGITS | SET_DIGITS).get(metric, 3)
     text = f"{found.centre * scale:.{digits}f}"
     if found.low is None or found.high is None:
         return text
