@@ -124,9 +124,7 @@ def arms_in(folder: Path) -> tuple[Variant, ...]:
         InputError: No folder, or a bundle that is none.
     """
     if not folder.is_dir():
-        raise InputError(
-            DOING, f"--arms {folder}", "no such folder", "train arms into it: 'simrun train fixer --recipe NAME --out ARMS/NAME'"
-        )
+        raise InputError(DOING, f"--arms {folder}", "no such folder", "train arms into it: 'simrun train arms PAIRS --vae VAE --out ARMS'")
     found: list[Variant] = []
     for path in sorted(folder.glob(f"*/{BUNDLE}")):
         name, settings = bundle_fixer(path)

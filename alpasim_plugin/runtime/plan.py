@@ -134,13 +134,13 @@ def make_plan(
     same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
         raise InputError("planning a run", f"renderers {list(renderers)}", f"they resolve to {same}", "name every renderer once")
-    if options.fixer and all(spec.fixer is None for spec in rendering):
-        found = f"no fixer among the renderers {list(renderers)}"
-        raise InputError("planning a run", f"--set fixer.{options.fixer[0]}", found, "leave it out, or name a fixer")
     labels = {label for text in options.fixer if (label := text.partition("=")[0].rpartition(":")[0])}
     if unknown := sorted(labels - {spec.name for spec in rendering if spec.fixer is not None}):
         found = f"no fixer of that name among the renderers {list(renderers)}"
         raise InputError("planning a run", f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it")
+    if options.fixer and all(spec.fixer is None for spec in rendering):
+        found = f"no fixer among the renderers {list(renderers)}"
+        raise InputError("planning a run", f"--set fixer.{options.fixer[0]}", found, "leave it out, or name a fixer")
     driving = tuple(resolve("policy", name) for name in policies)
     moving = {spec.name: resolve("controller", options.controller or spec.controller) for spec in driving}
     scoring = resolve_evaluators(options.evaluators)
