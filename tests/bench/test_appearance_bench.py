@@ -17,32 +17,15 @@ from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.styles import STYLES
-from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.training.pair_store import PairSequence
-from alpasim_plugin.training.pairs import PairRecipe, make_sequence
-from scenarios.load import load_scenario
 from tests.fixers.fixer_cases import small_settings
-
-SCENE = """
-version: 1
-scene_id: corner
-road: {segments: [{kind: straight, length_m: 90}]}
-ego: {speed_mps: 10}
-environment: {buildings: 0, trees_per_100m: 0, poles_spacing_m: 20, texture: 0}
-cameras: [{name: front, width: 48, height: 32}]
-timing: {duration_us: 400_000, warmup_us: 100_000}
-"""
+from tests.training.corner import make_corner
 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AppearanceRun:
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "cache"))
-    scene = tmp_path / "scenes" / "val" / "corner.yaml"
-    scene.parent.mkdir(parents=True)
-    scene.write_text(SCENE)
-    folder = tmp_path / "pairs" / "val" / "corner"
-    make_sequence(load_scenario(scene), folder, PairRecipe(source="clean", max_offset_m=0.0), 0, split="val", family="street")
-    clear_cache()
+    folder = make_corner(tmp_path / "scenes", tmp_path / "pairs", "val", 400_000)
     settings = small_settings("window=4", "holes=noise")
     sizes = DiTSizes(**settings.dit.model_dump())
     prompts = {style: torch.full((1, sizes.text_width), float(i)) for i, style in enumerate(STYLES)}

@@ -10,6 +10,7 @@ import pytest
 
 from alpasim_plugin.bench import paper as bench_paper
 from alpasim_plugin.bench import transfer as bench_transfer
+from alpasim_plugin.bench.training_memory import MemoryCell
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.nets import DiTSizes, TinyVAE
@@ -148,3 +149,20 @@ def test_what_cannot_be_compared_is_refused(
     ]
     assert run_command([*command, *more]) == 2
     assert found in " ".join(capsys.readouterr().err.split())
+
+
+def test_kept_memory_is_used_while_what_it_depends_on_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def measure(*args: object, **options: object) -> list[MemoryCell]:
+        asked.append(1)
+        return [MemoryCell(8, 1, 500.0, 1.0)]
+
+    monkeypatch.setattr(bench_paper, "measure_memory", measure)
+    path = tmp_path / "memory.json"
+    assert bench_paper.training_memory(path) == bench_paper.training_memory(path)
+    assert len(asked) == 1
+    kept = json.loads(path.read_text())
+    path.write_text(json.dumps({**kept, "facts": {**kept["facts"], "window": 99}}))
+    bench_paper.training_memory(path)
+    assert len(asked) == 2

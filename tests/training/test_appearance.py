@@ -21,13 +21,11 @@ from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.styles import CLEAR, STYLES
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.parts import build, resolve
-from alpasim_plugin.renderers.gaussian import clear_cache
 from alpasim_plugin.training.appearance import lights_of_posts
 from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
-from alpasim_plugin.training.pairs import PairRecipe, make_sequence
 from alpasim_plugin.training.recipes.registry import recipe_of, with_attention
 from alpasim_plugin.training.seen_scene import restyle_video, scene_of, seen_frames
 from alpasim_plugin.training.trainer import Schedule
@@ -35,15 +33,7 @@ from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
 from tests.fixers.fixer_cases import maps_of, moving_picture, pixels, run_blocks, small_settings
 
-SCENE = """
-version: 1
-scene_id: corner
-road: {segments: [{kind: straight, length_m: 90}]}
-ego: {speed_mps: 10}
-environment: {buildings: 0, trees_per_100m: 0, poles_spacing_m: 20, texture: 0}
-cameras: [{name: front, width: 48, height: 32}]
-timing: {duration_us: 600_000, warmup_us: 100_000}
-"""
+from .corner import make_corner
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +42,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("appearance")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SIMRUN_CACHE", str(root / "cache"))
-        path = root / "scenes" / "train" / "corner.yaml"
-        path.parent.mkdir(parents=True)
-        path.write_text(SCENE)
-        recipe = PairRecipe(source="clean", max_offset_m=0.0)
-        assert make_sequence(load_scenario(path), root / "train" / "corner", recipe, 0, split="train", family="street")
-        clear_cache()
+        make_corner(root / "scenes", root, "train", 600_000)
     TinyVAE.random(TinySizes(16, 16, 16, 16, 16)).save(root / "vae.safetensors")
     return root
 
@@ -116,7 +101,8 @@ def test_a_sequence_of_another_scene_is_refused(data: Path, tmp_path: Path) -> N
         scene_of(sequence, tmp_path)
     path = tmp_path / "train" / "corner.yaml"
     path.parent.mkdir()
-    path.write_text(SCENE.replace("texture: 0", "texture: 0, sky: dusk"))
+    same = (data / "scenes" / "train" / "corner.yaml").read_text()
+    path.write_text(same.replace("texture: 0", "texture: 0, sky: dusk"))
     with pytest.raises(InputError, match="differs by"):
         seen_frames(sequence, scene_of(sequence, tmp_path), 0, 2)
 
