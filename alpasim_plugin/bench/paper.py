@@ -21,6 +21,7 @@ from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
+from alpasim_plugin.bench.trained_arms import trained_arms
 from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.errors import InputError
@@ -32,9 +33,10 @@ from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
 from evaluators.paper.appearance import OURS as APPEARANCE
 from evaluators.paper.cost import Cost, contested
-from evaluators.paper.document import Findings
+from evaluators.paper.document import EqualTime, Findings
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip
+from evaluators.paper.training import TrainedArm
 from evaluators.paper.wrong_map import Shift
 from evaluators.video.summary import TRUTH
 
@@ -51,6 +53,7 @@ MEMORY = """Peak memory of forward and backward of one training sample above tha
 of two runs: 256x144, one clip, the rollout on own history with the perceptual term on its last k latents, without decoding.
 """
 MEMORY_LATENTS, MEMORY_HORIZONS = (8, 12, 16, 24), (1, 4, 8, 12, 16)  # the paper's figure has 16 and 24 latents
+TWICE = ("cycle", "under-trained")  # protocols that are measured for both budgets of training
 CURVES = ("psnr_db", "perceptual-syn", "warp_l1")
 Told = Callable[[str, int, int, Work, Mapping[str, Any]], None]
 
@@ -65,7 +68,7 @@ class PaperRun:
         arms: Folder with ``NAME/fixer.safetensors`` for every trained arm.
         out: Folder of the results.
         split: Of the pairs.
-        long: Folder of pairs for ``under-trained`` instead, of longer sequences.
+        long: Folder of pairs for ``under-trained`` instead, of longer sequences; its cycle renders are left out.
         drives: Finished run folder of the closed loop; None: that table is not made.
         clips: At most so many clips of a protocol, evenly chosen.
         frames: First frames of a clip; None: as many as in the paper.
@@ -75,6 +78,7 @@ class PaperRun:
         filmed: Clips on the page.
         map_clips: Clips of the protocol ``map-error``.
         transfer: What the protocol ``transfer`` is measured on; None: it is not.
+        equal_time: Folder like ``arms`` of the arms trained with equal core-minutes; None: that budget is not measured.
     """
 
     pairs: Path
@@ -93,6 +97,7 @@ class PaperRun:
     map_clips: int = 8
     protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer", "appearance")
     transfer: TransferData | None = None
+    equal_time: Path | None = None
 
 
 @dataclass
@@ -107,6 +112,8 @@ class Compared:
         shifted: The protocol ``map-error`` by configuration, where ``measured`` has groups of them.
         memory: Peak memory of a training sample by clip length and horizon.
         cost: Quality against training time; None where it was not asked for.
+        training: How the arms were trained, as far as their folder says.
+        equal_time: The arms of equal core-minutes; None where they were not asked for.
     """
 
     measured: dict[str, Measured] = field(default_factory=dict)
@@ -116,6 +123,8 @@ class Compared:
     shifted: Measured | None = None
     memory: list[MemoryCell] = field(default_factory=list)
     cost: Cost | None = None
+    training: tuple[TrainedArm, ...] = ()
+    equal_time: EqualTime | None = None
 
 
 def arms_in(folder: Path) -> tuple[Variant, ...]:
@@ -155,7 +164,8 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     plain = tuple(arm for arm in arms if arm.label == OURS)
     arms = tuple(arm for arm in arms if arm.label != APPEARANCE)  # it has a protocol of its own
     out.units = {arm.label: unit_of(arm) for arm in arms}
-    for name in ("cycle", "under-trained"):
+    out.training = trained_arms(run.arms)
+    for name in TWICE:
         if name in run.protocols:
             sequences = _sequences(run, name)
             _open_loop(run, name, sequences, arms, frozenset(s.name for s in evenly(sequences, run.filmed)), told, out)
@@ -179,10 +189,28 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     if "transfer" in run.protocols and run.transfer is not None:
         tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
+    if run.equal_time is not None:
+        out.equal_time = _equal_time(run, run.equal_time, told, out)
     bundle = run.arms / APPEARANCE / BUNDLE
     if "appearance" in run.protocols and bundle.is_file():
         out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
+
+
+def _equal_time(run: PaperRun, folder: Path, told: Told, out: Compared) -> EqualTime:
+    """Measure the arms of equal core-minutes on the clips of the others; render and shipped fixers are those measured there."""
+    arms, second = tuple(arm for arm in arms_in(folder) if arm.label != APPEARANCE), Compared()
+    merged: dict[str, Measured] = {}
+    for name in (name for name in TWICE if name in run.protocols):
+        _open_loop(replace(run, out=run.out / "equal-time"), name, _sequences(run, name), arms, frozenset(), told, second)
+        mine, others = second.measured[name], out.measured[name]
+        shared = [arm for arm in others.values if arm in (RAW, *SHIPPED)]
+        merged[name] = Measured(
+            {**{arm: others.values[arm] for arm in shared}, **mine.values},
+            {**{arm: others.features[arm] for arm in shared if arm in others.features}, **mine.features},
+            mine.reference, mine.seed,
+        )  # fmt: skip
+    return EqualTime(merged, trained_arms(folder))
 
 
 def findings(compared: Compared) -> Findings:
@@ -197,6 +225,8 @@ def findings(compared: Compared) -> Findings:
         None if compared.shifted is None else (compared.shifted, shifts),
         f"{MEMORY}\n{memory_table(cells)}\n\n{rises} (within 10 %, the allocator's).\n" if cells else "",
         compared.cost,
+        compared.training,
+        compared.equal_time,
     )
 
 
@@ -233,10 +263,10 @@ def _appearance(run: PaperRun, bundle: Path, plain: tuple[Variant, ...]) -> Appe
 
 
 def _sequences(run: PaperRun, protocol: str) -> list[PairSequence]:
-    cycle, long = protocol == "cycle", protocol == "under-trained" and run.long is not None
-    folder = run.long if long and run.long is not None else run.pairs
+    cycle = protocol == "cycle"
+    folder = run.long if protocol == "under-trained" and run.long is not None else run.pairs
     everything = PairDataset(folder, run.split).sequences
-    chosen = everything if long else [s for s in everything if (s.info["degradation"]["kind"] == "cycle") == cycle]
+    chosen = [s for s in everything if (s.info["degradation"]["kind"] == "cycle") == cycle]
     if not chosen:
         raise InputError(
             DOING, f"{folder}, split {run.split}", f"no clip of the protocol {protocol}", "make such pairs, or leave it out with --only"

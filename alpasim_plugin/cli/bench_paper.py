@@ -21,6 +21,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import FOLDER_VARIABLE, weights_folder
 from alpasim_plugin.reading import read_json_object
 from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.training.model_card import command as command_line
 from evaluators.paper.document import document, draw_figures
 from evaluators.paper.page import render_side_by_side
 from evaluators.paper.published import published
@@ -37,6 +38,8 @@ Examples:
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --split val --clips 4 --frames 60 --out runs/first-look`
 
+- `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --equal-time runs/arms-60 --judges 0,1 --out runs/paper`
+
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --only cost --judges 0 --out runs/cost`
 """
 
@@ -51,6 +54,10 @@ def paper(
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     long: Annotated[Path | None, typer.Option("--long", help="Pairs of 900 frames for the second table; else those of DATA.")] = None,
     drives: Annotated[Path | None, typer.Option("--drives", help="Finished run folder of the closed loop, for the third table.")] = None,
+    equal_time: Annotated[
+        Path | None,
+        typer.Option("--equal-time", help="Folder like --arms of the arms trained with --budget minutes: both budgets' verdicts."),
+    ] = None,
     transfer: Annotated[
         Path | None, typer.Option("--transfer", help="Pairs beyond driving, for the table of the transfer (docs/pairs.md).")
     ] = None,
@@ -85,7 +92,7 @@ def paper(
         judging = Judging(tuple(whole_numbers("--judges", judges, 0)), scenes, None, weights_folder(weights), judge_folder)
     run = PaperRun(
         data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
-        None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames),
+        None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames), equal_time,
     )  # fmt: skip
     why = {} if reasons is None else read_reasons(reasons)  # before hours of measuring
     console = Console(stderr=True)
@@ -102,7 +109,7 @@ def paper(
     found = compare_arms(run, told, told_clip)
     made = findings(found)
     judged = judge_claims(found.measured)
-    command = f"simrun bench paper {data} --arms {arms} --split {split} --only {','.join(protocols)} --out {out}"
+    command = command_line()
     write_text(out / "paper.md", document(published(), made, why, command))
     draw_figures(made, out)
     if found.cost is not None:

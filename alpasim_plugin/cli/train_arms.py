@@ -6,8 +6,8 @@ import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,24 +15,24 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.bench.arm_choice import Choice
+from alpasim_plugin.bench.trained_arms import trained_arms
 from alpasim_plugin.cli import training_options as options
-from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, choice_name, read_choice, tasks_of, work
+from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, tasks_of, work
 from alpasim_plugin.cli.train_fixer import PRECISIONS, named_weights
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import distance_for_training
 from alpasim_plugin.runtime.dependent import run_dependent
 from alpasim_plugin.stopping import Stopped
 from alpasim_plugin.training.arms.budget import in_equal_time, related
-from alpasim_plugin.training.arms.plan import Plan, comparison, plan, training_names
+from alpasim_plugin.training.arms.plan import comparison, plan, training_names
 from alpasim_plugin.training.arms.run import ArmsRun, probe, write_plan
 from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.recipes.appearance import APPEARANCE
 from alpasim_plugin.training.recipes.recipe import Recipe
 from alpasim_plugin.training.recipes.registry import with_perceptual_weight
-from alpasim_plugin.training.snapshots import core_seconds
 from alpasim_plugin.training.trainer import Schedule
-from evaluators.paper.tables import markdown_table
+from evaluators.paper.training import training_table
 
 EVERY_S = 20.0  # between lines of progress
 SHORT_S = 120.0  # a time left that is given in seconds
@@ -122,10 +122,10 @@ def arms(
     except Stopped as stopped:
         stopped.kept = f"{out} keeps finished stages and the last checkpoint of those begun; the same command resumes"
         raise
-    rows = summary(run, planned, swept)
-    telling.say(table(rows))
+    trained = trained_arms(out, planned.arms)
+    telling.say(training_table(trained))
     if as_json:
-        print(json.dumps({"arms": rows}))
+        print(json.dumps({"arms": [{**asdict(arm), "weights": str(run.bundle_of(arm.arm))} for arm in trained]}))
 
 
 def equal_time(
@@ -212,26 +212,3 @@ class Telling:
         left_s = sum(means.get(one, usual) * count for one, count in self.updates.items())
         left_s /= self.jobs
         return f"about {left_s:.0f} s left" if left_s < SHORT_S else f"about {left_s / 60:.0f} min left"
-
-
-def summary(run: ArmsRun, planned: Plan, swept: Sweep | None) -> list[dict[str, Any]]:
-    """Return a row for every arm: its stages with their updates, core-minutes of all of them, its rate where one was chosen."""
-    rows: list[dict[str, Any]] = []
-    for arm, trainings in planned.arms.items():
-        times = {name: core_seconds(run.out / name) for name in trainings}
-        choice = None if swept is None else read_choice(run.out / f"{choice_name(arm)}.json")
-        rows.append({
-            "arm": arm, "stages": {name: len(found) for name, found in times.items()},
-            "core_minutes": sum(found[-1] for found in times.values()) / 60, "rate": None if choice is None else choice.rate,
-            "weights": str(run.bundle_of(arm)),
-        })  # fmt: skip
-    return rows
-
-
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the summary as text; a stage that several arms have counts for each."""
-    lines = []
-    for row in rows:
-        stages = " + ".join(f"{name} {updates}" for name, updates in row["stages"].items())
-        lines.append([row["arm"], stages, f"{row['core_minutes']:.2f}", "as given" if row["rate"] is None else f"{row['rate']:g}"])
-    return markdown_table(["arm", "stages and updates", "core-minutes", "learning rate"], lines)

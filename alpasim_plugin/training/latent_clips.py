@@ -3,8 +3,8 @@
     FOLDER/DIGEST/SEQUENCE-CONTENT.npy   (clips, 49, N, H/8, W/8) float16: 16 channels each of render, clean frames and map, 1 of the mask
 
 Clips of a sequence start ``stride`` frames apart. Each is used as it is and mirrored; mirrored clips have class-colour augmentation (see
-`class_colours`). Each clip is encoded as a stream that starts at its first frame. DIGEST covers the autoencoder's weights and the form of
-the clips, CONTENT the sequence's arrays.
+`class_colours`). Each clip is encoded as a stream that starts at its first frame. DIGEST covers the encoder's weights and the form of the
+clips, CONTENT the sequence's arrays.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
 F16 = npt.NDArray[np.float16]
 DOING = "encoding training clips"
 CHANNELS = 16
+DECODER = "decoder."  # names of its weights
 
 
 @dataclass(frozen=True)
@@ -164,8 +165,10 @@ def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mi
 
 
 def digest(vae: TinyVAE, form: ClipForm) -> str:
-    """Return a digest of the autoencoder and the form of the clips."""
+    """Return a digest of what latents depend on: the encoder with its statistics, and the form of the clips. A decoder may be fine-tuned."""
     out = hashlib.blake2b(json.dumps(asdict(form)).encode(), digest_size=8)
     for key, value in sorted(vae.state_dict().items()):
+        if key.startswith(DECODER):
+            continue
         out.update(key.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return out.hexdigest()

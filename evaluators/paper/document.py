@@ -15,8 +15,9 @@ from evaluators.paper.measured import Measured
 from evaluators.paper.position import DRIFTING, by_position, distance_by_position, drift, with_half
 from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
+from evaluators.paper.training import TrainedArm, training_section
 from evaluators.paper.transfer import transfer_section
-from evaluators.paper.verdict import judge_claims
+from evaluators.paper.verdict import in_both, judge_claims
 from evaluators.video.charts import plot_by_frame
 from evaluators.video.summary import summarise
 
@@ -32,6 +33,19 @@ a test that swaps whole clips. Bold: shown. Absolute values do not compare with 
 metrics stand in the place of those that need networks of others. Every arm but `onefixer` has the same backbone here."""
 
 
+TABLES = (  # protocol, table of the paper, heading
+    ("cycle", "cycle", "Cycle renders"),
+    ("under-trained", "under-trained", "Under-trained reconstructions"),
+    ("cycle", "ablation", "Ablation"),
+    ("closed-loop", "closed-loop", "In closed loop"),
+)
+EQUAL_TIME = """Every arm has the same processor time instead of the paper's updates; clips, noise and judges are the same.
+"""
+BOTH = """A claim holds if it holds under both budgets, and does not if it does not under one. What was measured under one alone counts for
+both.
+"""
+
+
 @dataclass(frozen=True)
 class Findings:
     """What a comparison found.
@@ -43,6 +57,8 @@ class Findings:
         shifted: ``map-error`` with an arm for each configuration, and how far each is off.
         memory: Table of the peak memory of a training sample; empty where it was not measured.
         cost: Quality against training time; None where it was not measured.
+        training: How the arms were trained; empty where nothing is known of it.
+        equal_time: The same arms trained with equal core-minutes; None where they were not measured.
     """
 
     measured: Mapping[str, Measured]
@@ -51,6 +67,21 @@ class Findings:
     shifted: tuple[Measured, Mapping[str, wrong_map.Shift]] | None = None
     memory: str = ""
     cost: Cost | None = None
+    training: Sequence[TrainedArm] = ()
+    equal_time: EqualTime | None = None
+
+
+@dataclass(frozen=True)
+class EqualTime:
+    """The arms trained with equal core-minutes instead of the paper's updates.
+
+    Args:
+        measured: PROTOCOL -> what was measured of them, beside the render and the shipped fixers.
+        training: How they were trained.
+    """
+
+    measured: Mapping[str, Measured]
+    training: Sequence[TrainedArm]
 
 
 def document(published: Published, found: Findings, reasons: Mapping[int, str], command: str) -> str:
@@ -63,14 +94,28 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
         command: That makes it.
     """
     measured, rows = found.measured, found.rows
-    parts = [f"```bash\n{command}\n```\n", HOW + "\n"]
-    for name, table, heading in (
-        ("cycle", "cycle", "Cycle renders"),
-        ("under-trained", "under-trained", "Under-trained reconstructions"),
-        ("cycle", "ablation", "Ablation"),
-        ("closed-loop", "closed-loop", "In closed loop"),
-    ):
-        parts.append(f"## {heading}\n")
+    parts = [f"```bash\n{command}\n```\n", HOW + "\n", *_tables(published, measured, TABLES)]
+    sections = {
+        "A wrong map": _map_errors(found),
+        "Beyond driving": transfer_section(published, measured),
+        "Night, fog and snow": appearance_section(published, measured),
+        "By position": _positions(measured["under-trained"], rows["under-trained"]) if "under-trained" in rows else "",
+        "Drift": drift(measured["cycle"], rows["cycle"]) + f"\n![Quality by frame]({DRIFT})" if "cycle" in rows else "",
+        "Time": _times(measured["cycle"], found.units) if "cycle" in measured else "",
+        "Memory": found.memory,
+        "Core-minutes to quality": "" if found.cost is None else cost_section(found.cost, COST),
+        "Training": training_section(found.training),
+        "Equal core-minutes": "" if found.equal_time is None else _equal_time(published, found.equal_time),
+        "The paper's claims": _verdicts(found, reasons),
+    }
+    parts += [f"## {heading}\n\n{text or 'Not run.'}\n" for heading, text in sections.items()]
+    return "\n".join(parts)
+
+
+def _tables(published: Published, measured: Mapping[str, Measured], tables: Sequence[tuple[str, str, str]], level: str = "##") -> list[str]:
+    parts = []
+    for name, table, heading in tables:
+        parts.append(f"{level} {heading}\n")
         if name not in measured:
             parts.append("Not run.\n")
             continue
@@ -81,19 +126,24 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
             metrics = [m for m in (PAIRED if name != "closed-loop" else published_ours(published, table)) if mine.has(lead, m)]
             parts.append("\n" + differences(mine, lead, [arm for arm in mine.arms if arm != lead], metrics))
         parts.append(f"\n{_counts(mine)}\n")
-    sections = {
-        "A wrong map": _map_errors(found),
-        "Beyond driving": transfer_section(published, measured),
-        "Night, fog and snow": appearance_section(published, measured),
-        "By position": _positions(measured["under-trained"], rows["under-trained"]) if "under-trained" in rows else "",
-        "Drift": drift(measured["cycle"], rows["cycle"]) + f"\n![Quality by frame]({DRIFT})" if "cycle" in rows else "",
-        "Time": _times(measured["cycle"], found.units) if "cycle" in measured else "",
-        "Memory": found.memory,
-        "Core-minutes to quality": "" if found.cost is None else cost_section(found.cost, COST),
-        "The paper's claims": verdicts(judge_claims(measured), reasons),
-    }
-    parts += [f"## {heading}\n\n{text or 'Not run.'}\n" for heading, text in sections.items()]
-    return "\n".join(parts)
+    return parts
+
+
+def _equal_time(published: Published, found: EqualTime) -> str:
+    tables = [table for table in TABLES if table[0] in found.measured]
+    return "\n".join((EQUAL_TIME, training_section(found.training), *_tables(published, found.measured, tables, "###")))
+
+
+def _verdicts(found: Findings, reasons: Mapping[int, str]) -> str:
+    """Return the verdicts, and below them those that both budgets give; a protocol that only one was measured under counts for both."""
+    judged = judge_claims(found.measured)
+    text = verdicts(judged, reasons)
+    if found.equal_time is None:
+        return text
+    again = judge_claims({**found.measured, **found.equal_time.measured})
+    rows = [[str(a.claim.number), a.verdict, b.verdict, f"**{in_both(a.verdict, b.verdict)}**"] for a, b in zip(judged, again, strict=True)]
+    table = markdown_table(["claim", "updates as in the paper", "equal core-minutes", "in both"], rows)
+    return f"{text}\n### Under both budgets\n\n{BOTH}\n{table}"
 
 
 def draw_figures(found: Findings, folder: Path) -> None:

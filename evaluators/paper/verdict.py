@@ -50,6 +50,14 @@ def judge_claims(measured: Mapping[str, Measured], claims: Sequence[Claim] = CLA
     return tuple(_judged(claim, measured) for claim in claims)
 
 
+def in_both(first: Verdict, second: Verdict) -> Verdict:
+    """Return the verdict on a claim that was judged under two budgets of training: it holds if it holds in both, and fails in either."""
+    for verdict in ("does not hold", "not measured", "undecided at our scale"):
+        if verdict in (first, second):
+            return verdict
+    return "holds"
+
+
 def _judged(claim: Claim, measured: Mapping[str, Measured]) -> Judged:
     results = tuple(_result(contest, measured.get(contest.protocol)) for contest in claim.contests)
     outcomes = {result.outcome for result in results}

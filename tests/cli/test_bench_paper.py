@@ -61,6 +61,35 @@ def test_tables_verdicts_and_a_page_and_nothing_is_measured_twice(
     assert {path: path.stat().st_mtime_ns for path in rows} == rows
 
 
+def test_a_second_budget_is_measured_on_the_same_clips_without_measuring_the_shipped_arms_again(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_paper, "SHIPPED", ("onefixer",))
+    settings = small_settings("window=3")
+    for seed, folder in enumerate(("arms", "equal")):
+        parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), seed), "vae": TinyVAE.random(seed=3).state_dict()}
+        (tmp_path / folder / "V9").mkdir(parents=True)
+        save_bundle(tmp_path / folder / "V9" / bench_paper.BUNDLE, parts, settings, trained=True, note="random")
+    long = tmp_path / "long"
+    for name, kind in (("e", "reconstruction"), ("f", "reconstruction"), ("g", "cycle")):
+        path = make(long, "val", name, frames=7).folder / "sequence.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "degradation": {"kind": kind}}))
+    out, arms = tmp_path / "out", str(tmp_path / "arms")
+    command = ["bench", "paper", str(data), "--arms", arms, "--equal-time", str(tmp_path / "equal"), "--split", "val", "--long", str(long)]
+    assert run_command([*command, "--only", "cycle,under-trained", "--out", str(out), "--json"]) == 0
+    capsys.readouterr()
+    clips = {path.relative_to(out).as_posix() for path in out.rglob("clips/*/*.json")}
+    assert {f"under-trained/clips/V9/{name}.json" for name in "ef"} <= clips
+    assert "under-trained/clips/V9/g.json" not in clips, "a long cycle render is no under-trained reconstruction"
+    assert {name.split("/")[3] for name in clips if name.startswith("equal-time/cycle/")} == {"V9", "truth"}
+    text = (out / "paper.md").read_text()
+    second = text[text.index("## Equal core-minutes") : text.index("## The paper's claims")]
+    assert "**onefixer** | ours" in second
+    ours = [one[one.index("| **V9** | paper") :].splitlines()[1] for one in (text, second)]
+    assert ours[0] != ours[1]
+    assert "### Under both budgets" in text
+
+
 def test_the_transfer_is_measured_zero_shot_and_tuned_beside_the_papers_table(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

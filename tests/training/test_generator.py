@@ -26,7 +26,7 @@ from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.training.fixer_run import FixerRun, stage_inputs, train_fixer
 from alpasim_plugin.training.generator import SharedRollout
-from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
+from alpasim_plugin.training.latent_clips import ClipForm, LatentClips, digest
 from alpasim_plugin.training.pair_store import PairDataset, write_sequence
 from alpasim_plugin.training.recipes.ablation import ABLATION
 from alpasim_plugin.training.recipes.recipe import Recipe
@@ -107,6 +107,13 @@ def test_other_pairs_under_the_same_name_are_encoded_anew(data: Path, tmp_path: 
     assert after.digest != before.digest
     assert torch.equal(after[0].z_0, before[0].z_0)
     assert not torch.equal(after[0].z_r, before[0].z_r)
+
+
+@pytest.mark.parametrize(("part", "same"), [("decoder.", True), ("encoder.", False), ("stats.", False)])
+def test_latents_belong_to_the_encoder_and_its_statistics_whatever_the_decoder(data: Path, part: str, same: bool) -> None:
+    vae = TinyVAE.load(data / "vae.safetensors")
+    weights = {key: value + 0.01 if key.startswith(part) else value for key, value in vae.state_dict().items()}
+    assert (digest(TinyVAE.from_state_dict(weights), FORM) == digest(vae, FORM)) == same
 
 
 def test_sequences_that_make_no_clips_or_no_batch_are_refused(data: Path, tmp_path: Path) -> None:

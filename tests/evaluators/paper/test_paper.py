@@ -12,13 +12,14 @@ from alpasim_plugin.errors import EvaluatorError, InputError
 from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import CLAIMS, Claim, Contest, within
 from evaluators.paper.cost import Cost, Curve, Point, contested, cost_section
-from evaluators.paper.document import Findings, document, draw_figures
+from evaluators.paper.document import EqualTime, Findings, document, draw_figures
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip, render_side_by_side
 from evaluators.paper.position import by_position, distance_by_position, drift
 from evaluators.paper.published import Published, published
 from evaluators.paper.tables import paper_against_ours
-from evaluators.paper.verdict import judge_claims
+from evaluators.paper.training import TrainedArm
+from evaluators.paper.verdict import Verdict, in_both, judge_claims
 
 CLIPS = [f"clip-{i}" for i in range(12)]
 
@@ -188,11 +189,41 @@ def test_a_document_says_what_was_not_run() -> None:
     found: Published = published()
     findings = Findings({"under-trained": Measured(from_rows(rows))}, {"under-trained": rows}, {})
     text = document(found, findings, {}, "simrun bench paper")
-    assert text.count("Not run.") == 10
+    assert text.count("Not run.") == 12
     assert "Claim 3** was not measured: protocol cycle" in text
     windows = by_position(rows).splitlines()
     assert "| 0 to 92 | 93 to 189 |" in windows[0]
     assert windows[2].startswith("| 3dgs | 25.50 ± ")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "both"),
+    [
+        ("holds", "holds", "holds"), ("holds", "does not hold", "does not hold"), ("not measured", "does not hold", "does not hold"),
+        ("holds", "undecided at our scale", "undecided at our scale"), ("undecided at our scale", "not measured", "not measured"),
+    ],
+)  # fmt: skip
+def test_a_claim_holds_only_under_both_budgets(first: Verdict, second: Verdict, both: Verdict) -> None:
+    assert in_both(first, second) == in_both(second, first) == both
+
+
+def test_the_second_budget_has_its_own_tables_and_takes_the_rest_from_the_first() -> None:
+    rng = np.random.default_rng(3)
+    level = {clip: rng.normal() for clip in CLIPS}
+
+    def fd(**mean: float) -> Measured:
+        return Measured({arm: {c: {"fd_syn_clip": m + level[c]} for c in CLIPS} for arm, m in mean.items()})
+
+    paper_s, equal = fd(artifixer=8.0, **{"artifixer-pre@1": 9.0, "artifixer-pre@4": 7.0}), fd(artifixer=6.0, **{"artifixer-pre@1": 9.0})
+    trained = TrainedArm("artifixer", {"artifixer-pre": 40, "artifixer": 10}, 6.125, 3e-4, {1e-3: 0.31, 3e-4: 0.25})
+    findings = Findings({"cycle": paper_s}, {}, {}, training=[trained], equal_time=EqualTime({"cycle": equal}, [trained]))
+    text = document(published(), findings, {}, "simrun bench paper")
+    line = "| artifixer | artifixer-pre 40 + artifixer 10 | 6.12 | 0.0003 (0.0003: 0.250, 0.001: 0.310) |"
+    assert text.count(line) == 2
+    second = text[text.index("## Equal core-minutes") : text.index("## The paper's claims")]
+    assert "### Cycle renders" in second
+    assert "### Under-trained" not in second
+    assert "| 5 | holds | not measured | **not measured** |" in text[text.index("### Under both budgets") :]
 
 
 def test_the_first_frame_waits_for_look_ahead_and_the_whole_block() -> None:

@@ -1,0 +1,45 @@
+"""Read from a folder of `simrun train arms` how its arms were trained."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from alpasim_plugin.nets.perceptual import NAME as PERCEPTUAL
+from alpasim_plugin.reading import parsing, read_json_object
+from alpasim_plugin.training.arms.run import PLAN_FILE, arms_of
+from alpasim_plugin.training.fixer_run import BUNDLE_FILE
+from alpasim_plugin.training.snapshots import core_seconds
+from evaluators.paper.training import TrainedArm
+
+DOING = "reading how an arm was trained"
+DO = "train the arms again with 'simrun train arms'"
+
+
+def trained_arms(folder: Path, names: Collection[str] | None = None) -> tuple[TrainedArm, ...]:
+    """Return how each arm was trained, in the order in which they were planned.
+
+    Args:
+        folder: Of `simrun train arms`; of another one, such as one with arms that were trained one by one, nothing is known.
+        names: Only these arms; None: those that are finished.
+
+    Raises:
+        InputError: A log or a card that is missing or not whole.
+    """
+    if not (folder / PLAN_FILE).is_file():
+        return ()
+    found = arms_of(folder)
+    finished = [arm for arm in found if (folder / arm / BUNDLE_FILE).is_file()] if names is None else [arm for arm in found if arm in names]
+    return tuple(_trained(folder, arm, found[arm]) for arm in finished)
+
+
+def _trained(folder: Path, arm: str, trainings: list[str]) -> TrainedArm:
+    times = {name: core_seconds(folder / name) for name in trainings}
+    path = (folder / arm / BUNDLE_FILE).with_suffix(".card.json")
+    card = read_json_object(path, DOING, do_this=DO)
+    with parsing(DOING, path, DO, "no card of a training"):
+        rate = float(card["training"]["schedule"]["peak_lr"])
+        scores = card.get("sweep", {}).get("scores", {})
+        swept = {float(at): float(values[PERCEPTUAL]) for at, values in scores.items()}
+    stages = {name: len(found) for name, found in times.items()}
+    return TrainedArm(arm, stages, sum(found[-1] for found in times.values()) / 60, rate, swept)

@@ -1,0 +1,51 @@
+"""What every arm of a comparison was given: updates, processor time, and the learning rate that a sweep chose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from evaluators.paper.tables import markdown_table
+
+HOW = """A stage that several arms have counts for each; the initial networks, which all share, do not count. Core-minutes are processor
+time of the updates on one machine, without the candidates of a sweep, whose `perceptual-syn` on `val` is in brackets.
+"""
+
+
+@dataclass(frozen=True)
+class TrainedArm:
+    """How an arm was trained.
+
+    Args:
+        arm: Its name.
+        stages: Name of each stage -> its updates, in order.
+        core_minutes: Processor time of all stages.
+        rate: Peak learning rate before the recipe's own factors.
+        swept: Learning rate -> ``perceptual-syn``, lower is better; empty where none was chosen.
+    """
+
+    arm: str
+    stages: Mapping[str, int]
+    core_minutes: float
+    rate: float
+    swept: Mapping[float, float] = field(default_factory=dict)
+
+
+def training_table(arms: Sequence[TrainedArm]) -> str:
+    """Return one line for each arm."""
+    lines = []
+    for one in arms:
+        stages = " + ".join(f"{name} {updates}" for name, updates in one.stages.items())
+        lines.append([one.arm, stages, f"{one.core_minutes:.2f}", f"{one.rate:g}{_candidates(one)}"])
+    return markdown_table(["arm", "stages and updates", "core-minutes", "learning rate"], lines)
+
+
+def training_section(arms: Sequence[TrainedArm]) -> str:
+    """Return the table with what its numbers mean; empty where nothing is known of the training."""
+    return f"{HOW}\n{training_table(arms)}" if arms else ""
+
+
+def _candidates(one: TrainedArm) -> str:
+    if not one.swept:
+        return ""
+    return f" ({', '.join(f'{rate:g}: {value:.3f}' for rate, value in sorted(one.swept.items()))})"
