@@ -12,7 +12,7 @@ from alpasim_plugin.bench.arm_choice import Choice, Score, choose, take, write_c
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.reading import parsing, read_json_object
 from alpasim_plugin.runtime.dependent import Say
-from alpasim_plugin.training.arms.plan import INITIAL, Plan, Training
+from alpasim_plugin.training.arms.plan import INITIAL, Plan, Training, comparison, training_names
 from alpasim_plugin.training.arms.run import ArmsRun, train
 
 SWEEP = "sweep"
@@ -97,16 +97,24 @@ class ChoiceTask:
     sweep: Sweep
 
 
-def tasks_of(run: ArmsRun, plan: Plan, sweep: Sweep | None) -> Iterator[StageTask | ChoiceTask]:
+def tasks_of(run: ArmsRun, plan: Plan, sweep: Sweep | None, rates: Mapping[str, float] | None = None) -> Iterator[StageTask | ChoiceTask]:
     """Yield the tasks of a plan, every one behind those it depends on.
 
     With a sweep, an arm's last stage has a candidate for each rate, from the same stages before it. What starts from an arm starts from the
     best of them.
+
+    Args:
+        run: Shared options.
+        plan: What is trained.
+        sweep: Rates to choose from; None: no choice.
+        rates: Instead of a sweep, peak rates by training, as the whole comparison names them; others have the run's.
     """
+    names = training_names(comparison())
     for training in plan.trainings:
         name = training.name
         if sweep is None or not training.is_last or training.recipe.name in INITIAL.values():
-            yield StageTask(run, training, training.after, name)
+            known = names.get((training.recipe.name, training.stage.name), name)
+            yield StageTask(run, training, training.after, name, (rates or {}).get(known))
             continue
         candidates = tuple(candidate_name(name, rate) for rate in sweep.rates)
         for rate, candidate in zip(sweep.rates, candidates, strict=True):
@@ -179,6 +187,13 @@ def read_choice(path: Path) -> Choice:
         return Choice(float(found["rate"]), scores, tuple(found["clips"]))
 
 
-def total_updates(tasks: Sequence[StageTask | ChoiceTask]) -> int:
-    """Return the updates of all stages."""
-    return sum(task.updates for task in tasks if isinstance(task, StageTask))
+def chosen_rates(folder: Path) -> dict[str, float]:
+    """Return the rates that a sweep chose, by arm.
+
+    Raises:
+        InputError: No sweep was made there, or a record that is not whole.
+    """
+    records = sorted((folder / SWEEP).glob("*.json"))
+    if not records:
+        raise InputError(DOING, f"--rates {folder}", "no rates that a sweep chose", "name a folder of 'simrun train arms --sweep RATES'")
+    return {path.stem: read_choice(path).rate for path in records}

@@ -17,7 +17,7 @@ from rich.console import Console
 from alpasim_plugin.bench.arm_choice import Choice
 from alpasim_plugin.bench.trained_arms import trained_arms
 from alpasim_plugin.cli import training_options as options
-from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, tasks_of, work
+from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, chosen_rates, tasks_of, work
 from alpasim_plugin.cli.train_fixer import PRECISIONS, named_weights
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import distance_for_training
@@ -43,6 +43,8 @@ Examples:
 
 - `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms-60 --budget minutes --minutes 60`
 
+- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms-60 --budget minutes --minutes 60 --rates runs/swept`
+
 - `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/swept --sweep 1e-4,3e-4,1e-3 --sweep-steps 50 --only V9,difix`
 """
 
@@ -67,6 +69,9 @@ def arms(
     sweep: Annotated[str | None, typer.Option("--sweep", help="Learning rates, comma-separated: the best on split val is the arm.")] = None,
     sweep_steps: Annotated[int | None, typer.Option("--sweep-steps", min=1, help="U of the candidates; then the best in full.")] = None,
     sweep_clips: Annotated[int | None, typer.Option("--sweep-clips", min=1, help="At most so many clips to choose by.")] = None,
+    rates: Annotated[
+        Path | None, typer.Option("--rates", help="Folder of arms with a sweep: every arm has the learning rate that was chosen there.")
+    ] = None,
     clips: options.Clips = 4,
     accumulate: options.Accumulate = 2,
     latents: options.Latents = 12,
@@ -108,6 +113,9 @@ def arms(
     swept = None if sweep is None else Sweep(rates_of(sweep), sweep_steps, sweep_clips)
     if swept is None and (sweep_steps, sweep_clips) != (None, None):
         raise InputError(DOING, "--sweep-steps, --sweep-clips", "no rates to choose from", "give --sweep 1e-4,3e-4,1e-3")
+    if swept is not None and rates is not None:
+        raise InputError(DOING, "--sweep, --rates", "rates to choose from, and chosen ones", "leave one of them out")
+    known = {} if rates is None else chosen_rates(rates)
     planned = plan(recipes, chosen, run.given)
     telling.say(f"perceptual term: {distance_for_training(metric_weights)[0]}")
     run.clips(telling.encoded)
@@ -115,7 +123,7 @@ def arms(
         recipes = equal_time(run, recipes, chosen, minutes, probe_updates, telling)
         planned = plan(recipes, chosen, run.given)
     write_plan(run, planned, {"budget": budget, "minutes": minutes})
-    tasks = list(tasks_of(run, planned, swept))
+    tasks = list(tasks_of(run, planned, swept, known))
     telling.begin(tasks, jobs)
     try:
         run_dependent(work, tasks, jobs, telling.heard)

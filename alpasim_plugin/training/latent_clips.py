@@ -165,7 +165,7 @@ def _encode(sequence: PairSequence, vae: TinyVAE, start: int, form: ClipForm, mi
 
 
 def digest(vae: TinyVAE, form: ClipForm) -> str:
-    """Return a digest of what latents depend on: the encoder with its statistics, and the form of the clips. A decoder may be fine-tuned."""
+    """Return a digest of what latents depend on: the encoder with its statistics, and the form of the clips; not the decoder."""
     out = hashlib.blake2b(json.dumps(asdict(form)).encode(), digest_size=8)
     for key, value in sorted(vae.state_dict().items()):
         if key.startswith(DECODER):

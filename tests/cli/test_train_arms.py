@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
 from alpasim_plugin.bench.cost import cost_curves
+from alpasim_plugin.cli.arms_tasks import StageTask, chosen_rates, tasks_of
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
-from alpasim_plugin.training.arms.run import PROBE_FILE
+from alpasim_plugin.training.arms.budget import in_equal_time, related
+from alpasim_plugin.training.arms.plan import comparison, plan, training_names
+from alpasim_plugin.training.arms.run import PROBE_FILE, ArmsRun
+from alpasim_plugin.training.clip_batches import BatchForm
+from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.snapshots import core_seconds, snapshots_of
+from alpasim_plugin.training.trainer import Schedule
 from tests.training.pair_files import make
 
 
@@ -103,6 +110,25 @@ def test_a_budget_of_minutes_is_kept_with_recorded_times(data: Path, capsys: pyt
     assert (data / "timed" / PROBE_FILE).read_text() == probed
 
 
+def test_rates_of_a_sweep_reach_the_arm_and_the_same_stage_of_another_arm(data: Path) -> None:
+    sweep = data / "rates" / "sweep"
+    sweep.mkdir(parents=True)
+    for arm, rate in (("omnidreams", 1e-3), ("self-forcing", 1e-4)):
+        score = {"perceptual-syn": 0.3, "psnr_db": 20.0}
+        (sweep / f"{arm}.json").write_text(json.dumps({"rate": rate, "scores": {f"{rate:g}": score}, "clips": ["b"]}))
+    rates = chosen_rates(data / "rates")
+    assert rates == {"omnidreams": 1e-3, "self-forcing": 1e-4}
+
+    schedule = Schedule(steps=2, peak_lr=2e-4)
+    run = ArmsRun(data / "pairs", data / "vae.safetensors", data / "rated", ClipForm(2, 4), BatchForm(1), schedule, schedule)
+    names, seconds = training_names(comparison()), defaultdict(lambda: 1.0)
+    timed = in_equal_time(related(comparison(), ["self-forcing"]), names, seconds, 1.0, 2)  # its student is then no arm
+    for recipes, student in ((comparison(), "omnidreams"), (timed, "self-forcing/student")):
+        tasks = {task.name: task for task in tasks_of(run, plan(recipes, ["self-forcing"]), None, rates)}
+        given = {name: task.peak_lr for name, task in tasks.items() if isinstance(task, StageTask)}
+        assert given == {"initial/base": None, "initial/base-bi": None, "self-forcing/teacher": None, student: 1e-3, "self-forcing": 1e-4}
+
+
 @pytest.mark.parametrize(
     ("more", "found"),
     [
@@ -112,6 +138,8 @@ def test_a_budget_of_minutes_is_kept_with_recorded_times(data: Path, capsys: pyt
         (["--sweep", "1e-4"], "not at least two different learning rates"),
         (["--sweep", "1e-4,nan"], "not at least two different learning rates"),
         (["--sweep-steps", "3"], "no rates to choose from"),
+        (["--sweep", "1e-4,1e-3", "--rates", "."], "rates to choose from, and chosen ones"),
+        (["--rates", "."], "no rates that a sweep chose"),
         (["--weights", "init=x"], "no initial network"),
     ],
 )
