@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.types import F64
@@ -16,7 +17,7 @@ from evaluators.judges.frechet import frechet_distance, swap_test
 from evaluators.metrics import info
 
 ALPHA = 0.05
-SWAPS = 400
+SWAPS = 4000  # so that a p-value can survive the correction for a claim's many contests
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]  # ARM -> CLIP -> METRIC -> value
 Features = Mapping[str, Mapping[str, Mapping[str, F64]]]  # ARM -> CLIP -> METRIC -> vectors (n, d)
 
@@ -30,7 +31,7 @@ class Difference:
         first, second: Arms.
         difference: First minus second.
         low, high: 95 % t interval over clips; None for a metric of whole sets.
-        p_value: By swapping whole clips, for a metric of whole sets; else None.
+        p_value: Two-sided: of the t test over clips, or by swapping whole clips for a metric of whole sets; None with one clip.
         n: Clips.
         favours: Whether the first is shown to be better (1) or worse (-1), or neither (0).
     """
@@ -110,7 +111,8 @@ class Measured:
         favours = 0
         if found.low is not None and found.high is not None and not found.low <= 0.0 <= found.high:
             favours = better * int(np.sign(found.centre))
-        return Difference(metric, first, second, found.centre, found.low, found.high, None, len(clips), favours)
+        p_value = beyond(found, 0.0, len(clips))
+        return Difference(metric, first, second, found.centre, found.low, found.high, p_value, len(clips), favours)
 
     def margin(self, metric: str, arm: str, bound: float) -> Difference:
         """Return by how much an arm exceeds a bound on average, as a difference from it.
@@ -123,7 +125,9 @@ class Measured:
         better = {"higher": 1, "lower": -1}.get(info(metric).direction, 0)
         decided = found.low is not None and found.high is not None and not found.low < 0.0 < found.high
         favours = better * (1 if found.centre >= 0 else -1) if decided else 0
-        return Difference(metric, arm, f"{bound:g}", found.centre, found.low, found.high, None, len(clips), favours)
+        return Difference(
+            metric, arm, f"{bound:g}", found.centre, found.low, found.high, beyond(found, 0.0, len(clips)), len(clips), favours
+        )
 
     def _shared(self, metric: str, *arms: str) -> list[str]:
         sides = [self.clips(arm, metric) for arm in arms]
@@ -135,6 +139,17 @@ class Measured:
 
     def _sides(self, metric: str, clips: Sequence[str], arm: str) -> tuple[list[F64], list[F64]]:
         return [self.features[arm][c][metric] for c in clips], [self.features[self.reference][c][metric] for c in clips]
+
+
+def beyond(found: Interval, width: float, n: int) -> float | None:
+    """Return the two-sided p-value of the t test that a mean of ``n`` values is beyond ``width`` from zero; None without an interval."""
+    if found.low is None or found.high is None:
+        return None
+    excess, half = abs(found.centre) - width, (found.high - found.low) / 2
+    if half == 0.0:
+        return 0.0 if excess > 0.0 else 1.0
+    standard_error = half / float(scipy.special.stdtrit(n - 1, 1 - ALPHA / 2))
+    return min(2.0 * float(scipy.special.stdtr(n - 1, -excess / standard_error)), 1.0)
 
 
 def from_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:

@@ -98,6 +98,7 @@ def verdicts(judged: Sequence[Judged], reasons: Mapping[int, str]) -> str:
         telling = [
             r for r in one.results if r.outcome == ("for" if one.verdict == "holds" else "against" if one.count("against") else "open")
         ]
+        telling.sort(key=_refuting)
         lines = "".join(f"- {_sentence(result)}\n" for result in telling[:8])
         more = f"- and {len(telling) - 8} more\n" if len(telling) > 8 else ""
         why = f"\n{reasons[one.claim.number]}\n" if one.claim.number in reasons else ""
@@ -113,7 +114,12 @@ def _tally(one: Judged) -> str:
 def _sentence(result: Result) -> str:
     contest = result.contest
     assert result.difference is not None
-    return f"{contest.protocol}, `{contest.metric}`: {contest.first} minus {contest.second} {difference_text(result.difference)}"
+    corrected = f", corrected p {result.refutes:.3f}" if result.outcome == "against" and result.refutes is not None else ""
+    return f"{contest.protocol}, `{contest.metric}`: {contest.first} minus {contest.second} {difference_text(result.difference)}{corrected}"
+
+
+def _refuting(result: Result) -> float:
+    return 1.0 if result.refutes is None else result.refutes
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from alpasim_plugin.errors import EvaluatorError, InputError
 from evaluators.paper.appearance import appearance_section
@@ -19,7 +20,7 @@ from evaluators.paper.position import by_position, distance_by_position, drift
 from evaluators.paper.published import Published, published
 from evaluators.paper.tables import paper_against_ours
 from evaluators.paper.training import TrainedArm
-from evaluators.paper.verdict import Verdict, in_both, judge_claims
+from evaluators.paper.verdict import Verdict, holm, in_both, judge_claims
 
 CLIPS = [f"clip-{i}" for i in range(12)]
 
@@ -105,6 +106,45 @@ def test_one_lost_contest_refutes_and_a_missing_arm_leaves_it_open() -> None:
     assert verdict_of(measured, won, absent) == "not measured"
     assert verdict_of(measured, won, absent, lost) == "does not hold"
     assert verdict_of(measured, Contest("closed-loop", "offroad", "a", "b")) == "not measured"
+
+
+def test_the_p_value_of_a_difference_is_that_of_the_paired_t_test() -> None:
+    measured = arms(a=0.03, b=0.0)
+    a, b = ([measured.values[arm][clip]["psnr_db"] for clip in CLIPS] for arm in "ab")
+    assert measured.difference("psnr_db", "a", "b").p_value == pytest.approx(scipy.stats.ttest_rel(a, b).pvalue)
+    assert measured.margin("psnr_db", "a", 23.0).p_value == pytest.approx(scipy.stats.ttest_1samp(a, 23.0).pvalue)
+    equal = Measured({arm: {c: {"psnr_db": level} for c in CLIPS} for arm, level in (("a", 1.0), ("b", 2.0), ("c", 1.0))})
+    assert (equal.difference("psnr_db", "a", "b").p_value, equal.difference("psnr_db", "a", "c").p_value) == (0.0, 1.0)
+
+
+def lost_with(p_value: float, others: int) -> tuple[Measured, tuple[Contest, ...]]:
+    """Return one contest that is lost with a two-sided p-value, and others that are level."""
+    x = np.linspace(-1, 1, len(CLIPS))
+    shift = scipy.stats.t.isf(p_value / 2, len(CLIPS) - 1) * x.std(ddof=1) / np.sqrt(len(CLIPS))
+    values = {"a": np.zeros(len(CLIPS)), "b": x + shift, **{f"c{i}": x for i in range(others)}}
+    measured = Measured({arm: {c: {"psnr_db": float(v)} for c, v in zip(CLIPS, many, strict=True)} for arm, many in values.items()})
+    return measured, tuple(Contest("cycle", "psnr_db", "a", rival) for rival in values if rival != "a")
+
+
+@pytest.mark.parametrize(
+    ("p_value", "others", "verdict"),
+    [
+        (0.04, 0, "does not hold"), (0.06, 0, "undecided at our scale"), (0.04, 1, "undecided at our scale"),
+        (0.024, 1, "does not hold"), (0.024, 2, "undecided at our scale"),
+        (0.0004, 99, "does not hold"), (0.0006, 99, "undecided at our scale"),
+    ],
+)  # fmt: skip
+def test_a_lost_contest_refutes_if_it_is_lost_among_so_many(p_value: float, others: int, verdict: str) -> None:
+    measured, contests = lost_with(p_value, others)
+    judged = judge_claims({"cycle": measured}, [Claim(1, "it is so", "here", contests)])[0]
+    assert judged.verdict == verdict
+    assert judged.count("against") == (p_value < 0.05), "by its own interval it is lost all the same"
+    assert judged.results[0].refutes == pytest.approx(min(p_value / 2 * (others + 1), 1.0))
+
+
+def test_the_correction_is_holms() -> None:
+    assert holm([0.01, None, 0.04, 0.03]) == pytest.approx([0.03, None, 0.06, 0.06])
+    assert holm([None]) == [None]
 
 
 @pytest.mark.parametrize(("level", "verdict"), [(0.97, "holds"), (0.85, "does not hold"), (0.9, "undecided at our scale")])
