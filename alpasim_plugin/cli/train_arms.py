@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -164,13 +164,16 @@ def rates_of(text: str) -> tuple[float, ...]:
 
 
 class Telling:
-    """Progress on standard error: stages, losses, and the time left, from the mean time of an update of each stage so far."""
+    """Progress on standard error: stages, losses, and the time left."""
 
     def __init__(self) -> None:
         self.console, self.last_s = Console(stderr=True), time.monotonic()
         self.total: dict[str, int] = {}  # updates by stage
         self.updates: dict[str, int] = {}  # of unfinished stages: those still to make
-        self.taken: dict[str, list[float]] = defaultdict(list)
+        self.made: dict[str, int] = defaultdict(int)  # updates of this process
+        self.trainings: dict[str, str] = {}  # by stage; the candidates of a sweep are one training
+        self.latents: dict[str, int] = {}  # of a clip, by training
+        self.taken: dict[str, list[float]] = defaultdict(list)  # seconds of updates, by training
         self.stages = self.jobs = 0
 
     def say(self, text: str) -> None:
@@ -186,7 +189,10 @@ class Telling:
     def begin(self, tasks: Sequence[StageTask | ChoiceTask], jobs: int) -> None:
         """Take the stages, and name those in another precision than the run's."""
         self.jobs = jobs
-        self.updates = {task.name: task.updates for task in tasks if isinstance(task, StageTask)}
+        stages = [task for task in tasks if isinstance(task, StageTask)]
+        self.updates = {task.name: task.updates for task in stages}
+        self.trainings = {task.name: task.training.name for task in stages}
+        self.latents = {task.training.name: task.training.stage.latents or task.run.form.latents for task in stages}
         self.total, self.stages = dict(self.updates), len(self.updates)
         self.say(f"{self.stages} stages, {sum(self.updates.values())} updates")
         for task in tasks:
@@ -197,13 +203,14 @@ class Telling:
         """Report what a task says."""
         if isinstance(said, Updated):
             of = self.total[name]
-            self.taken[name].append(said.s)
+            self.taken[self.trainings[name]].append(said.s)
+            self.made[name] += 1
             self.updates[name] = of - said.step
             if time.monotonic() - self.last_s > EVERY_S:
                 self.last_s = time.monotonic()
                 self.say(f"{name} {said.step}/{of}, loss {said.loss:.4g}; {self._left()}")
         elif isinstance(said, Trained):
-            made = len(self.taken[name])
+            made = self.made[name]
             self.updates.pop(name)
             done = self.stages - len(self.updates)
             self.say(f"[{done}/{self.stages}] {name}: {f'{made} updates' if made else 'was finished'}; {self._left()}")
@@ -212,11 +219,31 @@ class Telling:
             self.say(f"{name}: learning rate {said.rate:g} is the best ({scores}; {len(said.clips)} clips of val)")
 
     def _left(self) -> str:
-        """Return the time left; a stage without an update yet is taken to be as fast as the others' mean."""
-        means = {one: sum(times) / len(times) for one, times in self.taken.items() if times}
-        if not means or not self.updates:
-            return "nothing left" if not self.updates else "time left not known yet"
-        usual = sum(means.values()) / len(means)
-        left_s = sum(means.get(one, usual) * count for one, count in self.updates.items())
+        if not self.updates:
+            return "nothing left"
+        left: dict[str, int] = defaultdict(int)
+        for name, count in self.updates.items():
+            left[self.trainings[name]] += count
+        left_s = seconds_left(left, self.latents, self.taken)
+        if left_s is None:
+            return "time left not known yet"
         left_s /= self.jobs
         return f"about {left_s:.0f} s left" if left_s < SHORT_S else f"about {left_s / 60:.0f} min left"
+
+
+def seconds_left(updates: Mapping[str, int], latents: Mapping[str, int], taken: Mapping[str, Sequence[float]]) -> float | None:
+    """Return the time that updates of several trainings will take; None while none has been timed.
+
+    A training without an update yet is taken to need the others' mean time for each latent of its clips: an update of an image arm, whose
+    clips have one latent, is a tenth of a video arm's.
+
+    Args:
+        updates: Still to make, by training.
+        latents: Of a clip, by training.
+        taken: Seconds of the updates made, by training.
+    """
+    means = {one: sum(times) / len(times) for one, times in taken.items() if times}
+    if not means:
+        return None
+    of_latent = sum(mean / latents[one] for one, mean in means.items()) / len(means)
+    return sum(means.get(one, of_latent * latents[one]) * count for one, count in updates.items())

@@ -11,6 +11,7 @@ import pytest
 from alpasim_plugin.bench.cost import cost_curves
 from alpasim_plugin.cli.arms_tasks import StageTask, chosen_rates, tasks_of
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.train_arms import seconds_left
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.arms.budget import in_equal_time, related
@@ -108,6 +109,14 @@ def test_a_budget_of_minutes_is_kept_with_recorded_times(data: Path, capsys: pyt
     assert run_command(train) == 0, "the same updates again, by the recorded times"
     assert json.loads(capsys.readouterr().out)["arms"] == rows
     assert (data / "timed" / PROBE_FILE).read_text() == probed
+
+
+def test_the_time_left_of_a_stage_without_an_update_goes_by_its_latents() -> None:
+    latents = {"V9": 12, "harmonizer": 1, "one-forcing": 12}
+    left = {"V9": 10, "harmonizer": 100, "one-forcing": 5}
+    assert seconds_left(left, latents, {}) is None
+    assert seconds_left(left, latents, {"V9": [2.0, 4.0]}) == pytest.approx(10 * 3 + 100 * 3 / 12 + 5 * 3)
+    assert seconds_left(left, latents, {"V9": [3.0], "harmonizer": [0.5]}) == pytest.approx(10 * 3 + 100 * 0.5 + 5 * 12 * 0.375)
 
 
 def test_rates_of_a_sweep_reach_the_arm_and_the_same_stage_of_another_arm(data: Path) -> None:
