@@ -17,7 +17,7 @@ from evaluators.judges.frechet import frechet_distance, swap_test
 from evaluators.metrics import info
 
 ALPHA = 0.05
-SWAPS = 4000  # so that a p-value can survive the correction for a claim's many contests
+SWAPS = 400  # of whole clips; no p-value is below 1 / (SWAPS + 1)
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]  # ARM -> CLIP -> METRIC -> value
 Features = Mapping[str, Mapping[str, Mapping[str, F64]]]  # ARM -> CLIP -> METRIC -> vectors (n, d)
 
