@@ -27,6 +27,7 @@ TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing
 block waits for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
 """
 BASELINE = "3dgs"
+LEADS = (OURS, "onefixer")  # whose paired differences with all others are shown
 PAIRED = ("psnr_db", "perceptual-syn", "fd_syn_clip", "fvmd_lk", "warp_l1", "lane_f1_syn", "cuboid_f1_syn")
 HOW = """A claim is a paired difference over the same clips, 95 %: a t interval, or for metrics of whole sets (`fd_syn_clip`, `fvmd_lk`)
 a test that swaps whole clips. Bold: shown. Absolute values do not compare with the paper's: other scenes, networks and resolution; our
@@ -121,10 +122,10 @@ def _tables(published: Published, measured: Mapping[str, Measured], tables: Sequ
             continue
         mine = measured[name]
         parts.append(paper_against_ours(published, table, _of_table(mine, published.tables[table].rows)))
-        lead = OURS if OURS in mine.arms else "onefixer"
-        if table != "ablation" and lead in mine.arms:
-            metrics = [m for m in (PAIRED if name != "closed-loop" else published_ours(published, table)) if mine.has(lead, m)]
-            parts.append("\n" + differences(mine, lead, [arm for arm in mine.arms if arm != lead], metrics))
+        metrics = PAIRED if name != "closed-loop" else published_ours(published, table)
+        for lead in (arm for arm in LEADS if table != "ablation" and arm in mine.arms):
+            has = [metric for metric in metrics if mine.has(lead, metric)]
+            parts.append("\n" + differences(mine, lead, [arm for arm in mine.arms if arm != lead], has))
         parts.append(f"\n{_counts(mine)}\n")
     return parts
 
