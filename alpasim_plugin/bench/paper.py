@@ -127,14 +127,16 @@ class Compared:
     equal_time: EqualTime | None = None
 
 
-def arms_in(folder: Path) -> tuple[Variant, ...]:
+def arms_in(folder: Path, option: str = "--arms") -> tuple[Variant, ...]:
     """Return the arms that were trained: a variant for each number of steps that the paper reports, in alphabetical order.
 
     Raises:
         InputError: No folder, or a bundle that is none.
     """
     if not folder.is_dir():
-        raise InputError(DOING, f"--arms {folder}", "no such folder", "train arms into it: 'simrun train arms PAIRS --vae VAE --out ARMS'")
+        raise InputError(
+            DOING, f"{option} {folder}", "no such folder", "train arms into it: 'simrun train arms PAIRS --vae VAE --out ARMS'"
+        )
     found: list[Variant] = []
     for path in sorted(folder.glob(f"*/{BUNDLE}")):
         name, settings = bundle_fixer(path)
@@ -165,6 +167,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     arms = tuple(arm for arm in arms if arm.label != APPEARANCE)  # it has a protocol of its own
     out.units = {arm.label: unit_of(arm) for arm in arms}
     out.training = trained_arms(run.arms)
+    again = () if run.equal_time is None else arms_in(run.equal_time, "--equal-time")  # before hours of measuring
     for name in TWICE:
         if name in run.protocols:
             sequences = _sequences(run, name)
@@ -190,16 +193,16 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
     if run.equal_time is not None:
-        out.equal_time = _equal_time(run, run.equal_time, told, out)
+        out.equal_time = _equal_time(run, again, trained_arms(run.equal_time), told, out)
     bundle = run.arms / APPEARANCE / BUNDLE
     if "appearance" in run.protocols and bundle.is_file():
         out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
 
 
-def _equal_time(run: PaperRun, folder: Path, told: Told, out: Compared) -> EqualTime:
+def _equal_time(run: PaperRun, found: Sequence[Variant], training: Sequence[TrainedArm], told: Told, out: Compared) -> EqualTime:
     """Measure the arms of equal core-minutes on the clips of the others; render and shipped fixers are those measured there."""
-    arms, second = tuple(arm for arm in arms_in(folder) if arm.label != APPEARANCE), Compared()
+    arms, second = tuple(arm for arm in found if arm.label != APPEARANCE), Compared()
     merged: dict[str, Measured] = {}
     for name in (name for name in TWICE if name in run.protocols):
         _open_loop(replace(run, out=run.out / "equal-time"), name, _sequences(run, name), arms, frozenset(), told, second)
@@ -210,7 +213,7 @@ def _equal_time(run: PaperRun, folder: Path, told: Told, out: Compared) -> Equal
             {**{arm: others.features[arm] for arm in shared if arm in others.features}, **mine.features},
             mine.reference, mine.seed,
         )  # fmt: skip
-    return EqualTime(merged, trained_arms(folder))
+    return EqualTime(merged, training)
 
 
 def findings(compared: Compared) -> Findings:

@@ -155,6 +155,7 @@ def test_an_arm_with_several_numbers_of_steps_takes_each_though_its_bundle_names
     [
         (["--only", "cycle,loop"], "unknown: loop"),
         (["--arms", "nowhere"], "no such folder"),
+        (["--equal-time", "nowhere"], "--equal-time nowhere"),
         (["--drives", "."], "no rollouts.parquet"),
         (["--reasons", "why.json"], "no such file"),
     ],
