@@ -23,10 +23,11 @@ from evaluators.judges.clip import cuboid_values, lane_values
 from evaluators.judges.cuboids import cuboid_f1
 from evaluators.judges.external import read_detections, read_tracks
 from evaluators.judges.facts import FD_16, FD_CLIP, FVMD_LK, of_seed, paper_cells
-from evaluators.judges.frechet import frechet_distance, halves, swap_test
+from evaluators.judges.frechet import frechet_distance, halves
 from evaluators.judges.fvmd import FVMD, RIDGE, histograms, motion_features
 from evaluators.judges.lane_jitter import lane_jitter_m
 from evaluators.judges.lanes import score_clip
+from evaluators.judges.swapping import swap_test
 
 DOING = "judging clips"
 REFERENCE = "truth"  # folder of detections on the clean frames

@@ -13,11 +13,12 @@ import scipy.special
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.types import F64
 from evaluators.aggregate.intervals import Interval, t_interval
-from evaluators.judges.frechet import frechet_distance, swap_test
+from evaluators.judges.frechet import frechet_distance
+from evaluators.judges.swapping import swap_test
 from evaluators.metrics import info
 
 ALPHA = 0.05
-SWAPS = 400  # of whole clips; no p-value is below 1 / (SWAPS + 1)
+SWAPS = 2000  # of whole clips; no p-value is below 1 / (SWAPS + 1)
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]  # ARM -> CLIP -> METRIC -> value
 Features = Mapping[str, Mapping[str, Mapping[str, F64]]]  # ARM -> CLIP -> METRIC -> vectors (n, d)
 
