@@ -21,7 +21,7 @@ from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
-from alpasim_plugin.bench.trained_arms import trained_arms
+from alpasim_plugin.bench.trained_arms import trained_arms, within_budget
 from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.errors import InputError
@@ -193,27 +193,29 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
     if run.equal_time is not None:
-        out.equal_time = _equal_time(run, again, trained_arms(run.equal_time), told, out)
+        out.equal_time = _equal_time(run, run.equal_time, again, told, out)
     bundle = run.arms / APPEARANCE / BUNDLE
     if "appearance" in run.protocols and bundle.is_file():
         out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
 
 
-def _equal_time(run: PaperRun, found: Sequence[Variant], training: Sequence[TrainedArm], told: Told, out: Compared) -> EqualTime:
-    """Measure the arms of equal core-minutes on the clips of the others; render and shipped fixers are those measured there."""
+def _equal_time(run: PaperRun, folder: Path, found: Sequence[Variant], told: Told, out: Compared) -> EqualTime:
+    """Measure the arms of equal core-minutes on the clips of the others; render, shipped fixers and arms that took as long are measured."""
     arms, second = tuple(arm for arm in found if arm.label != APPEARANCE), Compared()
+    taken = within_budget([one for one in out.training if one.arm != APPEARANCE], folder)
+    same = {RAW, *SHIPPED, *(one.arm for one in taken)}
     merged: dict[str, Measured] = {}
     for name in (name for name in TWICE if name in run.protocols):
         _open_loop(replace(run, out=run.out / "equal-time"), name, _sequences(run, name), arms, frozenset(), told, second)
         mine, others = second.measured[name], out.measured[name]
-        shared = [arm for arm in others.values if arm in (RAW, *SHIPPED)]
+        shared = [arm for arm in others.values if arm.partition("@")[0] in same]
         merged[name] = Measured(
             {**{arm: others.values[arm] for arm in shared}, **mine.values},
             {**{arm: others.features[arm] for arm in shared if arm in others.features}, **mine.features},
             mine.reference, mine.seed,
         )  # fmt: skip
-    return EqualTime(merged, training)
+    return EqualTime(merged, (*trained_arms(folder), *taken), tuple(one.arm for one in taken))
 
 
 def findings(compared: Compared) -> Findings:

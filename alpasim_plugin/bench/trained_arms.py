@@ -1,18 +1,19 @@
-"""Read from a folder of `simrun train arms` how its arms were trained."""
+"""Read from a folder of `simrun train arms` how its arms were trained, and which of them another budget would train the same."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from alpasim_plugin.nets.perceptual import NAME as PERCEPTUAL
 from alpasim_plugin.reading import parsing, read_json_object
-from alpasim_plugin.training.arms.run import PLAN_FILE, arms_of
+from alpasim_plugin.training.arms.run import PLAN_FILE, arms_of, minutes_of
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.training.snapshots import core_seconds
 from evaluators.paper.training import TrainedArm
 
 DOING = "reading how an arm was trained"
+WITHIN = 0.1  # of the core-minutes of a budget
 DO = "train the arms again with 'simrun train arms'"
 
 
@@ -31,6 +32,25 @@ def trained_arms(folder: Path, names: Collection[str] | None = None) -> tuple[Tr
     found = arms_of(folder)
     finished = [arm for arm in found if (folder / arm / BUNDLE_FILE).is_file()] if names is None else [arm for arm in found if arm in names]
     return tuple(_trained(folder, arm, found[arm]) for arm in finished)
+
+
+def within_budget(trained: Sequence[TrainedArm], folder: Path) -> tuple[TrainedArm, ...]:
+    """Return the arms that need no second training for equal core-minutes: theirs took as long already, within `WITHIN`.
+
+    Args:
+        trained: With the paper's updates.
+        folder: Of `simrun train arms --budget minutes`; an arm that was trained there is left out. Of another folder nothing is known.
+
+    Raises:
+        InputError: A plan that is not whole.
+    """
+    minutes = minutes_of(folder) if (folder / PLAN_FILE).is_file() else None
+    if minutes is None:
+        return ()
+    return tuple(
+        one for one in trained
+        if abs(one.core_minutes / minutes - 1.0) <= WITHIN and not (folder / one.arm / BUNDLE_FILE).is_file()
+    )  # fmt: skip
 
 
 def _trained(folder: Path, arm: str, trainings: list[str]) -> TrainedArm:

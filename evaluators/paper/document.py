@@ -42,6 +42,8 @@ TABLES = (  # protocol, table of the paper, heading
 )
 EQUAL_TIME = """Every arm has the same processor time instead of the paper's updates; clips, noise and judges are the same.
 """
+TAKEN = """With the paper's updates these arms took this time already, within 10 %, and their weights stand here too: {}.
+"""
 BOTH = """A claim holds if it holds under both budgets, and does not if it does not under one. What was measured under one alone counts for
 both.
 """
@@ -79,10 +81,12 @@ class EqualTime:
     Args:
         measured: PROTOCOL -> what was measured of them, beside the render and the shipped fixers.
         training: How they were trained.
+        taken: Those of them whose training with the paper's updates took as long, so that its weights stand here too.
     """
 
     measured: Mapping[str, Measured]
     training: Sequence[TrainedArm]
+    taken: Sequence[str] = ()
 
 
 def document(published: Published, found: Findings, reasons: Mapping[int, str], command: str) -> str:
@@ -132,7 +136,8 @@ def _tables(published: Published, measured: Mapping[str, Measured], tables: Sequ
 
 def _equal_time(published: Published, found: EqualTime) -> str:
     tables = [table for table in TABLES if table[0] in found.measured]
-    return "\n".join((EQUAL_TIME, training_section(found.training), *_tables(published, found.measured, tables, "###")))
+    taken = TAKEN.format(", ".join(f"`{arm}`" for arm in found.taken)) if found.taken else ""
+    return "\n".join((EQUAL_TIME + taken, training_section(found.training), *_tables(published, found.measured, tables, "###")))
 
 
 def _verdicts(found: Findings, reasons: Mapping[int, str]) -> str:

@@ -31,6 +31,7 @@ from alpasim_plugin.training.recipes.recipe import Recipe
 from alpasim_plugin.training.snapshots import core_seconds
 from alpasim_plugin.training.trainer import Schedule
 
+READING, DO = "reading which trainings an arm has", "train the arms with 'simrun train arms'"
 PLAN_FILE, PROBE_FILE = "arms.json", "probe.json"
 WARM_UP = 2  # updates before those that are timed
 DOING = "training the arms"
@@ -179,11 +180,20 @@ def arms_of(folder: Path) -> dict[str, list[str]]:
         InputError: It was not made by `simrun train arms`.
     """
     path = folder / PLAN_FILE
-    do = "train the arms with 'simrun train arms'"
-    found = read_json_object(path, "reading which trainings an arm has", do_this=do).get("arms")
+    found = read_json_object(path, READING, do_this=DO).get("arms")
     if not isinstance(found, dict):
-        raise InputError("reading which trainings an arm has", str(path), "no arms", do)
+        raise InputError(READING, str(path), "no arms", DO)
     return {str(name): [str(one) for one in trainings] for name, trainings in found.items()}
+
+
+def minutes_of(folder: Path) -> float | None:
+    """Return the core-minutes that every arm in a folder of arms was given; None: it has the paper's updates.
+
+    Raises:
+        InputError: It was not made by `simrun train arms`.
+    """
+    minutes = read_json_object(folder / PLAN_FILE, READING, do_this=DO).get("minutes")
+    return None if minutes is None else float(minutes)
 
 
 def _distance(run: ArmsRun) -> tuple[str, Any]:
