@@ -33,6 +33,7 @@
       const series = clip.curves[0] && clip.curves[0].lines[k];
       figure.querySelector(".number").textContent = series && series[frame] != null ? series[frame].toFixed(clip.curves[0].digits) + " " + clip.curves[0].unit : "";
     });
+    get("all").textContent = hidden.size ? "Show all" : "Hide all";
     at.textContent = frame + " of " + (clip.frames - 1);
     document.querySelectorAll(".charts .at").forEach((line) => {
       const x = Number(line.dataset.left) + frame * Number(line.dataset.step);
@@ -47,6 +48,7 @@
     if (text !== undefined) made.textContent = text;
     return made;
   };
+  const DASHES = ["none", "5 3", "1 2", "8 2 1 2"];  // with eight colours, 32 arms are told apart
   const W = 420, H = 190, L = 46, R = 8, T = 8, B = 22;
   const charts = () => {
     get("charts").replaceChildren(...clip.curves.map((curve) => {
@@ -62,7 +64,10 @@
       shown.forEach((line, k) => {
         let path = "", pen = "M";
         line.forEach((v, i) => { if (v === null) { pen = "M"; return; } path += pen + x(i).toFixed(1) + " " + y(v).toFixed(1); pen = "L"; });
-        if (path) svg.append(node("path", { d: path, stroke: `var(--variant-${k % 8})`, "stroke-dasharray": k >= 16 ? "1 2" : k >= 8 ? "5 3" : "none" }));
+        if (!path) return;
+        const made = node("path", { d: path, "data-arm": k, stroke: `var(--variant-${k % 8})`, "stroke-dasharray": DASHES[Math.floor(k / 8) % DASHES.length] });
+        made.append(node("title", {}, arms[k].querySelector(".toggle").textContent));
+        svg.append(made);
       });
       svg.append(node("line", { class: "at", y1: T, y2: H - B, "data-left": L, "data-step": step }));
       svg.addEventListener("click", (event) => {
@@ -73,6 +78,16 @@
       figure.className = "card"; caption.textContent = curve.title; figure.append(caption, svg);
       return figure;
     }));
+  };
+
+  const point = (k) => {  // one arm's curves before all others; null: none
+    get("charts").querySelectorAll("svg").forEach((svg) => svg.classList.toggle("pointed", k !== null && svg.querySelector(`path[data-arm="${k}"]`) !== null));
+    get("charts").querySelectorAll("path").forEach((path) => path.classList.toggle("of", Number(path.dataset.arm) === k && k !== null));
+  };
+  const show = (k, shown) => {
+    shown ? hidden.delete(k) : hidden.add(k);
+    arms[k].classList.toggle("off", !shown);
+    arms[k].querySelector(".toggle").setAttribute("aria-pressed", String(shown));
   };
 
   const go = (frame) => { slider.value = Math.max(0, Math.min(clip.frames - 1, frame)); draw(); };
@@ -95,12 +110,14 @@
   play.addEventListener("click", () => (timer ? stop() : start()));
   get("rate").addEventListener("change", () => { if (timer) { stop(); start(); } });
   document.querySelectorAll("[data-clip]").forEach((b) => b.addEventListener("click", () => choose(Number(b.dataset.clip))));
-  arms.forEach((figure, k) => figure.querySelector(".toggle").addEventListener("click", (event) => {
-    hidden.has(k) ? hidden.delete(k) : hidden.add(k);
-    figure.classList.toggle("off", hidden.has(k));
-    event.currentTarget.setAttribute("aria-pressed", String(!hidden.has(k)));
-    charts(); draw();
-  }));
+  arms.forEach((figure, k) => {
+    figure.querySelector(".toggle").addEventListener("click", () => { show(k, hidden.has(k)); charts(); draw(); });
+    figure.addEventListener("pointerenter", () => point(k));
+    figure.addEventListener("pointerleave", () => point(null));
+    figure.addEventListener("focusin", () => point(k));
+    figure.addEventListener("focusout", () => point(null));
+  });
+  get("all").addEventListener("click", () => { const shown = hidden.size > 0; arms.forEach((_, k) => show(k, shown)); charts(); draw(); });
   document.addEventListener("keydown", (event) => {
     if (event.target.matches("select, input[type=range]") && event.key !== " ") return;
     const moves = { ArrowLeft: -1, ArrowRight: 1 };
