@@ -75,7 +75,7 @@ def difference_text(found: Difference) -> str:
     if found.low is not None and found.high is not None:
         text += f" ± {(found.high - found.low) / 2 * scale:.{digits}f}"
     elif found.p_value is not None:
-        text += f" (p {found.p_value:.3f})"
+        text += f" (p {found.p_value:.2g})"
     return f"**{text}**" if found.favours else text
 
 
@@ -114,7 +114,7 @@ def _tally(one: Judged) -> str:
 def _sentence(result: Result) -> str:
     contest = result.contest
     assert result.difference is not None
-    corrected = f", corrected p {result.refutes:.3f}" if result.outcome == "against" and result.refutes is not None else ""
+    corrected = f", corrected p {result.refutes:.2g}" if result.outcome == "against" and result.refutes is not None else ""
     return f"{contest.protocol}, `{contest.metric}`: {contest.first} minus {contest.second} {difference_text(result.difference)}{corrected}"
 
 
