@@ -201,7 +201,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
 
 
 def _equal_time(run: PaperRun, folder: Path, found: Sequence[Variant], told: Told, out: Compared) -> EqualTime:
-    """Measure the arms of equal core-minutes on the clips of the others; render, shipped fixers and arms that took as long are measured."""
+    """Measure the arms of equal core-minutes on the clips of the others; the others' values are those measured there."""
     arms, second = tuple(arm for arm in found if arm.label != APPEARANCE), Compared()
     taken = within_budget([one for one in out.training if one.arm != APPEARANCE], folder)
     same = {RAW, *SHIPPED, *(one.arm for one in taken)}

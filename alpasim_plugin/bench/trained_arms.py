@@ -10,10 +10,9 @@ from alpasim_plugin.reading import parsing, read_json_object
 from alpasim_plugin.training.arms.run import PLAN_FILE, arms_of, minutes_of
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.training.snapshots import core_seconds
-from evaluators.paper.training import TrainedArm
+from evaluators.paper.training import WITHIN, TrainedArm
 
 DOING = "reading how an arm was trained"
-WITHIN = 0.1  # of the core-minutes of a budget
 DO = "train the arms again with 'simrun train arms'"
 
 

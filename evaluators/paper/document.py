@@ -15,7 +15,7 @@ from evaluators.paper.measured import Measured
 from evaluators.paper.position import DRIFTING, by_position, distance_by_position, drift, with_half
 from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
-from evaluators.paper.training import TrainedArm, training_section
+from evaluators.paper.training import WITHIN, TrainedArm, training_section
 from evaluators.paper.transfer import transfer_section
 from evaluators.paper.verdict import in_both, judge_claims
 from evaluators.video.charts import plot_by_frame
@@ -42,7 +42,7 @@ TABLES = (  # protocol, table of the paper, heading
 )
 EQUAL_TIME = """Every arm has the same processor time instead of the paper's updates; clips, noise and judges are the same.
 """
-TAKEN = """With the paper's updates these arms took this time already, within 10 %, and their weights stand here too: {}.
+TAKEN = """With the paper's updates these arms took this time already, within {:.0f} %, and their weights stand here too: {}.
 """
 BOTH = """A claim holds if it holds under both budgets, and does not if it does not under one. What was measured under one alone counts for
 both.
@@ -136,7 +136,7 @@ def _tables(published: Published, measured: Mapping[str, Measured], tables: Sequ
 
 def _equal_time(published: Published, found: EqualTime) -> str:
     tables = [table for table in TABLES if table[0] in found.measured]
-    taken = TAKEN.format(", ".join(f"`{arm}`" for arm in found.taken)) if found.taken else ""
+    taken = TAKEN.format(100 * WITHIN, ", ".join(f"`{arm}`" for arm in found.taken)) if found.taken else ""
     return "\n".join((EQUAL_TIME + taken, training_section(found.training), *_tables(published, found.measured, tables, "###")))
 
 

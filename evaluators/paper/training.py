@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from evaluators.paper.tables import markdown_table
 
+WITHIN = 0.1  # of a budget's core-minutes: a training that took so long needs no second one
 HOW = """A stage that several arms have counts for each; the initial networks, which all share, do not count. Core-minutes are processor
 time of the updates on one machine, without the candidates of a sweep, whose `perceptual-syn` on `val` is in brackets.
 """
