@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from alpasim_plugin.bench.quality import Variant
@@ -11,7 +11,9 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.parts import resolve
+from alpasim_plugin.reading import parsing, read_json_object
 from alpasim_plugin.training.arms.run import arms_of
+from alpasim_plugin.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.training.snapshots import core_seconds, snapshots_of
 from evaluators.paper.claims import DISTILLED, OURS
@@ -23,38 +25,60 @@ CLIPS, FRAMES = 8, 93  # the paper's clips are the length of its training clips
 ARMS = (OURS, *DISTILLED)
 
 
-def cost_curves(arms: Path) -> tuple[list[Curve], list[Variant]]:
+def cost_curves(folders: Sequence[Path]) -> tuple[list[Curve], list[Variant]]:
     """Return the curve of each arm that was trained, and the snapshots to measure, each once.
 
     The snapshots of a stage that is no causal generator of short blocks, such as a teacher, are left out; its time counts.
 
+    Args:
+        folders: Of trained arms, each with a seed of its own; claims are judged by the first.
+
     Raises:
-        InputError: None of the arms was trained, or one without snapshots or processor times.
+        InputError: A folder without any of the arms, an arm twice with one seed, or one without snapshots or processor times.
     """
-    trained = arms_of(arms)
-    curves, variants = [], dict[str, Variant]()
-    for arm in (arm for arm in ARMS if arm in trained):
-        points, ends, before_s = list[Point](), dict[str, float](), 0.0
-        for stage in trained[arm]:
-            for label, variant, step, core_s in _snapshots(arms, stage):
-                points.append(Point(stage, step, (before_s + core_s) / 60, label))
-                variants[label] = variant
-            before_s += core_seconds(arms / stage)[-1]
-            ends[stage] = before_s / 60
-        curves.append(Curve(arm, tuple(points), ends))
-    if not curves:
-        found = f"none of {', '.join(ARMS)}"
-        raise InputError(DOING, str(arms), found, "train them: 'simrun train arms --only V9,self-forcing,one-forcing'")
+    curves, variants = list[Curve](), dict[str, Variant]()
+    for arms in folders:
+        trained = arms_of(arms)
+        chosen = [arm for arm in ARMS if arm in trained]
+        if not chosen:
+            found = f"none of {', '.join(ARMS)}"
+            raise InputError(DOING, str(arms), found, "train them: 'simrun train arms --only V9,self-forcing,one-forcing'")
+        for arm in chosen:
+            seed = _seed(arms / arm)
+            if any((curve.arm, curve.seed) == (arm, seed) for curve in curves):
+                found = f"{arm} of seed {seed}, which another folder has too"
+                raise InputError(DOING, str(arms), found, "train it with another --seed, or name one of the folders")
+            curve, snapshots = _curve(arms, arm, trained[arm], seed, "" if arms == folders[0] else f", seed {seed}")
+            curves.append(curve)
+            variants |= snapshots
     return curves, list(variants.values())
 
 
-def _snapshots(arms: Path, stage: str) -> Iterator[tuple[str, Variant, int, float]]:
+def _seed(training: Path) -> int:
+    path, do = (training / BUNDLE_FILE).with_suffix(".card.json"), "train the arm again with 'simrun train arms'"
+    card = read_json_object(path, DOING, do_this=do)
+    with parsing(DOING, path, do, "no card of a training"):
+        return int(card["training"]["batches"]["seed"])
+
+
+def _curve(arms: Path, arm: str, stages: Sequence[str], seed: int, suffix: str) -> tuple[Curve, dict[str, Variant]]:
+    points, variants, ends, before_s = list[Point](), dict[str, Variant](), dict[str, float](), 0.0
+    for stage in stages:
+        for label, variant, step, core_s in _snapshots(arms, stage, suffix):
+            points.append(Point(stage, step, (before_s + core_s) / 60, label))
+            variants[label] = variant
+        before_s += core_seconds(arms / stage)[-1]
+        ends[stage] = before_s / 60
+    return Curve(arm, tuple(points), ends, seed), variants
+
+
+def _snapshots(arms: Path, stage: str, suffix: str) -> Iterator[tuple[str, Variant, int, float]]:
     for snapshot in snapshots_of(arms / stage):
         name, overrides = bundle_fixer(snapshot.path)
         spec = resolve("fixer", name, overrides)
         if isinstance(spec.settings, OneFixerSettings) and spec.settings.history != "finalise":
             return  # a bidirectional network: the clip is one block
-        label = f"{stage.replace('/', ' ')} after {snapshot.step}"
+        label = f"{stage.replace('/', ' ')} after {snapshot.step}{suffix}"
         yield label, Variant(label, spec), snapshot.step, snapshot.core_s
 
 

@@ -79,6 +79,7 @@ class PaperRun:
         map_clips: Clips of the protocol ``map-error``.
         transfer: What the protocol ``transfer`` is measured on; None: it is not.
         equal_time: Folder like ``arms`` of the arms trained with equal core-minutes; None: that budget is not measured.
+        other_seeds: Folders like ``arms`` of the same arms trained with other seeds, for the protocol ``cost``.
     """
 
     pairs: Path
@@ -98,6 +99,7 @@ class PaperRun:
     protocols: tuple[str, ...] = ("cycle", "under-trained", "map-error", "closed-loop", "memory", "transfer", "appearance")
     transfer: TransferData | None = None
     equal_time: Path | None = None
+    other_seeds: tuple[Path, ...] = ()
 
 
 @dataclass
@@ -184,7 +186,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     if "memory" in run.protocols:
         out.memory = training_memory(run.out / "memory.json")
     if "cost" in run.protocols:
-        curves, snapshots = cost_curves(run.arms)
+        curves, snapshots = cost_curves((run.arms, *run.other_seeds))
         clips, frames, about = cost_clips(run.pairs, run.clips, run.frames)
         _open_loop(replace(run, frames=frames), "cost", clips, snapshots, frozenset(), told, out)
         out.cost = Cost(tuple(curves), out.measured["cost"], about)

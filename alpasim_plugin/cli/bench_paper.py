@@ -41,6 +41,8 @@ Examples:
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --equal-time runs/arms-60 --judges 0,1 --out runs/paper`
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --only cost --judges 0 --out runs/cost`
+
+- `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --other-seed runs/arms-seed1 --only cost --judges 0 --out runs/cost`
 """
 
 
@@ -57,6 +59,10 @@ def paper(
     equal_time: Annotated[
         Path | None,
         typer.Option("--equal-time", help="Folder like --arms of the arms trained with --budget minutes: both budgets' verdicts."),
+    ] = None,
+    other_seeds: Annotated[
+        list[Path] | None,
+        typer.Option("--other-seed", help="Folder like --arms trained with another --seed, for --only cost; may be repeated."),
     ] = None,
     transfer: Annotated[
         Path | None, typer.Option("--transfer", help="Pairs beyond driving, for the table of the transfer (docs/pairs.md).")
@@ -93,6 +99,7 @@ def paper(
     run = PaperRun(
         data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
         None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames), equal_time,
+        tuple(other_seeds or ()),
     )  # fmt: skip
     why = {} if reasons is None else read_reasons(reasons)  # before hours of measuring
     console = Console(stderr=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 
 from evaluators.judges.facts import FD_16, FVMD_LK
 from evaluators.metrics import info
-from evaluators.paper.claims import OURS, within
+from evaluators.paper.claims import CLAIMS, OURS, within
 from evaluators.paper.measured import Measured
-from evaluators.paper.tables import ARROWS, SET_DIGITS, markdown_table
+from evaluators.paper.tables import ARROWS, SET_DIGITS, difference_text, markdown_table
+from evaluators.paper.verdict import contest_results
 from evaluators.video.table import DIGITS
 
 METRICS = (FD_16, FVMD_LK, "psnr_db", "perceptual-syn")
@@ -21,7 +22,9 @@ COLUMNS, DPI = 2, 110
 COLOURS = {OURS: "C3", "self-forcing": "C0", "one-forcing": "C2"}
 HOW = """Core-minutes are processor time of the updates alone, all stages of an arm in turn, a shared one counted for each; the initial
 networks and the evaluation do not count. A distilled arm's teacher is no causal network: its time counts, and the arm's curve begins with
-the student's first snapshot; curves of arms with that stage in common coincide there. One seed."""
+the student's first snapshot; curves of arms with that stage in common coincide there."""
+BY_SEED = """What the claims compare, in every seed of the trainings; the verdict is of the first. All seeds start from the same initial
+networks."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,13 @@ class Curve:
         arm: Which.
         points: Measured snapshots; the last one is the arm.
         ends: Core-minutes at the end of each stage, by training.
+        seed: Of the training.
     """
 
     arm: str
     points: tuple[Point, ...]
     ends: Mapping[str, float]
+    seed: int = 0
 
     @property
     def core_minutes(self) -> float:
@@ -70,7 +75,7 @@ class Cost:
     """What was measured of training times.
 
     Args:
-        curves: Of the arms.
+        curves: Of the arms, those of the first seed before others.
         measured: By labels of their points.
         about: What the clips are.
     """
@@ -80,15 +85,26 @@ class Cost:
     about: str
 
     @property
+    def seeds(self) -> list[int]:
+        """Seeds of the trainings, the one by which claims are judged first."""
+        return list(dict.fromkeys(curve.seed for curve in self.curves))
+
+    @property
     def metrics(self) -> list[str]:
         """Metrics that any point has."""
         labels = [point.label for curve in self.curves for point in curve.points]
         return [metric for metric in METRICS if any(self.measured.has(label, metric) for label in labels)]
 
 
-def contested(cost: Cost) -> Measured:
-    """Return the measurements by names that claims use: every arm at its end, and ours in half of each other arm's time."""
-    curves, measured = cost.curves, cost.measured
+def contested(cost: Cost, seed: int | None = None) -> Measured:
+    """Return the measurements by names that claims use: every arm at its end, and ours in half of each other arm's time.
+
+    Args:
+        cost: What was measured.
+        seed: Of the trainings; None: the first.
+    """
+    chosen = cost.seeds[0] if seed is None else seed
+    curves, measured = [curve for curve in cost.curves if curve.seed == chosen], cost.measured
     labels = {curve.arm: curve.points[-1].label for curve in curves}
     ours = next((curve for curve in curves if curve.arm == OURS), None)
     for curve in curves:
@@ -112,25 +128,43 @@ def cost_section(cost: Cost, figure: str) -> str:
     for curve in curves:
         for point in curve.points:
             values = [_value(measured, point.label, metric) for metric in shown]
-            rows.append([curve.arm, point.stage, str(point.updates), _minutes(point.core_minutes), *values])
-    head = ["arm", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[info(m).direction]}" for m in shown)]
-    ends = "".join(f"- {curve.arm}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves)
+            rows.append([curve.arm, str(curve.seed), point.stage, str(point.updates), _minutes(point.core_minutes), *values])
+    head = ["arm", "seed", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[info(m).direction]}" for m in shown)]
+    named = {id(curve): curve.arm if len(cost.seeds) == 1 else f"{curve.arm}, seed {curve.seed}" for curve in curves}
+    ends = "".join(
+        f"- {named[id(curve)]}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves
+    )
     return (
         f"{HOW}\n\n{cost.about}\n\n![Quality against core-minutes, borders of stages dashed]({figure})\n\n"
-        f"Ends of stages, core-minutes:\n\n{ends}\n{markdown_table(head, rows)}\n{_halves(curves)}"
+        f"Ends of stages, core-minutes:\n\n{ends}\n{markdown_table(head, rows)}\n{_halves(cost)}{_by_seed(cost)}"
     )
 
 
-def _halves(curves: Sequence[Curve]) -> str:
-    ours = next((curve for curve in curves if curve.arm == OURS), None)
+def _halves(cost: Cost) -> str:
     lines = []
-    for curve in curves:
+    for curve in cost.curves:
+        ours = next((other for other in cost.curves if (other.arm, other.seed) == (OURS, curve.seed)), None)
         if ours is None or curve is ours:
             continue
         point, half = ours.at(curve.core_minutes / 2), curve.core_minutes / 2
         found = "no snapshot" if point is None else f"the snapshot of {point.updates} updates, {_minutes(point.core_minutes)}"
-        lines.append(f"- Within half of the core-minutes of {curve.arm} ({_minutes(half)}), {OURS} has {found}.\n")
+        of_seed = "" if len(cost.seeds) == 1 else f", seed {curve.seed}"
+        lines.append(f"- Within half of the core-minutes of {curve.arm}{of_seed} ({_minutes(half)}), {OURS} has {found}.\n")
     return "".join(lines)
+
+
+def _by_seed(cost: Cost) -> str:
+    """Return the claims' contests of training time in every seed; empty where there is one seed."""
+    if len(cost.seeds) == 1:
+        return ""
+    contests = [contest for claim in CLAIMS for contest in claim.contests if contest.protocol == "cost"]
+    found = [contest_results(contests, {"cost": contested(cost, seed)}) for seed in cost.seeds]
+    rows = []
+    for i, contest in enumerate(contests):
+        results = [each[i] for each in found]
+        cells = [r.missing if r.difference is None else f"{difference_text(r.difference)}: {r.outcome}" for r in results]
+        rows.append([f"`{contest.metric}`: {contest.first} minus {contest.second}", *cells])
+    return f"\n{BY_SEED}\n\n" + markdown_table(["contest", *(f"seed {seed}" for seed in cost.seeds)], rows)
 
 
 def _minutes(value: float) -> str:
@@ -157,8 +191,11 @@ def plot_cost(cost: Cost, path: Path) -> None:
             colour = COLOURS.get(curve.arm, f"C{i + 4}")
             x = [point.core_minutes for point in curve.points if measured.has(point.label, metric)]
             y = [measured.mean(point.label, metric).centre for point in curve.points if measured.has(point.label, metric)]
-            ax.plot(x, y, marker="o", markersize=3.5, color=colour, label=curve.arm, linewidth=1.6)
-            for end in list(curve.ends.values())[:-1]:
+            first = curve.seed == cost.seeds[0]
+            label = curve.arm if len(cost.seeds) == 1 else f"{curve.arm}, seed {curve.seed}"
+            how = {"marker": "o", "linewidth": 1.6} if first else {"marker": "s", "linewidth": 1.0, "alpha": 0.55}
+            ax.plot(x, y, markersize=3.5, color=colour, label=label, **how)
+            for end in list(curve.ends.values())[:-1] if first else ():
                 ax.axvline(end, color=colour, linestyle="--", linewidth=0.9, alpha=0.5)
         ax.set_xlim(left=0)
         ax.set_xlabel("core-minutes")

@@ -70,8 +70,18 @@ def in_both(first: Verdict, second: Verdict) -> Verdict:
     return "holds"
 
 
+def contest_results(contests: Sequence[Contest], measured: Mapping[str, Measured]) -> list[Result]:
+    """Return every contest with its outcome, uncorrected for their number.
+
+    Args:
+        contests: In any order.
+        measured: PROTOCOL -> what was measured under it.
+    """
+    return [_result(contest, measured.get(contest.protocol)) for contest in contests]
+
+
 def _judged(claim: Claim, measured: Mapping[str, Measured]) -> Judged:
-    found = [_result(contest, measured.get(contest.protocol)) for contest in claim.contests]
+    found = contest_results(claim.contests, measured)
     against = [None if r.difference is None else _p_against(r.contest, r.difference, measured[r.contest.protocol]) for r in found]
     results = tuple(replace(result, refutes=p) for result, p in zip(found, holm(against), strict=True))
     outcomes = {result.outcome for result in results}

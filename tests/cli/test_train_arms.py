@@ -62,7 +62,7 @@ def test_arms_share_a_stage_resume_and_are_measured_against_their_time(data: Pat
     assert run_command([*train, "--lr", "1e-3"]) == 2
     assert "it was begun as" in capsys.readouterr().err
 
-    (curve,), variants = cost_curves(out)
+    (curve,), variants = cost_curves([out])
     before = core_seconds(out / "self-forcing" / "teacher")[-1] / 60
     assert [point.stage for point in curve.points] == ["omnidreams"] * 2 + ["self-forcing"] * 2, "the teacher's time counts alone"
     assert before < curve.points[0].core_minutes < curve.core_minutes == pytest.approx(rows["self-forcing"]["core_minutes"])
@@ -72,7 +72,7 @@ def test_arms_share_a_stage_resume_and_are_measured_against_their_time(data: Pat
     assert run_command(measure) == 0
     text = (data / "cost" / "paper.md").read_text()
     assert "9 frames each (the shortest clip has no more" in text
-    assert "| self-forcing | omnidreams | 1 |" in text
+    assert "| self-forcing | 0 | omnidreams | 1 |" in text
     assert (data / "cost" / "cost.png").stat().st_size > 10_000
 
 

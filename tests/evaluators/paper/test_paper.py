@@ -12,7 +12,7 @@ import scipy.stats
 from alpasim_plugin.errors import EvaluatorError, InputError
 from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import CLAIMS, Claim, Contest, within
-from evaluators.paper.cost import Cost, Curve, Point, contested, cost_section
+from evaluators.paper.cost import Cost, Curve, Point, contested, cost_section, plot_cost
 from evaluators.paper.document import EqualTime, Findings, document, draw_figures
 from evaluators.paper.measured import Measured, from_rows
 from evaluators.paper.page import ShownClip, render_side_by_side
@@ -322,6 +322,28 @@ def test_training_time_is_compared_at_our_last_snapshot_within_half_of_the_other
     assert "self-forcing (2.5), V9 has the snapshot of 2 updates, 2." in text
     assert "one-forcing (0.75), V9 has no snapshot." in text
     assert "- self-forcing: teacher to 2, omnidreams to 3, self-forcing to 5" in text
+    assert "seed 0" not in text
+
+
+def test_training_time_of_two_seeds_is_compared_in_each(tmp_path: Path) -> None:
+    def curves(seed: int) -> tuple[Curve, ...]:
+        ours = Curve("V9", tuple(Point("V9", i, float(i), f"V9 {i}, {seed}") for i in (1, 2)), {"V9": 2.0}, seed)
+        dmd = (Point("self-forcing", 1, 5.0, f"dmd, {seed}"),)
+        return ours, Curve("self-forcing", dmd, {"self-forcing": 5.0}, seed)
+
+    labels = [point.label for seed in (3, 7) for curve in curves(seed) for point in curve.points]
+    shifts = {label: i / 10 for i, label in enumerate(labels)}
+    shifts["dmd, 7"] = -1.0
+    cost = Cost((*curves(3), *curves(7)), arms(**shifts), "12 clips.")
+    assert contested(cost).values == contested(cost, 3).values
+    gain = [contested(cost, seed).difference("psnr_db", "V9", "self-forcing").difference for seed in (3, 7)]
+    assert gain[0] < 0 < gain[1], "each seed's own arms"
+    text = cost_section(cost, "cost.png")
+    assert "- self-forcing, seed 7: self-forcing to 5" in text
+    assert "core-minutes of self-forcing, seed 7 (2.5), V9 has the snapshot of 2 updates" in text
+    assert "| contest | seed 3 | seed 7 |" in text
+    plot_cost(cost, tmp_path / "cost.png")
+    assert (tmp_path / "cost.png").stat().st_size > 10_000
 
 
 def test_a_page_holds_every_frame_and_refuses_films_of_other_lengths() -> None:
