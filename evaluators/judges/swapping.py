@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64
+from alpasim_plugin.types import F64, Bool
 from evaluators.judges.frechet import check_features, frechet_distance, moments
 
 AS_EXTREME = 20  # swaps as extreme as the measured difference after which no more are drawn
@@ -27,7 +28,7 @@ class SwapTest:
     Args:
         difference: First minus second; negative: the first is closer.
         p_value: Two-sided, over swaps of whole clips.
-        swaps: How many were drawn.
+        swaps: How many were drawn, or all that there are.
     """
 
     difference: float
@@ -38,12 +39,14 @@ class SwapTest:
 def swap_test(first: Sequence[F64], second: Sequence[F64], reference: Sequence[F64], swaps: int = 500, seed: int = 0) -> SwapTest:
     """Test whether two variants of the same clips are equally far from the reference.
 
-    Under the null hypothesis a clip's two versions are exchangeable, so every clip is swapped with probability one half. The draws end
-    early once `AS_EXTREME` of them are as extreme; the p-value is then their share (Besag and Clifford, Biometrika 1991).
+    Under the null hypothesis a clip's two versions are exchangeable, so every clip is swapped with probability one half. Of few clips
+    all swaps are taken, and the test is exact: ``2 ** (n - 1)`` of them, as the difference of a swap and of its opposite differ in sign
+    alone. Of more clips swaps are drawn, which ends early once `AS_EXTREME` of them are as extreme; the p-value is then their share
+    (Besag and Clifford, Biometrika 1991).
 
     Args:
         first, second, reference: Features ``(n_i, d)`` of every clip, in one order.
-        swaps: Most draws; no p-value is below ``1 / (swaps + 1)``.
+        swaps: Most swaps; no p-value is below ``1 / (swaps + 1)``, or ``2 / 2 ** n`` where all are taken.
         seed: Of the draws.
 
     Raises:
@@ -58,11 +61,17 @@ def swap_test(first: Sequence[F64], second: Sequence[F64], reference: Sequence[F
     distances = SubsetDistances([*first, *second], truth)
     clips = np.arange(n)
     bound = abs(distances(clips) - distances(clips + n)) - distances.rounding
+
+    def as_extreme(swapped: Bool) -> bool:
+        return abs(distances(clips + n * swapped) - distances(clips + n * ~swapped)) >= bound
+
+    if 2 ** (n - 1) <= swaps:
+        every = [as_extreme(np.array((False, *others))) for others in product((False, True), repeat=n - 1)]
+        return SwapTest(measured, sum(every) / len(every), len(every))
     rng = stream("judges", seed, "frechet.swap")
     extreme = 0
     for drawn in range(1, swaps + 1):
-        swapped = rng.random(n) < 0.5
-        extreme += abs(distances(clips + n * swapped) - distances(clips + n * ~swapped)) >= bound
+        extreme += as_extreme(rng.random(n) < 0.5)
         if extreme == AS_EXTREME:
             return SwapTest(measured, extreme / drawn, drawn)
     return SwapTest(measured, (extreme + 1) / (swaps + 1), swaps)

@@ -12,7 +12,7 @@ from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import OURS
 from evaluators.paper.cost import Cost, cost_section, plot_cost
 from evaluators.paper.measured import Measured
-from evaluators.paper.position import DRIFTING, by_position, distance_by_position, drift, with_half
+from evaluators.paper.position import DRAWN, DRIFTING, by_position, distance_by_position, drift, with_half
 from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours, verdicts
 from evaluators.paper.training import WITHIN, TrainedArm, training_section
@@ -158,8 +158,8 @@ def draw_figures(found: Findings, folder: Path) -> None:
         wrong_map.plot(*found.shifted, folder / WRONG_MAP)
     if found.cost is not None:
         plot_cost(found.cost, folder / COST)
-    for name, protocol, arms in ((POSITION, "under-trained", None), (DRIFT, "cycle", DRIFTING)):
-        shown = [row for row in found.rows.get(protocol, ()) if arms is None or row["arm"] in arms]
+    for name, protocol, arms in ((POSITION, "under-trained", DRAWN), (DRIFT, "cycle", DRIFTING)):
+        shown = [row for row in found.rows.get(protocol, ()) if row["arm"] in arms]
         if shown:
             plot_by_frame(summarise(shown, BASELINE), folder / name)
 
@@ -175,12 +175,7 @@ def _of_table(measured: Measured, rows: Mapping[str, Any]) -> Measured:
     always = {measured.reference, "3dgs", "onefixer", "onefixer-dit-tiny"}
     is_variant = {arm: arm.startswith("V") for arm in measured.values}
     kept = [arm for arm in measured.values if arm in rows or arm in always or is_variant[arm] == ablation]
-    return Measured(
-        {arm: measured.values[arm] for arm in kept},
-        {arm: measured.features[arm] for arm in kept if arm in measured.features},
-        measured.reference,
-        measured.seed,
-    )
+    return measured.only(kept)
 
 
 def _counts(measured: Measured) -> str:

@@ -14,11 +14,11 @@ from alpasim_plugin.errors import EvaluatorError
 from alpasim_plugin.types import F64
 from evaluators.aggregate.intervals import Interval, t_interval
 from evaluators.judges.frechet import frechet_distance
-from evaluators.judges.swapping import swap_test
+from evaluators.judges.swapping import SwapTest, swap_test
 from evaluators.metrics import info
 
 ALPHA = 0.05
-SWAPS = 2000  # of whole clips; no p-value is below 1 / (SWAPS + 1)
+SWAPS = 2000  # of whole clips, where not all of them are taken; no p-value is below 1 / (SWAPS + 1)
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]  # ARM -> CLIP -> METRIC -> value
 Features = Mapping[str, Mapping[str, Mapping[str, F64]]]  # ARM -> CLIP -> METRIC -> vectors (n, d)
 
@@ -60,6 +60,14 @@ class Measured:
 
     def __init__(self, values: Values, features: Features | None = None, reference: str = "truth", seed: int = 0) -> None:
         self.values, self.features, self.reference, self.seed = values, features or {}, reference, seed
+        self._tests: dict[tuple[str, str, str], SwapTest] = {}
+
+    def only(self, arms: Sequence[str]) -> Measured:
+        """Return the measurements of some of the arms, in this order, beside the clean frames; tests that were made are not made again."""
+        features = {arm: self.features[arm] for arm in dict.fromkeys((*arms, self.reference)) if arm in self.features}
+        chosen = Measured({arm: self.values[arm] for arm in arms}, features, self.reference, self.seed)
+        chosen._tests = self._tests
+        return chosen
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -103,17 +111,24 @@ class Measured:
         clips = self._shared(metric, first, second)
         better = {"higher": 1, "lower": -1}.get(info(metric).direction, 0)
         if metric in self.set_metrics:
-            a, true = self._sides(metric, clips, first)
-            b, _ = self._sides(metric, clips, second)
-            test = swap_test(a, b, true, SWAPS, self.seed)
-            favours = better * int(np.sign(test.difference)) if test.p_value < ALPHA else 0
-            return Difference(metric, first, second, test.difference, None, None, test.p_value, len(clips), favours)
+            test = self._swap_test(metric, clips, *sorted((first, second)))
+            difference = test.difference if first <= second else -test.difference
+            favours = better * int(np.sign(difference)) if test.p_value < ALPHA else 0
+            return Difference(metric, first, second, difference, None, None, test.p_value, len(clips), favours)
         found = t_interval([self.values[first][clip][metric] - self.values[second][clip][metric] for clip in clips], "clips")
         favours = 0
         if found.low is not None and found.high is not None and not found.low <= 0.0 <= found.high:
             favours = better * int(np.sign(found.centre))
         p_value = beyond(found, 0.0, len(clips))
         return Difference(metric, first, second, found.centre, found.low, found.high, p_value, len(clips), favours)
+
+    def _swap_test(self, metric: str, clips: Sequence[str], first: str, second: str) -> SwapTest:
+        """Return the test of two arms, made once: tables and verdicts ask for the same ones, in either order."""
+        if (metric, first, second) not in self._tests:
+            a, true = self._sides(metric, clips, first)
+            b, _ = self._sides(metric, clips, second)
+            self._tests[metric, first, second] = swap_test(a, b, true, SWAPS, self.seed)
+        return self._tests[metric, first, second]
 
     def margin(self, metric: str, arm: str, bound: float) -> Difference:
         """Return by how much an arm exceeds a bound on average, as a difference from it.

@@ -17,6 +17,9 @@ from evaluators.video.facts import DRIFT, PSNR
 
 WINDOW = 93  # frames: the length of the paper's training clips
 FEATURE_FRAMES = 16  # of a vector of `fd_syn_16`, one after the other
+DRAWN = (  # by position: more curves cannot be told apart
+    "3dgs", "onefixer", "onefixer-dit-tiny", "V9", "V5", "difix", "harmonizer-temporal", "artifixer", "omnidreams@1", "self-forcing",
+)  # fmt: skip
 DRIFTING = ("3dgs", "harmonizer", "harmonizer-temporal", "harmonizer-temporal-teacher", "V9")
 DRIFT_WINDOW = 33  # frames: a sixth of the paper's 198
 HOW_DRIFT = """The temporal Harmonizer sees its own last four outputs. `harmonizer-temporal` was trained on its own outputs,

@@ -19,13 +19,15 @@ MARKERS = ("o", "s", "D", "^", "v", "P", "X", "p")
 COLUMNS = 2
 DPI = 110
 LEAST_BANDED = 5  # clips; the intervals of fewer hide the curves
+MOST_BANDED = 8  # variants, beside the clean frames; the bands of more do
 
 
 def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
-    """Draw every metric's mean over clips in windows of frames, with its 95 % band, and write a PNG."""
+    """Draw every metric's mean over clips in windows of frames and write a PNG; few variants have 95 % bands."""
     by_frame = summary["by_frame"]
     metrics = [m for m in FACTS if any(m in windows for windows in by_frame.values())]
     figure, panels = _panels(len(metrics))
+    banded = len([variant for variant in by_frame if variant != TRUTH]) <= MOST_BANDED
     for ax, metric in zip(panels, metrics, strict=True):
         for variant, colour, dash in _styles(summary):
             windows = by_frame[variant].get(metric)
@@ -33,7 +35,7 @@ def plot_by_frame(summary: Mapping[str, Any], path: str | Path) -> None:
                 continue
             x = [(a + b) / 2 for a, b in zip(windows["first"], windows["last"], strict=True)]
             ax.plot(x, windows["mean"], color=colour, linestyle=dash, label=variant, linewidth=1.6)
-            if summary["clips"][variant] >= LEAST_BANDED:
+            if banded and summary["clips"][variant] >= LEAST_BANDED:
                 ax.fill_between(x, windows["low"], windows["high"], color=colour, alpha=0.13, linewidth=0)
         ax.set_xlabel("frame")
         _finish(ax, metric)

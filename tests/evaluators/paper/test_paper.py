@@ -10,6 +10,7 @@ import pytest
 import scipy.stats
 
 from alpasim_plugin.errors import EvaluatorError, InputError
+from evaluators.judges.swapping import swap_test
 from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import CLAIMS, Claim, Contest, within
 from evaluators.paper.cost import Cost, Curve, Point, contested, cost_section, plot_cost
@@ -344,6 +345,22 @@ def test_training_time_of_two_seeds_is_compared_in_each(tmp_path: Path) -> None:
     assert "| contest | seed 3 | seed 7 |" in text
     plot_cost(cost, tmp_path / "cost.png")
     assert (tmp_path / "cost.png").stat().st_size > 10_000
+
+
+def test_two_arms_are_tested_once_whatever_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    monkeypatch.setattr("evaluators.paper.measured.swap_test", lambda *given: made.append(given) or swap_test(*given))
+    rng = np.random.default_rng(1)
+    features = {
+        arm: {clip: {"fd_syn_clip": rng.normal(size=(3, 2)) + by} for clip in CLIPS[:6]} for arm, by in (("truth", 0), ("b", 0), ("a", 2))
+    }
+    measured = Measured({"a": {}, "b": {}}, features)
+    found, back = measured.difference("fd_syn_clip", "b", "a"), measured.difference("fd_syn_clip", "a", "b")
+    assert found.difference == -back.difference < 0
+    assert (found.favours, back.favours, found.p_value) == (1, -1, back.p_value)
+    assert found.p_value == pytest.approx(2 / 2**6)
+    assert measured.only(["a", "b"]).difference("fd_syn_clip", "a", "b") == back
+    assert len(made) == 1
 
 
 def test_a_page_holds_every_frame_and_refuses_films_of_other_lengths() -> None:
