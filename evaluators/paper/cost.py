@@ -89,6 +89,10 @@ class Cost:
         """Seeds of the trainings, the one by which claims are judged first."""
         return list(dict.fromkeys(curve.seed for curve in self.curves))
 
+    def name(self, curve: Curve) -> str:
+        """Return the arm of a curve, with its seed where there are several."""
+        return curve.arm if len(self.seeds) == 1 else f"{curve.arm}, seed {curve.seed}"
+
     @property
     def metrics(self) -> list[str]:
         """Metrics that any point has."""
@@ -130,9 +134,8 @@ def cost_section(cost: Cost, figure: str) -> str:
             values = [_value(measured, point.label, metric) for metric in shown]
             rows.append([curve.arm, str(curve.seed), point.stage, str(point.updates), _minutes(point.core_minutes), *values])
     head = ["arm", "seed", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[info(m).direction]}" for m in shown)]
-    named = {id(curve): curve.arm if len(cost.seeds) == 1 else f"{curve.arm}, seed {curve.seed}" for curve in curves}
     ends = "".join(
-        f"- {named[id(curve)]}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves
+        f"- {cost.name(curve)}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves
     )
     return (
         f"{HOW}\n\n{cost.about}\n\n![Quality against core-minutes, borders of stages dashed]({figure})\n\n"
@@ -148,8 +151,7 @@ def _halves(cost: Cost) -> str:
             continue
         point, half = ours.at(curve.core_minutes / 2), curve.core_minutes / 2
         found = "no snapshot" if point is None else f"the snapshot of {point.updates} updates, {_minutes(point.core_minutes)}"
-        of_seed = "" if len(cost.seeds) == 1 else f", seed {curve.seed}"
-        lines.append(f"- Within half of the core-minutes of {curve.arm}{of_seed} ({_minutes(half)}), {OURS} has {found}.\n")
+        lines.append(f"- Within half of the core-minutes of {cost.name(curve)} ({_minutes(half)}), {OURS} has {found}.\n")
     return "".join(lines)
 
 
@@ -192,9 +194,8 @@ def plot_cost(cost: Cost, path: Path) -> None:
             x = [point.core_minutes for point in curve.points if measured.has(point.label, metric)]
             y = [measured.mean(point.label, metric).centre for point in curve.points if measured.has(point.label, metric)]
             first = curve.seed == cost.seeds[0]
-            label = curve.arm if len(cost.seeds) == 1 else f"{curve.arm}, seed {curve.seed}"
             how = {"marker": "o", "linewidth": 1.6} if first else {"marker": "s", "linewidth": 1.0, "alpha": 0.55}
-            ax.plot(x, y, markersize=3.5, color=colour, label=label, **how)
+            ax.plot(x, y, markersize=3.5, color=colour, label=cost.name(curve), **how)
             for end in list(curve.ends.values())[:-1] if first else ():
                 ax.axvline(end, color=colour, linestyle="--", linewidth=0.9, alpha=0.5)
         ax.set_xlim(left=0)
