@@ -93,6 +93,10 @@ def paper(
     protocols = tuple(name.strip() for name in only.split(",") if name.strip())
     if unknown := [name for name in protocols if name not in PROTOCOLS]:
         raise InputError(DOING, f"--only {only}", f"unknown: {', '.join(unknown)}", f"choose from {', '.join(PROTOCOLS)}")
+    if other_seeds and "cost" not in protocols:
+        raise InputError(
+            DOING, f"--other-seed {other_seeds[0]}", f"--only {only}", "add the protocol cost to --only, or leave --other-seed out"
+        )
     judging = None
     if judges is not None:
         judging = Judging(tuple(whole_numbers("--judges", judges, 0)), scenes, None, weights_folder(weights), judge_folder)

@@ -12,6 +12,7 @@ from alpasim_plugin.bench.cost import cost_curves
 from alpasim_plugin.cli.arms_tasks import StageTask, chosen_rates, tasks_of
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.train_arms import seconds_left
+from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.training.arms.budget import in_equal_time, related
@@ -67,6 +68,12 @@ def test_arms_share_a_stage_resume_and_are_measured_against_their_time(data: Pat
     assert [point.stage for point in curve.points] == ["omnidreams"] * 2 + ["self-forcing"] * 2, "the teacher's time counts alone"
     assert before < curve.points[0].core_minutes < curve.core_minutes == pytest.approx(rows["self-forcing"]["core_minutes"])
     assert len(variants) == 4
+    with pytest.raises(InputError, match="self-forcing of seed 0, which another folder has too"):
+        cost_curves([out, out])
+    assert (
+        run_command(["bench", "paper", str(data / "pairs"), "--arms", str(out), "--other-seed", str(out), "--out", str(data / "no")]) == 2
+    )
+    assert "add the protocol cost to --only" in capsys.readouterr().err
 
     measure = ["bench", "paper", str(data / "pairs"), "--arms", str(out), "--only", "cost", "--out", str(data / "cost"), "--json"]
     assert run_command(measure) == 0
