@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from alpasim_plugin.atomic import write_json
 from alpasim_plugin.bench.appearance import JUDGE_SEEDS, AppearanceRun, measure_appearance
 from alpasim_plugin.bench.cost import cost_clips, cost_curves
+from alpasim_plugin.bench.drives import read_drives
 from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
@@ -30,6 +30,7 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.parts import resolve
 from alpasim_plugin.reading import read_json_object
 from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.training.pair_store import PairDataset, PairSequence
 from evaluators.paper.appearance import OURS as APPEARANCE
 from evaluators.paper.cost import Cost, contested
@@ -41,7 +42,6 @@ from evaluators.paper.wrong_map import Shift
 from evaluators.video.summary import TRUTH
 
 DOING = "making the paper's comparison"
-BUNDLE = "fixer.safetensors"
 STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
 OURS = "V9"  # the paper's own method on the backbone that the arms share
 SHIPPED = ("onefixer", "onefixer-dit-tiny")  # rows of their own in every table
@@ -69,7 +69,7 @@ class PaperRun:
         out: Folder of the results.
         split: Of the pairs.
         long: Folder of pairs for ``under-trained`` instead, of longer sequences; its cycle renders are left out.
-        drives: Finished run folder of the closed loop; None: that table is not made.
+        drives: Finished run folders of the closed loop; without any that table is not made.
         clips: At most so many clips of a protocol, evenly chosen.
         frames: First frames of a clip; None: as many as in the paper.
         judging: Which judges are asked.
@@ -88,7 +88,7 @@ class PaperRun:
     out: Path
     split: str = "test-known"
     long: Path | None = None
-    drives: Path | None = None
+    drives: tuple[Path, ...] = ()
     clips: int | None = None
     frames: int | None = None
     judging: Judging | None = None
@@ -140,7 +140,7 @@ def arms_in(folder: Path, option: str = "--arms") -> tuple[Variant, ...]:
             DOING, f"{option} {folder}", "no such folder", "train arms into it: 'simrun train arms PAIRS --vae VAE --out ARMS'"
         )
     found: list[Variant] = []
-    for path in sorted(folder.glob(f"*/{BUNDLE}")):
+    for path in sorted(folder.glob(f"*/{BUNDLE_FILE}")):
         name, settings = bundle_fixer(path)
         arm = path.parent.name
         for steps in STEPS.get(arm, (None,)):
@@ -170,6 +170,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
     out.units = {arm.label: unit_of(arm) for arm in arms}
     out.training = trained_arms(run.arms)
     again = () if run.equal_time is None else arms_in(run.equal_time, "--equal-time")  # before hours of measuring
+    driven = read_drives(run.drives, run.arms) if "closed-loop" in run.protocols else {}
     for name in TWICE:
         if name in run.protocols:
             sequences = _sequences(run, name)
@@ -181,8 +182,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         _open_loop(run, "map-error", evenly(_sequences(run, "cycle"), run.map_clips), shown, frozenset(), told, out)
         out.shifted = out.measured["map-error"]
         out.measured["map-error"] = grouped(out.shifted)
-    if "closed-loop" in run.protocols and run.drives is not None:
-        out.measured["closed-loop"] = drives(run.drives)
+    out.measured |= driven
     if "memory" in run.protocols:
         out.memory = training_memory(run.out / "memory.json")
     if "cost" in run.protocols:
@@ -196,7 +196,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
     if run.equal_time is not None:
         out.equal_time = _equal_time(run, run.equal_time, again, told, out)
-    bundle = run.arms / APPEARANCE / BUNDLE
+    bundle = run.arms / APPEARANCE / BUNDLE_FILE
     if "appearance" in run.protocols and bundle.is_file():
         out.measured |= measure_appearance(_appearance(run, bundle, plain), told_clip)
     return out
@@ -310,7 +310,7 @@ def _shifted(arms: Sequence[Variant], folder: Path) -> tuple[Variant, ...]:
     ours = by_name.get(OURS) or by_name[SHIPPED[0]]
     wrong = (replace(ours, label=f"{ours.label} {shift.label}", map_shift=shift) for shift in CONFIGURATIONS)
     lines = (by_name[name] for name in UNCONDITIONED if name in by_name)
-    return (Variant(RAW), *wrong, *([black_map(folder / OURS / BUNDLE)] if OURS in by_name else []), *lines)
+    return (Variant(RAW), *wrong, *([black_map(folder / OURS / BUNDLE_FILE)] if OURS in by_name else []), *lines)
 
 
 def black_map(bundle: Path) -> Variant:
@@ -346,27 +346,6 @@ def grouped(measured: Measured) -> Measured:
 
 def _groups(name: str, shift: MapShift) -> tuple[str, str]:
     return f"{name}, lanes {abs(shift.lanes_left_m):.2f} m aside", f"{name}, boxes {shift.boxes_m:.2f} m aside"
-
-
-def drives(folder: Path) -> Measured:
-    """Return a run of the closed loop as arms and scenes: the mean over seeds of each scene, which is the unit of the intervals.
-
-    Raises:
-        InputError: No finished run.
-    """
-    path = folder / "rollouts.parquet"
-    if not path.is_file():
-        raise InputError(DOING, f"--drives {folder}", "no rollouts.parquet", "name the folder of a finished run")
-    metrics = ("collision_at_fault", "offroad", "route_distance_m")
-    rows = pq.read_table(path).to_pylist()
-    many: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for row in rows:
-        for metric in metrics:
-            if row["status"] == "ok" and row.get(metric) is not None:
-                many.setdefault(row["renderer"], {}).setdefault(row["scene"], {}).setdefault(metric, []).append(float(row[metric]))
-    return Measured(
-        {arm: {s: {m: float(np.mean(v)) for m, v in found.items()} for s, found in scenes.items()} for arm, scenes in many.items()}
-    )
 
 
 def shown_clips(works: Sequence[Work]) -> list[ShownClip]:

@@ -34,7 +34,7 @@ Examples:
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --judges 0,1 --out runs/paper`
 
-- `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --drives runs/drives --only cycle,closed-loop --out runs/paper`
+- `simrun bench paper data/pairs --arms runs/arms --drives runs/learned --drives runs/lane-camera --only closed-loop --out runs/paper`
 
 - `simrun bench paper data/pairs --scenes data/scenes --arms runs/arms --split val --clips 4 --frames 60 --out runs/first-look`
 
@@ -55,7 +55,10 @@ def paper(
     ] = None,
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
     long: Annotated[Path | None, typer.Option("--long", help="Pairs of 900 frames for the second table; else those of DATA.")] = None,
-    drives: Annotated[Path | None, typer.Option("--drives", help="Finished run folder of the closed loop, for the third table.")] = None,
+    drives: Annotated[
+        list[Path] | None,
+        typer.Option("--drives", help="Finished run folder of the closed loop, for the third table; may be repeated, a policy each."),
+    ] = None,
     equal_time: Annotated[
         Path | None,
         typer.Option("--equal-time", help="Folder like --arms of the arms trained with --budget minutes: both budgets' verdicts."),
@@ -101,7 +104,7 @@ def paper(
     if judges is not None:
         judging = Judging(tuple(whole_numbers("--judges", judges, 0)), scenes, None, weights_folder(weights), judge_folder)
     run = PaperRun(
-        data, scenes, arms, out, split, long, drives, clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
+        data, scenes, arms, out, split, long, tuple(drives or ()), clips, frames, judging, jobs, seed, filmed, map_clips, protocols,
         None if transfer is None else TransferData(transfer, transfer_arms, photographs, clips, frames), equal_time,
         tuple(other_seeds or ()),
     )  # fmt: skip

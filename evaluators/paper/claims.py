@@ -26,6 +26,7 @@ LONG_ARMS = tuple(arm for arm in ALL_ARMS if not arm.startswith("artifixer-pre")
 DISTILLED = ("self-forcing", "one-forcing")
 OURS = "V9"  # the paper's own method on the shared backbone
 FD_16 = "fd_syn_16"
+DRIVERS = ("learned", "lane-camera")  # policies that drive behind the arms; the paper's is another one
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Contest:
     """One comparison.
 
     Args:
-        protocol: Which measurements: ``cycle``, ``under-trained``, ``closed-loop``, ``map-error``, ``cost``, ``transfer`` or
-            ``appearance``.
+        protocol: Which measurements: ``cycle``, ``under-trained``, ``map-error``, ``cost``, ``transfer``, ``appearance``, or what
+            `behind` says of a policy in closed loop.
         metric: Ours.
         first, second: Arms.
         relation: ``better``: the paired difference favours the first; ``not better``: it does not; ``close``: its interval lies within a
@@ -70,6 +71,11 @@ class Claim:
     text: str
     where: str
     contests: tuple[Contest, ...]
+
+
+def behind(policy: str) -> str:
+    """Return the name of the protocol in which a policy drives behind the arms."""
+    return f"closed-loop, {policy}"
 
 
 def within(arm: str) -> str:
@@ -144,10 +150,12 @@ CLAIMS: tuple[Claim, ...] = (
         9, "In closed loop DiFix collides more than the raw render and leaves the road less; arms of the same backbone stay near the raw "
         "render", "Table 2b",
         (
-            Contest("closed-loop", "collision_at_fault", "3dgs", "difix"),
-            Contest("closed-loop", "offroad", "difix", "3dgs"),
-            *each("closed-loop", ("collision_at_fault",), "omnidreams@4", ("3dgs",), "close"),
-            *each("closed-loop", ("collision_at_fault",), "self-forcing", ("3dgs",), "close"),
+            *(Contest(behind(policy), "collision_at_fault", "3dgs", "difix") for policy in DRIVERS),
+            *(Contest(behind(policy), "offroad", "difix", "3dgs") for policy in DRIVERS),
+            *(
+                Contest(behind(policy), "collision_at_fault", arm, "3dgs", "close")
+                for policy in DRIVERS for arm in ("omnidreams@4", "self-forcing")
+            ),
         ),
     ),
     Claim(

@@ -10,6 +10,7 @@ from typing import Any
 from evaluators.paper import wrong_map
 from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import OURS
+from evaluators.paper.closed_loop import Driven, closed_loop_section
 from evaluators.paper.cost import Cost, cost_section, plot_cost
 from evaluators.paper.measured import Measured
 from evaluators.paper.position import DRAWN, DRIFTING, by_position, distance_by_position, drift, with_half
@@ -38,7 +39,6 @@ TABLES = (  # protocol, table of the paper, heading
     ("cycle", "cycle", "Cycle renders"),
     ("under-trained", "under-trained", "Under-trained reconstructions"),
     ("cycle", "ablation", "Ablation"),
-    ("closed-loop", "closed-loop", "In closed loop"),
 )
 EQUAL_TIME = """Every arm has the same processor time instead of the paper's updates; clips, noise and judges are the same.
 """
@@ -101,6 +101,7 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
     measured, rows = found.measured, found.rows
     parts = [f"```bash\n{command}\n```\n", HOW + "\n", *_tables(published, measured, TABLES)]
     sections = {
+        "In closed loop": closed_loop_section(published, [one for one in measured.values() if isinstance(one, Driven)]),
         "A wrong map": _map_errors(found),
         "Beyond driving": transfer_section(published, measured),
         "Night, fog and snow": appearance_section(published, measured),
@@ -126,9 +127,8 @@ def _tables(published: Published, measured: Mapping[str, Measured], tables: Sequ
             continue
         mine = measured[name]
         parts.append(paper_against_ours(published, table, _of_table(mine, published.tables[table].rows)))
-        metrics = PAIRED if name != "closed-loop" else published_ours(published, table)
         for lead in (arm for arm in LEADS if table != "ablation" and arm in mine.arms):
-            has = [metric for metric in metrics if mine.has(lead, metric)]
+            has = [metric for metric in PAIRED if mine.has(lead, metric)]
             parts.append("\n" + differences(mine, lead, [arm for arm in mine.arms if arm != lead], has))
         parts.append(f"\n{_counts(mine)}\n")
     return parts
@@ -164,11 +164,6 @@ def draw_figures(found: Findings, folder: Path) -> None:
             plot_by_frame(summarise(shown, BASELINE), folder / name)
 
 
-def published_ours(published: Published, table: str) -> list[str]:
-    """Return our metrics in the place of a table's."""
-    return [ours for metric in published.tables[table].metrics if (ours := published.ours(metric)) is not None]
-
-
 def _of_table(measured: Measured, rows: Mapping[str, Any]) -> Measured:
     """Leave variants of the ablation out of Table 1 and other arms out of the ablation; the raw render and our arms stay in both."""
     ablation = "V1" in rows
@@ -180,7 +175,7 @@ def _of_table(measured: Measured, rows: Mapping[str, Any]) -> Measured:
 
 def _counts(measured: Measured) -> str:
     most = max((len(clips) for clips in measured.values.values()), default=0)
-    return f"{most} clips or scenes, {len(measured.arms)} arms."
+    return f"{most} clips, {len(measured.arms)} arms."
 
 
 def _map_errors(found: Findings) -> str:

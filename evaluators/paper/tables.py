@@ -69,11 +69,14 @@ def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Se
 
 
 def difference_text(found: Difference) -> str:
-    """Return a difference with its half-width, or with its p-value for a metric of whole sets; bold where it is shown."""
+    """Return a difference with its half-width, its bounds where they lie unevenly, or its p-value for a whole set; bold where shown."""
     digits, scale = (DIGITS | SET_DIGITS).get(found.metric, 4), SCALE.get(found.metric, 1.0)
     text = f"{found.difference * scale:+.{digits}f}"
     if found.low is not None and found.high is not None:
-        text += f" ± {(found.high - found.low) / 2 * scale:.{digits}f}"
+        half = (found.high - found.low) / 2
+        lopsided = abs((found.high + found.low) / 2 - found.difference) > 1e-6 * half
+        bounds = f" [{found.low * scale:+.{digits}f}, {found.high * scale:+.{digits}f}]"
+        text += bounds if lopsided else f" ± {half * scale:.{digits}f}"
     elif found.p_value is not None:
         text += f" (p {found.p_value:.2g})"
     return f"**{text}**" if found.favours else text

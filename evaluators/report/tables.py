@@ -212,7 +212,7 @@ def _pair_row(variant: str, name: str, entry: Mapping[str, Any], unit: str, dire
             at = [round(50 + 46 * v / reach, 2) for v in (diff, *bounds)]
             span = Span(at[0], at[1], at[2], zero=50.0)
     p = finite(entry.get("p_value"))
-    p_cell = missing(reason or "no test was made") if p is None else Cell(_p_text(p), str(entry.get("test") or ""), sort=p)
+    p_cell = missing(reason or "no test was made") if p is None else Cell(p_text(p), str(entry.get("test") or ""), sort=p)
     tone = tone_of(entry, direction)
     verdict = str(entry.get("verdict") or {"unclear": "undecided"}.get(tone, tone))
     verdict = {
@@ -241,7 +241,8 @@ def _pair_note(entry: Mapping[str, Any]) -> str:
     return ", ".join(said)
 
 
-def _p_text(p: float) -> str:
+def p_text(p: float) -> str:
+    """Print a p-value."""
     return "< 0.001" if p < 0.001 else fixed(p, 3)
 
 

@@ -70,7 +70,7 @@ def test_a_second_budget_is_measured_on_the_same_clips_without_measuring_the_shi
     for seed, (arm, took) in enumerate(minutes.items()):
         parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), seed), "vae": TinyVAE.random(seed=3).state_dict()}
         (tmp_path / arm).mkdir(parents=True)
-        save_bundle(tmp_path / arm / bench_paper.BUNDLE, parts, settings, trained=True, note="random")
+        save_bundle(tmp_path / arm / bench_paper.BUNDLE_FILE, parts, settings, trained=True, note="random")
         (tmp_path / arm / "fixer.card.json").write_text(json.dumps({"training": {"schedule": {"peak_lr": 1e-3}}}))
         (tmp_path / arm / "log.jsonl").write_text(json.dumps({"step": 1, "core_s": 60 * took}) + "\n")
     for folder, budget in (("arms", None), ("equal", 1.0)):
@@ -116,7 +116,7 @@ def test_the_transfer_is_measured_zero_shot_and_tuned_beside_the_papers_table(
     parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
     for folder in ("arms", "tuned"):
         (tmp_path / folder / "V9").mkdir(parents=True)
-        save_bundle(tmp_path / folder / "V9" / bench_paper.BUNDLE, parts, settings, trained=True, note="random")
+        save_bundle(tmp_path / folder / "V9" / bench_paper.BUNDLE_FILE, parts, settings, trained=True, note="random")
     where = {name: str(tmp_path / name) for name in ("arms", "beyond", "photos", "tuned", "out")}
     command = [
         "bench",
@@ -155,7 +155,7 @@ def test_an_arm_with_several_numbers_of_steps_takes_each_though_its_bundle_names
     parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
     for arm in ("omnidreams", "V9"):
         (tmp_path / arm).mkdir()
-        save_bundle(tmp_path / arm / bench_paper.BUNDLE, parts, settings, trained=True, note="random")
+        save_bundle(tmp_path / arm / bench_paper.BUNDLE_FILE, parts, settings, trained=True, note="random")
     found = bench_paper.arms_in(tmp_path)
     assert {arm.label: len(arm.spec.settings.steps) for arm in found} == {"V9": 1, "omnidreams@1": 1, "omnidreams@4": 4}  # type: ignore[union-attr]
 
@@ -166,7 +166,7 @@ def test_an_arm_with_several_numbers_of_steps_takes_each_though_its_bundle_names
         (["--only", "cycle,loop"], "unknown: loop"),
         (["--arms", "nowhere"], "no such folder"),
         (["--equal-time", "nowhere"], "--equal-time nowhere"),
-        (["--drives", "."], "no rollouts.parquet"),
+        (["--drives", "."], "run.json"),
         (["--reasons", "why.json"], "no such file"),
     ],
 )
