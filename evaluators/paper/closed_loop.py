@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from evaluators.aggregate.intervals import Interval
 from evaluators.aggregate.paired import compare, paired_sides
 from evaluators.aggregate.rows import Row, by_renderer
 from evaluators.aggregate.summary import aggregate_sides
 from evaluators.aggregate.verdict import default_margin
+from evaluators.metrics import info
 from evaluators.paper.claims import behind
 from evaluators.paper.measured import Difference, Measured
 from evaluators.paper.published import Published
@@ -21,6 +27,7 @@ TABLE = "closed-loop"  # of the paper
 BASELINE = "3dgs"
 EVENTS = ("collision_at_fault", "offroad", "offroad_or_collision_at_fault")
 METRICS = (*EVENTS, "route_distance_m", "progress")
+CAPTION = "Mean by renderer; thin: 95 % with scenes as clusters; thick: the paper's interval"
 RATES = """Means over rollouts. ± is the paper's 1.96 σ/√N, as if rollouts were independent; a to b is the 95 % interval with scenes as
 clusters.
 """
@@ -29,6 +36,8 @@ PAIRS = """Paired differences on the same scenes and seeds: 95 % interval and p-
 FLIPS = f"""Flips: scenes and seeds with the event behind one of the two renderers alone. The test on scenes compares how many have more
 events than behind `{BASELINE}` with how many have fewer; the test on rollouts (McNemar) takes them as independent.
 """
+PANELS = {"offroad_or_collision_at_fault": 100.0, "route_distance_m": 1.0, "progress": 100.0}  # of the figure, and their scales
+DPI = 110
 FLIP_HEAD = (
     "renderer", "event", "only behind it", f"only behind {BASELINE}", "p, rollouts", "scenes with more", "scenes with fewer", "p, scenes",
 )  # fmt: skip
@@ -84,9 +93,51 @@ class Driven(Measured):
         return Difference(metric, first, second, found["diff"], low, high, found["p_value"], found["n_scenes"], favours)
 
 
-def closed_loop_section(published: Published, drives: Sequence[Driven]) -> str:
-    """Return the tables of every policy; empty where none drove."""
-    return "\n".join(_of_policy(published, driven) for driven in drives)
+def closed_loop_section(published: Published, drives: Sequence[Driven], figure: str) -> str:
+    """Return the figure and the tables of every policy; empty where none drove.
+
+    Args:
+        published: The paper's numbers.
+        drives: A policy each.
+        figure: Path of the figure, from the document's folder.
+    """
+    if not drives:
+        return ""
+    return "\n".join([f"![{CAPTION}]({figure})\n", *(_of_policy(published, driven) for driven in drives)])
+
+
+def plot_closed_loop(drives: Sequence[Driven], path: Path) -> None:
+    """Draw event rate, route distance and progress by renderer, a row of panels for each policy, and write a PNG."""
+    most = max(len(driven.arms) for driven in drives)
+    figure = Figure(figsize=(10.4, (0.28 * most + 0.9) * len(drives) + 0.3), layout="constrained")
+    FigureCanvasAgg(figure)
+    for driven, row in zip(drives, figure.subplots(len(drives), len(PANELS), squeeze=False), strict=True):
+        for ax, (metric, scale) in zip(row, PANELS.items(), strict=True):
+            _panel(ax, driven, metric, scale)
+        row[0].set_yticks(range(len(driven.arms)), driven.arms)
+        row[0].set_title(f"behind {driven.policy}", fontsize=10, loc="left")
+    figure.savefig(path, dpi=DPI)
+
+
+def _panel(ax: Axes, driven: Driven, metric: str, scale: float) -> None:
+    found = aggregate_sides(driven.sides, [metric])
+    for i, arm in enumerate(driven.arms):
+        entry, colour = found[arm][metric], "C1" if arm == BASELINE else "C0"
+        if entry["mean"] is None:
+            continue
+        centre = scale * entry["mean"]
+        if entry["ci95_clustered"] is not None:
+            ax.plot([scale * bound for bound in entry["ci95_clustered"]], [i, i], color=colour, linewidth=1.2)
+        if entry["ci95"] is not None:
+            half = scale * entry["ci95"]
+            ax.plot([centre - half, centre + half], [i, i], color=colour, linewidth=4.5, alpha=0.35)
+        ax.plot([centre], [i], "o", color=colour, markersize=4.5)
+    ax.set_yticks(range(len(driven.arms)), [""] * len(driven.arms))
+    ax.set_ylim(len(driven.arms) - 0.5, -0.5)
+    ax.set_xlabel(f"{metric}, %" if scale == 100.0 else metric)
+    ax.set_title(f"{info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
+    ax.grid(visible=True, axis="x", alpha=0.25)
+    ax.spines[["top", "right"]].set_visible(False)
 
 
 def _of_policy(published: Published, driven: Driven) -> str:

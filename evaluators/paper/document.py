@@ -10,7 +10,7 @@ from typing import Any
 from evaluators.paper import wrong_map
 from evaluators.paper.appearance import appearance_section
 from evaluators.paper.claims import OURS
-from evaluators.paper.closed_loop import Driven, closed_loop_section
+from evaluators.paper.closed_loop import Driven, closed_loop_section, plot_closed_loop
 from evaluators.paper.cost import Cost, cost_section, plot_cost
 from evaluators.paper.measured import Measured
 from evaluators.paper.position import DRAWN, DRIFTING, by_position, distance_by_position, drift, with_half
@@ -23,6 +23,7 @@ from evaluators.video.charts import plot_by_frame
 from evaluators.video.summary import summarise
 
 WRONG_MAP, POSITION, DRIFT, COST = "wrong-map.png", "by-position.png", "drift.png", "cost.png"  # figures beside the document
+CLOSED_LOOP = "closed-loop.png"
 PERIOD_MS = 100.0  # between frames of the pairs
 TIMES = """Median over blocks of each clip, mean over clips, one thread; drawing of map and render is not included. The first frame of a
 block waits for the frames that the block looks ahead to, 100 ms apart, and for the block's computation.
@@ -101,7 +102,7 @@ def document(published: Published, found: Findings, reasons: Mapping[int, str], 
     measured, rows = found.measured, found.rows
     parts = [f"```bash\n{command}\n```\n", HOW + "\n", *_tables(published, measured, TABLES)]
     sections = {
-        "In closed loop": closed_loop_section(published, [one for one in measured.values() if isinstance(one, Driven)]),
+        "In closed loop": closed_loop_section(published, _drives(found), CLOSED_LOOP),
         "A wrong map": _map_errors(found),
         "Beyond driving": transfer_section(published, measured),
         "Night, fog and snow": appearance_section(published, measured),
@@ -152,8 +153,14 @@ def _verdicts(found: Findings, reasons: Mapping[int, str]) -> str:
     return f"{text}\n### Under both budgets\n\n{BOTH}\n{table}"
 
 
+def _drives(found: Findings) -> list[Driven]:
+    return [one for one in found.measured.values() if isinstance(one, Driven)]
+
+
 def draw_figures(found: Findings, folder: Path) -> None:
     """Write the document's figures beside it: those of the protocols that were run."""
+    if drives := _drives(found):
+        plot_closed_loop(drives, folder / CLOSED_LOOP)
     if found.shifted is not None:
         wrong_map.plot(*found.shifted, folder / WRONG_MAP)
     if found.cost is not None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from evaluators.aggregate import aggregate, paired
 from evaluators.paper.claims import CLAIMS, DRIVERS, Claim, Contest, behind
 from evaluators.paper.closed_loop import METRICS, Driven, closed_loop_section
-from evaluators.paper.document import Findings, document
+from evaluators.paper.document import Findings, document, draw_figures
 from evaluators.paper.published import published
 from evaluators.paper.tables import difference_text
 from evaluators.paper.verdict import judge_claims
@@ -65,7 +67,7 @@ def table(text: str, first: str) -> dict[str, list[str]]:
 
 def test_rates_and_differences_are_those_of_a_run() -> None:
     rows = rows_of(EVENTS)
-    text = closed_loop_section(published(), [Driven("learned", rows)])
+    text = closed_loop_section(published(), [Driven("learned", rows)], "f.png")
     means, off = aggregate(rows)["3dgs"]["offroad"], METRICS.index("offroad")
     low, high = means["ci95_clustered"]
     half = f"{100 * means['ci95']:.1f}"
@@ -78,7 +80,7 @@ def test_rates_and_differences_are_those_of_a_run() -> None:
 
 
 def test_flips_are_counted_both_ways() -> None:
-    text = closed_loop_section(published(), [Driven("learned", rows_of(EVENTS))])
+    text = closed_loop_section(published(), [Driven("learned", rows_of(EVENTS))], "f.png")
     flips = table(text[text.index("Flips") :], "renderer")
     assert flips["difix `offroad`"][1:] == ["3", "36", "< 0.001", "1", "12", "0.003"]
     assert flips["V9 `collision_at_fault`"][1:] == ["0", "0", "1.000", "0", "0", "1.000"]
@@ -112,9 +114,12 @@ def test_the_claim_asks_both_policies() -> None:
     assert {result.missing for result in judged.results} == {"", "protocol closed-loop, lane-camera"}
 
 
-def test_the_document_has_a_part_for_every_policy() -> None:
+def test_the_document_has_a_part_and_a_picture_of_every_policy(tmp_path: Path) -> None:
     drives = [Driven(policy, rows_of(EVENTS, policy)) for policy in DRIVERS]
-    text = document(published(), Findings({one.protocol: one for one in drives}, {}, {}), {}, "simrun bench paper")
+    found = Findings({one.protocol: one for one in drives}, {}, {})
+    draw_figures(found, tmp_path)
+    assert cv2.imread(str(tmp_path / "closed-loop.png")).std() > 5
+    text = document(published(), found, {}, "simrun bench paper")
     section = text[text.index("## In closed loop") : text.index("## A wrong map")]
     assert re.findall(r"^### Behind `(.*)`$", section, re.MULTILINE) == list(DRIVERS)
     assert "## In closed loop\n\nNot run." in document(published(), Findings({}, {}, {}), {}, "simrun bench paper")
@@ -123,7 +128,7 @@ def test_the_document_has_a_part_for_every_policy() -> None:
 def test_a_failed_rollout_is_in_no_rate_and_a_lopsided_interval_shows_its_bounds() -> None:
     rows = rows_of({"3dgs": lambda scene, seed: scene == 0 and seed == 0, "V9": never})
     rows[0] |= {"status": "failed", "failure_class": "renderer"}  # the only one with the event
-    text = closed_loop_section(published(), [Driven("learned", rows)])
+    text = closed_loop_section(published(), [Driven("learned", rows)], "f.png")
     assert table(text, "renderer")["3dgs"][METRICS.index("offroad")].startswith("0.0 (0 of 59)")
     rows[0] |= {"status": "ok"}
     driven = Driven("learned", rows)
