@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.bench.trained_arms import STEPS
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.training.fixer_run import BUNDLE_FILE
 from alpasim_plugin.vouched import sha256_of
@@ -55,7 +56,7 @@ def _arm(renderer: str, run: Run, bundles: Mapping[str, str]) -> str:
         return renderer
     arm = next((bundles[digest] for digest in fixer["files"].values() if digest in bundles), None)
     if arm is not None:
-        return f"{arm}@{len(fixer['settings']['steps'])}" if "@" in renderer else arm
+        return f"{arm}@{len(fixer['settings']['steps'])}" if arm in STEPS else arm
     name = renderer.partition("@")[0]
     if name in bundles.values():
         raise InputError(

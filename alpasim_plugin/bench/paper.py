@@ -21,7 +21,7 @@ from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
-from alpasim_plugin.bench.trained_arms import trained_arms, within_budget
+from alpasim_plugin.bench.trained_arms import STEPS, trained_arms, within_budget
 from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.errors import InputError
@@ -42,7 +42,6 @@ from evaluators.paper.wrong_map import Shift
 from evaluators.video.summary import TRUTH
 
 DOING = "making the paper's comparison"
-STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
 OURS = "V9"  # the paper's own method on the backbone that the arms share
 SHIPPED = ("onefixer", "onefixer-dit-tiny")  # rows of their own in every table
 ABLATION = ("V1", "V2", "V3", "V3b", "V4", "V5", "V6", "V7", "V8", "V9")

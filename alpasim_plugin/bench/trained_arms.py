@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from alpasim_plugin.nets.perceptual import NAME as PERCEPTUAL
@@ -14,6 +14,8 @@ from evaluators.paper.training import WITHIN, TrainedArm
 
 DOING = "reading how an arm was trained"
 DO = "train the arms again with 'simrun train arms'"
+# Arms of which the paper reports some numbers of steps: each is a row of its own, ARM@N.
+STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
 
 
 def trained_arms(folder: Path, names: Collection[str] | None = None) -> tuple[TrainedArm, ...]:

@@ -20,7 +20,8 @@ from evaluators.paper.claims import behind
 from evaluators.paper.measured import Difference, Measured
 from evaluators.paper.published import Published
 from evaluators.paper.tables import markdown_table, paper_against_ours
-from evaluators.report.numbers import Cell, plural
+from evaluators.report.numbers import plural
+from evaluators.report.summary import cell_text, metric_label
 from evaluators.report.tables import PairRow, metric_rows, p_text, pair_rows
 
 TABLE = "closed-loop"  # of the paper
@@ -147,8 +148,8 @@ def _of_policy(published: Published, driven: Driven) -> str:
     }
     seeds, scenes = ({row[key] for row in driven.rows} for key in ("seed", "scene"))
     rows = sorted(metric_rows(summary), key=lambda row: METRICS.index(row.name))
-    head = [" ".join(part for part in (f"`{row.name}`", f"({row.unit})" if row.unit else "", row.arrow) if part) for row in rows]
-    means = [[arm, *(_mean(row.cells[i]) for row in rows)] for i, arm in enumerate(driven.arms)]
+    head = [metric_label(f"`{row.name}`", row.unit, row.arrow) for row in rows]
+    means = [[arm, *(cell_text(row.cells[i]) for row in rows)] for i, arm in enumerate(driven.arms)]
     pairs = {(row.variant, row.metric): row for row in pair_rows(summary)}
     others = [arm for arm in driven.arms if arm != BASELINE]
     differences = [[arm, *(_pair(pairs[arm, row.name]) for row in rows)] for arm in others]
@@ -162,12 +163,6 @@ def _of_policy(published: Published, driven: Driven) -> str:
             FLIPS + "\n" + markdown_table(FLIP_HEAD, flips),
         )
     )
-
-
-def _mean(cell: Cell) -> str:
-    if cell.missing:
-        return f"{cell.text} ({cell.note})"
-    return f"{cell.text}{f' ({cell.count})' if cell.count else ''}, {cell.detail}"
 
 
 def _pair(row: PairRow) -> str:

@@ -47,7 +47,7 @@ def summary_md(run: Run) -> str:
     rows = tables.metric_rows(run.summary, run.invalid_reasons)
     if rows:
         head = ["metric", *(f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
-        body = [[_label(r.name, r.unit, r.arrow), *(_cell(c) for c in r.cells)] for r in rows]
+        body = [[metric_label(r.name, r.unit, r.arrow), *(cell_text(c) for c in r.cells)] for r in rows]
         parts.append(f"\n### Results, preset {escape(str(run.summary.get('preset')))}\n\n{table(head, body)}\n{INTERVAL_NOTE}\n")
     pairs = tables.pair_rows(run.summary)
     if pairs:
@@ -102,11 +102,13 @@ def _key(rollout: Rollout) -> list[str]:
     return [rollout.failure_class, rollout.renderer, rollout.policy, rollout.scene, str(rollout.seed)]
 
 
-def _label(name: str, unit: str, arrow: str) -> str:
+def metric_label(name: str, unit: str, arrow: str) -> str:
+    """Print a metric with its unit and the direction that is better."""
     return " ".join(part for part in (name, f"({unit})" if unit else "", arrow) if part)
 
 
-def _cell(cell: Cell) -> str:
+def cell_text(cell: Cell) -> str:
+    """Print a mean with its count and intervals, or why there is none."""
     if cell.missing:
         return f"{cell.text} ({cell.note})" if cell.note else cell.text
     return f"{cell.text}{f' ({cell.count})' if cell.count else ''}, {cell.detail}" if cell.detail else cell.text

@@ -13,7 +13,7 @@ from alpasim_plugin.errors import InputError
 from alpasim_plugin.vouched import sha256_of
 from tests.report.make_run import Plan, make_run
 
-BASES = {"difix": "3dgs", "omnidreams@4": "3dgs", "onefixer-dit-tiny": "3dgs", "onefixer": "3dgs"}
+BASES = {"difix": "3dgs", "omnidreams": "3dgs", "omnidreams@4": "3dgs", "onefixer-dit-tiny": "3dgs", "onefixer": "3dgs"}
 
 
 @pytest.fixture
@@ -53,6 +53,11 @@ def test_a_renderer_is_the_arm_whose_weights_it_has(tmp_path: Path, arms: Path) 
     assert list(found) == ["closed-loop, lane-camera"]
     assert found["closed-loop, lane-camera"].arms == ("clean", "3dgs", "difix", "omnidreams@4", "V9", "onefixer")
     assert len(found["closed-loop, lane-camera"].rows) == 6 * 3 * 2
+
+
+def test_an_arm_with_several_numbers_of_steps_is_the_row_of_its_own_number(tmp_path: Path, arms: Path) -> None:
+    run = driven(tmp_path / "run", arms, ("3dgs", "omnidreams"), {"omnidreams": "omnidreams"})  # without @N: the steps are the bundle's
+    assert read_drives([run], arms)["closed-loop, lane-camera"].arms == ("3dgs", "omnidreams@4")
 
 
 def test_policies_may_share_a_folder_or_have_their_own(tmp_path: Path, arms: Path) -> None:
