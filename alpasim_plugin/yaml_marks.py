@@ -21,6 +21,7 @@ from alpasim_plugin.errors import InputError
 
 MAX_NODES = int(YAML_VALUES.high)
 MAX_DEPTH = 40
+_TOO_DEEP = f"nested deeper than {MAX_DEPTH} levels"
 
 Key = tuple[str | int, ...]
 
@@ -104,6 +105,8 @@ def parse(text: str, file: str, doing: str, *, override: bool = False) -> tuple[
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         at = file if mark is None or override else f"{file}:{mark.line + 1}:{mark.column + 1}"
+        if "nesting depth" in str(e.problem):  # libyaml 0.2.6 looks ahead of the events counted here and has a bound of its own
+            raise InputError(doing, at, _TOO_DEEP, "flatten the file") from e
         found = " ".join(str(part) for part in (e.context, e.problem) if part)
         raise InputError(doing, at, f"not valid YAML: {found}", "correct the syntax (indentation, colon, quote or bracket)") from e
     except yaml.reader.ReaderError as e:
@@ -123,7 +126,7 @@ def _check_events(text: str, file: str, doing: str) -> None:
         values += isinstance(event, yaml.NodeEvent)
         depth += isinstance(event, yaml.CollectionStartEvent)
         if depth > MAX_DEPTH + 1 or values > 2 * MAX_NODES:  # keys are events too
-            found = f"nested deeper than {MAX_DEPTH} levels" if depth > MAX_DEPTH + 1 else f"more than {MAX_NODES} values"
+            found = _TOO_DEEP if depth > MAX_DEPTH + 1 else f"more than {MAX_NODES} values"
             mark = event.start_mark
             at = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark is not None else file
             raise InputError(doing, at, found, "flatten the file" if depth > MAX_DEPTH + 1 else "split the file or use a data file")
@@ -149,7 +152,7 @@ class _Builder:
         if self.n_nodes > MAX_NODES:
             raise self.fail(node, f"more than {MAX_NODES} values once aliases are expanded", "remove nested aliases")
         if depth > MAX_DEPTH:
-            raise self.fail(node, f"nested deeper than {MAX_DEPTH} levels", "flatten the file")
+            raise self.fail(node, _TOO_DEEP, "flatten the file")
         if id(node) in self.open:
             raise self.fail(node, "an alias that contains itself", "remove the recursive alias")
         self.marks.setdefault(loc, self.position(node))
