@@ -21,7 +21,7 @@ from alpasim_plugin.bench.judged import Judging, set_metrics, vectors
 from alpasim_plugin.bench.map_error import CONFIGURATIONS, MapShift
 from alpasim_plugin.bench.quality import RAW, Variant
 from alpasim_plugin.bench.quality_run import QualityRun, Work, evenly, features_of, film_of, row_of, unit_of
-from alpasim_plugin.bench.trained_arms import STEPS, trained_arms, within_budget
+from alpasim_plugin.bench.trained_arms import STEPS, TRANSFER_STEPS, trained_arms, within_budget
 from alpasim_plugin.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.bench.transfer import TransferData, measure_transfer
 from alpasim_plugin.errors import InputError
@@ -128,8 +128,13 @@ class Compared:
     equal_time: EqualTime | None = None
 
 
-def arms_in(folder: Path, option: str = "--arms") -> tuple[Variant, ...]:
+def arms_in(folder: Path, option: str = "--arms", steps_of: Mapping[str, tuple[int | None, ...]] = STEPS) -> tuple[Variant, ...]:
     """Return the arms that were trained: a variant for each number of steps that the paper reports, in alphabetical order.
+
+    Args:
+        folder: With ``NAME/fixer.safetensors``.
+        option: That named it, for errors.
+        steps_of: ARM -> its numbers of steps; None: the bundle's own, under the arm's plain name.
 
     Raises:
         InputError: No folder, or a bundle that is none.
@@ -142,7 +147,7 @@ def arms_in(folder: Path, option: str = "--arms") -> tuple[Variant, ...]:
     for path in sorted(folder.glob(f"*/{BUNDLE_FILE}")):
         name, settings = bundle_fixer(path)
         arm = path.parent.name
-        for steps in STEPS.get(arm, (None,)):
+        for steps in steps_of.get(arm, (None,)):
             if steps is None:
                 found.append(Variant(arm, resolve("fixer", name, settings)))
             else:  # the bundle's own steps would come after those of the name
@@ -191,7 +196,7 @@ def compare_arms(run: PaperRun, told: Told, told_clip: Callable[[int, int, str],
         out.cost = Cost(tuple(curves), out.measured["cost"], about)
         out.measured["cost"] = contested(out.cost)
     if "transfer" in run.protocols and run.transfer is not None:
-        tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms)
+        tuned = () if run.transfer.arms is None else arms_in(run.transfer.arms, "--transfer-arms", TRANSFER_STEPS)
         out.measured |= measure_transfer(run.transfer, arms, tuned, run.out, run.seed, run.jobs, told)
     if run.equal_time is not None:
         out.equal_time = _equal_time(run, run.equal_time, again, told, out)

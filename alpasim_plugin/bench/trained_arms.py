@@ -15,7 +15,8 @@ from evaluators.paper.training import WITHIN, TrainedArm
 DOING = "reading how an arm was trained"
 DO = "train the arms again with 'simrun train arms'"
 # Arms of which the paper reports some numbers of steps: each is a row of its own, ARM@N.
-STEPS: Mapping[str, tuple[int, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
+STEPS: Mapping[str, tuple[int | None, ...]] = {"omnidreams": (1, 4), "artifixer-pre": (1, 4), "gsfix3d": (8,), "3dgs-enhancer": (8,)}
+TRANSFER_STEPS: Mapping[str, tuple[int | None, ...]] = {"artifixer": (None, 4)}  # the paper's DL3DV table has it after DMD at 1 and 4
 
 
 def trained_arms(folder: Path, names: Collection[str] | None = None) -> tuple[TrainedArm, ...]:

@@ -14,7 +14,7 @@ from evaluators.paper.published import Published
 from evaluators.paper.tables import differences, markdown_table, paper_against_ours
 
 TRANSFER, PHOTOGRAPHS = "transfer", "transfer-photographs"
-COMPARED = (OURS, "difix", "artifixer")  # the arms of the paper's table that are trained here
+COMPARED = (OURS, "difix", "artifixer", "artifixer@4")  # the arms of the paper's table that are trained here
 ZERO_SHOT = " zero shot"  # ends the name of an arm that was trained on driving alone; a plain name is fine-tuned, as in the paper
 METRICS = (PSNR, PERCEPTUAL, MID, LAST, WARP, FVMD_LK)
 HOW = f"""Arms with a plain name were fine-tuned on the 32 training scenes; `{ZERO_SHOT.strip()}` means trained on driving alone;

@@ -158,6 +158,8 @@ def test_an_arm_with_several_numbers_of_steps_takes_each_though_its_bundle_names
         save_bundle(tmp_path / arm / bench_paper.BUNDLE_FILE, parts, settings, trained=True, note="random")
     found = bench_paper.arms_in(tmp_path)
     assert {arm.label: len(arm.spec.settings.steps) for arm in found} == {"V9": 1, "omnidreams@1": 1, "omnidreams@4": 4}  # type: ignore[union-attr]
+    both = bench_paper.arms_in(tmp_path, steps_of={"V9": (None, 4)})
+    assert {arm.label: len(arm.spec.settings.steps) for arm in both} == {"V9": 1, "V9@4": 4, "omnidreams": 1}  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from evaluators.paper.measured import Measured
 from evaluators.paper.published import published
-from evaluators.paper.transfer import PHOTOGRAPHS, TRANSFER, clip_values, tenth, transfer_section
+from evaluators.paper.transfer import COMPARED, PHOTOGRAPHS, TRANSFER, clip_values, tenth, transfer_section
 
 SERIES = {"psnr_db": np.arange(50.0), "perceptual-syn": np.linspace(0, 0.49, 50), "warp_l1": np.zeros(49)}
 
@@ -45,3 +45,7 @@ def test_the_section_has_photographs_where_they_were_measured() -> None:
     both = transfer_section(published(), {TRANSFER: mine, PHOTOGRAPHS: mine})
     assert "| V9 zero shot | 21.00 ± " in both
     assert transfer_section(published(), {}) == ""
+
+
+def test_every_row_of_the_papers_transfer_table_has_an_arm_here() -> None:
+    assert set(published().tables["transfer"].rows) == set(COMPARED)
