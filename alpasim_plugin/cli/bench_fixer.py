@@ -15,6 +15,7 @@ from rich.table import Table
 from alpasim_plugin.bench.fixer import bench_fixer
 from alpasim_plugin.bench.fixer_rows import Bench, BenchOptions, Row
 from alpasim_plugin.bench.fixer_table import HEAD, MARKERS, cells, markdown, plot, put_between_marks
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 
@@ -54,9 +55,8 @@ def fixer(
         raise InputError("writing the fixer's bench into the docs", str(PAGE), "no such file", "run it at the root of the repository")
     own = tuple(fixer_overrides(overrides or []))
     options = BenchOptions(name, own, device, threads, 1 if quick else passes, quick, parse_groups(only), seed)
-    bench = bench_fixer(
-        options, [parse_size(size) for size in sizes.split(",")], 21 if quick else frames, (lambda row: None) if as_json else _print_row
-    )
+    measured_sizes = [parse_size(size, "--sizes") for size in sizes.split(",")]
+    bench = bench_fixer(options, measured_sizes, 21 if quick else frames, (lambda row: None) if as_json else _print_row)
     document = as_document(bench)
     if out is not None:
         write_results(bench, out)
@@ -77,23 +77,6 @@ def fixer(
     console.width = max(console.width, Console(width=1000).measure(table).maximum)
     console.print(table)
     print(machine_line(bench.facts))
-
-
-def parse_size(text: str, multiple: int = 1) -> tuple[int, int]:
-    """Return width and height, pixels.
-
-    Example:
-        >>> parse_size("256x144")
-        (256, 144)
-
-    Raises:
-        InputError: Anything but two positive multiples of ``multiple``.
-    """
-    sides = [int(part) if part.strip().isdecimal() else 0 for part in text.split("x")]
-    if len(sides) != 2 or any(side < 1 or side % multiple for side in sides):
-        found = f"not two positive {f'multiples of {multiple}' if multiple > 1 else 'integers'}"
-        raise InputError("reading an image size", text, found, "write WIDTHxHEIGHT, such as 960x544")
-    return sides[0], sides[1]
 
 
 def parse_groups(text: str) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import typer
 
 from alpasim_plugin.bench.block_speed import BlockTimes, measure_blocks
 from alpasim_plugin.bench.roofline import TEXT_TOKENS, BlockWork, Device, block_work, device_of
-from alpasim_plugin.cli.bench_fixer import parse_size
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
@@ -57,7 +57,7 @@ def roofline(
     settings = fixer_settings(name, fixer_overrides(overrides or []))
     if not isinstance(settings, OneFixerSettings):
         raise InputError("counting a fixer's work", f"--fixer {name}", "it has no networks to count", "take one of the onefixer family")
-    width, height = parse_size(size, SIDE)
+    width, height = parse_size(size, multiple=SIDE)
     limits = device_of(on)
     work = block_work(settings, height, width, views, text_tokens)
     times = measure_blocks(settings, work, height, width, device, blocks, text_tokens, attention) if measure else None

@@ -9,8 +9,8 @@ import typer
 
 from alpasim_plugin.alpasim.server.assembly import Settings
 from alpasim_plugin.bench.serve import bench_serve, soak
-from alpasim_plugin.cli.bench_fixer import parse_size
 from alpasim_plugin.cli.bench_rows import print_rows
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.errors import InputError
 
 SIDE = 16
@@ -46,7 +46,7 @@ def serve(
     """
     del debug
     settings = Settings(renderer, tuple(set_ or ()), device=device, threads=threads, history_bytes=history_mb << 20)
-    shape = parse_size(size, SIDE)
+    shape = parse_size(size, multiple=SIDE)
     if soak_frames:
         rows = [asdict(soak(settings, soak_frames, shape))]
     else:

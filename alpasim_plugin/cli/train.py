@@ -43,7 +43,7 @@ from alpasim_plugin.training.vae_quality import quality, round_trip
 app = typer.Typer(no_args_is_help=True, help="Make training data and train networks.")
 WIDTH, HEIGHT = 256, 144
 
-EXAMPLE = "Example: `simrun train fixer data/pairs --vae runs/vae/vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
+EXAMPLE = "Example: `simrun train fixer data/pairs --size 256x144 --vae vae.safetensors --init runs/base/fixer.safetensors --out runs/v9`"
 app.command("per-frame", epilog=PER_FRAME_EXAMPLES)(per_frame)
 app.command("fixer", epilog=EXAMPLE)(train_fixer_command)
 app.command("arms", epilog=ARMS_EXAMPLES)(arms)

@@ -18,6 +18,7 @@ from alpasim_plugin.bench.arm_choice import Choice
 from alpasim_plugin.bench.trained_arms import trained_arms
 from alpasim_plugin.cli import training_options as options
 from alpasim_plugin.cli.arms_tasks import DOING, ChoiceTask, StageTask, Sweep, Trained, Updated, chosen_rates, tasks_of, work
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.cli.train_fixer import PRECISIONS, named_weights
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.nets.image_distance import distance_for_training
@@ -39,13 +40,13 @@ SHORT_S = 120.0  # a time left that is given in seconds
 EPILOG = """
 Examples:
 
-- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms --steps 400 --jobs 2`
+- `simrun train arms data/pairs --size 256x144 --vae vae.safetensors --out runs/arms --steps 400 --jobs 2`
 
-- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms-60 --budget minutes --minutes 60`
+- `simrun train arms data/pairs --size 256x144 --vae vae.safetensors --out runs/arms-60 --budget minutes --minutes 60`
 
-- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/arms-60 --budget minutes --minutes 60 --rates runs/swept`
+- `simrun train arms data/pairs --size 256x144 --vae vae.safetensors --out runs/arms-60 --budget minutes --minutes 60 --rates runs/swept`
 
-- `simrun train arms data/pairs --vae runs/vae/vae.safetensors --out runs/swept --sweep 1e-4,3e-4,1e-3 --sweep-steps 50 --only V9,difix`
+- `simrun train arms data/pairs --size 256x144 --vae vae.safetensors --out runs/swept --sweep 1e-4,3e-4,1e-3 --sweep-steps 50`
 """
 
 
@@ -58,6 +59,7 @@ def arms(
     weights: Annotated[
         list[str] | None, typer.Option("--weights", help="base=FILE or base-bi=FILE: an initial network that is not trained. Repeatable.")
     ] = None,
+    size: options.Size = None,
     steps: options.Unit = 400,
     base_steps: Annotated[int, typer.Option("--base-steps", min=1, help="Updates of base and of base-bi.")] = 400,
     base_lr: Annotated[float, typer.Option("--base-lr", min=1e-7, help="Peak learning rate of base and base-bi.")] = 1e-3,
@@ -103,6 +105,7 @@ def arms(
         data, vae, out, ClipForm(latents, stride), BatchForm(clips, None, columns, seed), schedule,
         replace(schedule, peak_lr=base_lr).of_length(base_steps), named_weights(None, weights or []), channels == "equal",
         PRECISIONS[precision], snapshots, metric_weights, scenes,
+        None if size is None else parse_size(size),
     )  # fmt: skip
     recipes = tuple(with_perceptual_weight(recipe, perceptual) for recipe in comparison())
     telling = Telling()

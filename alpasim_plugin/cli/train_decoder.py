@@ -9,18 +9,20 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli import training_options as options
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.training.decoder_finetune import DecoderRecipe
 from alpasim_plugin.training.decoder_finetune_run import finetune_decoder
 from alpasim_plugin.training.latent_clips import ClipForm
 from alpasim_plugin.training.trainer import Schedule
 
-EPILOG = "Example: `simrun train decoder data/pairs --init runs/v9/fixer.safetensors --out runs/v9-decoder`"
+EPILOG = "Example: `simrun train decoder data/pairs --size 256x144 --init runs/v9/fixer.safetensors --out runs/v9-decoder`"
 
 
 def decoder(
     data: options.Pairs,
     init: Annotated[Path, typer.Option("--init", help="Trained fixer: the fixer.safetensors of 'simrun train fixer'.")],
     out: options.RunFolder,
+    size: options.Size = None,
     steps: options.Steps = 800,
     clips: options.Clips = 2,
     latents: options.Latents = 12,
@@ -43,5 +45,6 @@ def decoder(
     recipe = DecoderRecipe(clips, rows, columns, perceptual_weight=perceptual, seed=seed)
     schedule = Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=0.99, save_every=max(steps // 20, 5))
     prepared = partial(progress.prepared, every=50)
-    path = finetune_decoder(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update)
+    own_size = None if size is None else parse_size(size)
+    path = finetune_decoder(init, data, out, ClipForm(latents, stride), recipe, schedule, distance, prepared, progress.update, own_size)
     progress.wrote(path, as_json)

@@ -13,6 +13,7 @@ import typer
 
 from alpasim_plugin.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.cli import training_options as options
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
@@ -73,6 +74,7 @@ def train_fixer_command(
     scenes: Annotated[
         Path | None, typer.Option("--scenes", help="Folder of the pairs' scenes; recipe appearance renders their depth for its targets.")
     ] = None,
+    size: options.Size = None,
     steps: options.Unit = 400,
     clips: options.Clips = 4,
     accumulate: options.Accumulate = 2,
@@ -123,8 +125,9 @@ def train_fixer_command(
     schedule = Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps)
     form = ClipForm(latents, stride, class_colour_augmentation and recolour)
     batches = BatchForm(clips, None, columns, seed)
+    own_size = None if size is None else parse_size(size)
     files, equal = named_weights(init, weights or []), channels == "equal"
-    run = FixerRun(settings, chosen, data, vae, files, form, batches, schedule, equal, PRECISIONS[precision], snapshots, scenes)
+    run = FixerRun(settings, chosen, data, vae, files, form, batches, schedule, equal, PRECISIONS[precision], snapshots, scenes, own_size)
     progress = options.Progress(run.updates)
     progress.float32(run.precision, run.stages())
     distance = progress.perceptual_term(metric_weights) if run.perceptual else None

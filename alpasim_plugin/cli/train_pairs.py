@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.cli.training_options import AsJson, Debug, scene_files
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.renderers.cache import cache_root
@@ -173,15 +174,3 @@ def import_pairs(
     Console(stderr=True).print(f"{folder}: {frames} frames", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         print(json.dumps({"folder": str(folder), "split": split, "frames": frames}))
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Parse ``WIDTHxHEIGHT``.
-
-    Raises:
-        InputError: Other text.
-    """
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-        raise InputError("reading a size", f"--size {text}", "not a size", "give WIDTHxHEIGHT, for example 256x144")
-    return int(parts[0]), int(parts[1])

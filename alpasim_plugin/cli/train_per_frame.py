@@ -10,6 +10,7 @@ import torch
 import typer
 
 from alpasim_plugin.cli import training_options as options
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
@@ -85,7 +86,7 @@ def per_frame(
         raise InputError("choosing a fixer to train", f"--fixer {fixer}", "it is no generator in pixels", do)
     chosen = choose_precision(precision)
     progress.console.print(f"precision: {chosen.name} ({chosen.why})", highlight=False)
-    width, height = _size(crop)
+    width, height = parse_size(crop, "--crop", 16)
     shares = StreamShares() if video is not None else WITHOUT_VIDEO
     source = TrainingStreams(
         data, video, seed=seed, batch=streams, frames=frames, crop=(height, width), episode=episode, shares=shares, count=sequences
@@ -100,10 +101,3 @@ def per_frame(
     run = PixelRun(settings, source, chosen_variant, schedule, init, seed, dtype, keep_every)
     work = partial(train_per_frame, run, out, distance, stop_at)
     progress.wrote(in_ranks(work, processes, progress.update), as_json)
-
-
-def _size(text: str) -> tuple[int, int]:
-    sides = text.split("x")
-    if len(sides) != 2 or not all(side.isdecimal() and int(side) and int(side) % 16 == 0 for side in sides):
-        raise InputError("reading --crop", f"--crop {text}", "not two multiples of 16", "write WIDTHxHEIGHT, such as 128x96")
-    return int(sides[0]), int(sides[1])

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.train_pairs import parse_size
+from alpasim_plugin.cli.image_sizes import parse_size
 from alpasim_plugin.cli.training_options import AsJson, Debug
 from alpasim_plugin.training.video_pairs import VideoRecipe, make_video_pairs
 

@@ -21,6 +21,7 @@ from alpasim_plugin.training.recipes.recipe import Stage
 from alpasim_plugin.training.trainer import LOG_FILE
 
 Pairs = Annotated[Path, typer.Argument(help="Folder of pairs; the split 'train' is used.")]
+Size = Annotated[str | None, typer.Option("--size", metavar="WIDTHxHEIGHT", help="Train on sequences of this image size alone.")]
 RunFolder = Annotated[Path, typer.Option("--out", help="Folder of the run; the same command resumes it.")]
 Steps = Annotated[int, typer.Option("--steps", min=1, help="Total updates.")]
 Clips = Annotated[int, typer.Option("--clips", min=1, help="Clips per batch.")]

@@ -38,6 +38,7 @@ def finetune_decoder(
     distance: tuple[str, Distance] | None = None,
     prepared: Callable[[str, int, int], None] | None = None,
     report: Callable[[int, Mapping[str, float]], None] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Path:
     """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors and its card.
 
@@ -49,6 +50,7 @@ def finetune_decoder(
         distance: Name and function of the perceptual term.
         prepared: Called with the current item (latents, rollouts), the number done and the total.
         report: Called after every update with its number and the logged values.
+        size: Width and height of the sequences to train on, pixels; None: all are of one size.
 
     Raises:
         InputError: Another kind of bundle, no data, or a crop larger than the clips.
@@ -63,7 +65,7 @@ def finetune_decoder(
     def tell(what: str) -> Callable[[int, int], None] | None:
         return None if prepared is None else lambda done, count: prepared(what, done, count)
 
-    clips = LatentClips(PairDataset(data, "train").sequences, vae, form, out.parent / "latents", tell("latents"))
+    clips = LatentClips(PairDataset(data, "train", size).sequences, vae, form, out.parent / "latents", tell("latents"))
     shown = "drawn" if settings.uses_map else settings.no_map
     rollouts = Rollouts(clips, vae, net, settings.block_latents, settings.window, shown, out.parent / "rollouts", tell("rollouts"))
     task = DecoderTask(vae, rollouts, recipe, distance)

@@ -27,7 +27,7 @@ from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.training.clip_batches import BatchForm
 from alpasim_plugin.training.latent_clips import ClipForm, LatentClips
 from alpasim_plugin.training.model_card import ModelCard, curves
-from alpasim_plugin.training.pair_store import PairDataset
+from alpasim_plugin.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.training.perceptual_term import Distance
 from alpasim_plugin.training.recipes.recipe import GIVEN, Recipe, Stage, StageInputs, Task, Weights
 from alpasim_plugin.training.snapshots import snapshot_file, snapshot_steps
@@ -57,6 +57,7 @@ class FixerRun:
         precision: Of the forward passes: None is float32. A stage that is always trained in float32 ignores it.
         snapshots: Weights that are kept of every stage at equal intervals (`snapshots`); equal weights come out with any number.
         scenes: Folder of the scenes behind the pairs; recipes whose targets need depth ask for it.
+        size: Width and height of the sequences to train on, pixels; None: all are of one size.
     """
 
     settings: TrainableSettings
@@ -71,6 +72,7 @@ class FixerRun:
     precision: torch.dtype | None = None
     snapshots: int = 0
     scenes: Path | None = None
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         names = {*GIVEN, *(stage.name for stage in self.recipe.stages[:-1])}
@@ -86,6 +88,15 @@ class FixerRun:
                 out.append(stage)
                 needed |= set(stage.sources)
         return out[::-1]
+
+    @property
+    def sequences(self) -> tuple[PairSequence, ...]:
+        """Pairs to train on.
+
+        Raises:
+            InputError: None are finished, or none have the size.
+        """
+        return PairDataset(self.data, "train", self.size).sequences
 
     @property
     def updates(self) -> int:
@@ -134,7 +145,7 @@ def train_fixer(
         InfrastructureError: The loss is not finite.
     """
     vae = load_tiny_vae(run.vae)
-    clips = LatentClips(PairDataset(run.data, "train").sequences, vae, run.form, out.parent / "latents", encoded)
+    clips = LatentClips(run.sequences, vae, run.form, out.parent / "latents", encoded)
     files, before, path = dict(run.weights), 0, out / BUNDLE_FILE
     for stage in run.stages():
         if stop_at is not None and stop_at <= before:
@@ -232,7 +243,7 @@ def write_bundle(
     training = {
         "about": recipe.about, "schedule": asdict(schedule), "trained": trained, "always_float32": stage.always_float32, **facts,
     }  # fmt: skip
-    data = {"pairs": "rendered scenes, split train", "sequences": len(PairDataset(run.data, "train").sequences), "form": asdict(run.form)}
+    data = {"pairs": "rendered scenes, split train", "sequences": len(run.sequences), "form": asdict(run.form)}
     ModelCard(f"OneFixer weights, recipe {name_of(run, stage)}: {recipe.about}", data, training, rows, hours).write(path)
     return path
 

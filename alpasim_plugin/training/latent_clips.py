@@ -29,7 +29,7 @@ from alpasim_plugin.nets.tiny_vae import TinyVAE
 from alpasim_plugin.seeding import stream
 from alpasim_plugin.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.training.clips import to_tensor
-from alpasim_plugin.training.pair_store import PairSequence, pairs_digest
+from alpasim_plugin.training.pair_store import PairSequence, listed_sizes, pairs_digest
 
 F16 = npt.NDArray[np.float16]
 DOING = "encoding training clips"
@@ -111,10 +111,9 @@ class LatentClips:
     ) -> None:
         if not sequences:
             raise InputError(DOING, "the pairs", "no finished sequence", "run 'simrun train pairs' first")
-        sizes = sorted({sequence.clip.rgb_gt.shape[1:3] for sequence in sequences})
-        if len(sizes) > 1:
-            found = f"images of {', '.join(f'{width}x{height}' for height, width in sizes)}, which make no batch"
-            raise InputError(DOING, "the pairs", found, "give a folder with the sequences of one size")
+        if len({sequence.size for sequence in sequences}) > 1:
+            found = f"images of several sizes, which make no batch: {listed_sizes(sequences)}"
+            raise InputError(DOING, "the pairs", found, "choose one with --size WIDTHxHEIGHT")
         encoder = digest(vae, form)
         self.form, self.digest = form, f"{encoder}-{pairs_digest(sequences)}"
         self.folder = folder / encoder

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
@@ -101,6 +102,12 @@ class PairSequence:
         return str(self.info.get(CONTENT) or _content(self.folder))
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of its images, pixels."""
+        height, width = self.clip.rgb_gt.shape[1:3]
+        return width, height
+
+    @property
     def clip(self) -> PairClip:
         """The frames that every channel has, as memory maps; they are closed when many other sequences have been used since."""
         return _opened(self)
@@ -143,12 +150,17 @@ def is_made(folder: Path, info: Mapping[str, Any]) -> bool:
 class PairDataset:
     """The complete sequences of one split, in order of name; `refresh` finds new ones.
 
+    Args:
+        root: Folder of pairs.
+        split: One of its folders.
+        size: Width and height, pixels: sequences of other sizes are left out.
+
     Raises:
-        InputError: No such split, or no complete sequence in it.
+        InputError: No such split, no complete sequence in it, or none of that size.
     """
 
-    def __init__(self, root: Path | str, split: str) -> None:
-        self.folder = Path(root) / split
+    def __init__(self, root: Path | str, split: str, size: tuple[int, int] | None = None) -> None:
+        self.folder, self.size = Path(root) / split, size
         self.sequences: tuple[PairSequence, ...] = ()
         self.refresh()
 
@@ -158,10 +170,20 @@ class PairDataset:
         finished = sorted(p.parent for p in self.folder.glob(f"*/{SEQUENCE_FILE}") if not p.parent.name.startswith("."))
         if not finished:
             raise InputError(READING, str(self.folder), "no finished sequence", "make some with 'simrun train pairs'")
-        self.sequences = tuple(known.get(f.name) or PairSequence(f) for f in finished)
+        complete = tuple(known.get(f.name) or PairSequence(f) for f in finished)
+        self.sequences = tuple(s for s in complete if self.size in (None, s.size))
+        if self.size is not None and not self.sequences:
+            found = f"no sequence of {self.size[0]}x{self.size[1]}; there are {listed_sizes(complete)}"
+            raise InputError(READING, str(self.folder), found, "choose one of these sizes")
 
     def __len__(self) -> int:
         return len(self.sequences)
+
+
+def listed_sizes(sequences: Iterable[PairSequence]) -> str:
+    """Return the image sizes of sequences with the number of each, the most frequent first, for errors."""
+    counts = Counter(sequence.size for sequence in sequences)
+    return ", ".join(f"{width}x{height} ({n})" for (width, height), n in counts.most_common())
 
 
 def pairs_digest(sequences: Sequence[PairSequence]) -> str:

@@ -24,11 +24,14 @@ from alpasim_plugin.training.snapshots import core_seconds, snapshots_of
 from alpasim_plugin.training.trainer import Schedule
 from tests.training.pair_files import make
 
+CLIPS = ["--latents", "2", "--stride", "4", "--clips", "1", "--size", "48x32"]
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("arms")
     make(root / "pairs", "train", "a", frames=9)
+    make(root / "pairs", "train", "wide", frames=9, width=64)
     for name in ("b", "c"):
         sequence = make(root / "pairs", "val", name, frames=9)
         path = sequence.folder / "sequence.json"
@@ -38,7 +41,22 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(data: Path, *more: str, out: str = "arms", only: str = "omnidreams,self-forcing") -> list[str]:
-    fixed = ["--latents", "2", "--stride", "4", "--clips", "1", "--accumulate", "1", "--columns", "4", "--base-steps", "1"]
+    fixed = [
+        "--latents",
+        "2",
+        "--stride",
+        "4",
+        "--clips",
+        "1",
+        "--accumulate",
+        "1",
+        "--columns",
+        "4",
+        "--base-steps",
+        "1",
+        "--size",
+        "48x32",
+    ]
     names = ["--vae", str(data / "vae.safetensors"), "--out", str(data / out), "--only", only]
     return ["train", "arms", str(data / "pairs"), *names, *fixed, *more]
 
@@ -145,6 +163,17 @@ def test_rates_of_a_sweep_reach_the_arm_and_the_same_stage_of_another_arm(data: 
         assert given == {"initial/base": None, "initial/base-bi": None, "self-forcing/teacher": None, student: 1e-3, "self-forcing": 1e-4}
 
 
+def test_one_fixer_and_its_decoder_are_trained_on_the_sequences_of_one_size(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fixer = ["train", "fixer", str(data / "pairs"), "--vae", str(data / "vae.safetensors"), "--recipe", "base", "--steps", "1"]
+    assert run_command([*fixer, *CLIPS[:-2], "--out", str(data / "fixer")]) == 2
+    assert "48x32 (1), 64x32 (1)" in capsys.readouterr().err
+    assert run_command([*fixer, *CLIPS, "--out", str(data / "fixer")]) == 0
+    bundle = data / "fixer" / "fixer.safetensors"
+    decoder = ["train", "decoder", str(data / "pairs"), "--init", str(bundle), "--steps", "1", "--rows", "2", "--columns", "2"]
+    assert run_command([*decoder, *CLIPS, "--perceptual", "0", "--out", str(data / "decoder")]) == 0
+    assert json.loads((data / "decoder" / "fixer.card.json").read_text())["data"]["clips"] == 4
+
+
 @pytest.mark.parametrize(
     ("more", "found"),
     [
@@ -157,6 +186,8 @@ def test_rates_of_a_sweep_reach_the_arm_and_the_same_stage_of_another_arm(data: 
         (["--sweep", "1e-4,1e-3", "--rates", "."], "rates to choose from, and chosen ones"),
         (["--rates", "."], "no rates that a sweep chose"),
         (["--weights", "init=x"], "no initial network"),
+        (["--size", "48"], "not two positive integers"),
+        (["--size", "32x48"], "no sequence of 32x48; there are 48x32 (1), 64x32 (1)"),
     ],
 )
 def test_options_that_do_not_fit_together_are_refused(data: Path, capsys: pytest.CaptureFixture[str], more: list[str], found: str) -> None:

@@ -47,7 +47,7 @@ def test_pairs_become_a_bundle_with_its_card(pairs: Path, tmp_path: Path, capsys
     ("options", "mention"),
     [
         (["--fixer", "onefixer-dit-tiny"], "simrun train fixer"),
-        (["--crop", "50x32"], "not two multiples of 16"),
+        (["--crop", "50x32"], "not two positive multiples of 16"),
         (["--crop", "96x64"], "frames of 48x32"),
     ],
 )

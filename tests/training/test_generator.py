@@ -124,8 +124,24 @@ def test_sequences_that_make_no_clips_or_no_batch_are_refused(data: Path, tmp_pa
         LatentClips([], TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
     make(tmp_path, "mixed/train", "a", frames=13)
     make(tmp_path, "mixed/train", "b", frames=13, width=64)
-    with pytest.raises(InputError, match="images of 48x32, 64x32, which make no batch"):
+    with pytest.raises(InputError, match=r"make no batch: 48x32 \(1\), 64x32 \(1\)"):
         LatentClips(PairDataset(tmp_path / "mixed", "train").sequences, TinyVAE.load(data / "vae.safetensors"), FORM, tmp_path / "z")
+
+
+def test_of_several_sizes_one_is_chosen_and_gives_the_weights_of_a_folder_of_its_own(data: Path, tmp_path: Path) -> None:
+    run = run_of(data, "base")
+    alone = train_fixer(run, tmp_path / "alone", ("brightness", brightness))
+    make(tmp_path / "mixed", name="a", frames=21)
+    make(tmp_path / "mixed", name="b", frames=14)
+    make(tmp_path / "mixed", name="c", frames=14, width=64)
+    mixed = replace(run, data=tmp_path / "mixed")
+    with pytest.raises(InputError, match=r"make no batch: 48x32 \(2\), 64x32 \(1\)"):
+        train_fixer(mixed, tmp_path / "of-mixed", ("brightness", brightness))
+    with pytest.raises(InputError, match=r"no sequence of 32x48; there are 48x32 \(2\), 64x32 \(1\)"):
+        train_fixer(replace(mixed, size=(32, 48)), tmp_path / "of-mixed", ("brightness", brightness))
+    chosen = train_fixer(replace(mixed, size=(48, 32)), tmp_path / "of-mixed", ("brightness", brightness))
+    assert all(torch.equal(value, load_weights(alone)[key]) for key, value in load_weights(chosen).items())
+    assert json.loads(chosen.with_suffix(".card.json").read_text())["data"]["sequences"] == 2
 
 
 QUICK = ("base", "V5", "V8")  # the branches that V9, which is trained below, does not take

@@ -114,7 +114,7 @@ def test_command_imports_and_refuses_names_that_are_paths(sources: PairSources, 
     assert PairDataset(tmp_path / "pairs", "test-known").sequences[0].clip.rgb_gt.shape == (6, 16, 24, 3)
     for bad in (["--name", "../drive"], ["--name", "drive", "--split", "tests"], ["--name", "drive", "--size", "big"]):
         assert run_command([*command, *bad]) == 2
-    assert "give WIDTHxHEIGHT" in capsys.readouterr().err
+    assert "write WIDTHxHEIGHT" in capsys.readouterr().err
 
 
 def _saved(path: Path, array: np.ndarray) -> Path:

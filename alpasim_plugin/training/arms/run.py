@@ -55,6 +55,7 @@ class ArmsRun:
         snapshots: Kept of every stage.
         metric_weights: Folder of LPIPS weights for the perceptual term.
         scenes: Folder of the pairs' scenes, for arms whose targets need depth.
+        size: Width and height of the sequences to train on, pixels; None: all are of one size.
     """
 
     data: Path
@@ -70,6 +71,7 @@ class ArmsRun:
     snapshots: int = 0
     metric_weights: Path | None = None
     scenes: Path | None = None
+    size: tuple[int, int] | None = None
 
     def bundle_of(self, training: str) -> Path:
         """Return the weights of a training, given or made."""
@@ -80,9 +82,10 @@ class ArmsRun:
         """Return the clips' latents, encoded where they are not yet.
 
         Raises:
-            InputError: No pairs, or pairs of several sizes.
+            InputError: No pairs, none of the size, or pairs of several sizes and none chosen.
         """
-        return LatentClips(PairDataset(self.data, "train").sequences, load_tiny_vae(self.vae), self.form, self.out / "latents", encoded)
+        sequences = PairDataset(self.data, "train", self.size).sequences
+        return LatentClips(sequences, load_tiny_vae(self.vae), self.form, self.out / "latents", encoded)
 
     def fixer_run(self, recipe: Recipe, weights: Mapping[str, Path], schedule: Schedule | None = None) -> FixerRun:
         """Return the run of a recipe with these options."""
@@ -91,7 +94,7 @@ class ArmsRun:
         chosen = self.initial if recipe.name in INITIAL.values() else self.schedule
         return FixerRun(
             settings, recipe, self.data, self.vae, weights, self.form, self.batches, schedule or chosen, self.equal_channels,
-            self.precision, self.snapshots, self.scenes,
+            self.precision, self.snapshots, self.scenes, self.size,
         )  # fmt: skip
 
 
