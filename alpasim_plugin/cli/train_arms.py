@@ -33,7 +33,7 @@ from alpasim_plugin.training.recipes.appearance import APPEARANCE
 from alpasim_plugin.training.recipes.recipe import Recipe
 from alpasim_plugin.training.recipes.registry import with_perceptual_weight
 from alpasim_plugin.training.trainer import Schedule
-from evaluators.paper.training import training_table
+from evaluators.paper.training import edge_of, training_table
 
 EVERY_S = 20.0  # between lines of progress
 SHORT_S = 120.0  # a time left that is given in seconds
@@ -219,7 +219,9 @@ class Telling:
             self.say(f"[{done}/{self.stages}] {name}: {f'{made} updates' if made else 'was finished'}; {self._left()}")
         elif isinstance(said, Choice):
             scores = "; ".join(f"{rate:g}: {score}" for rate, score in said.scores.items())
-            self.say(f"{name}: learning rate {said.rate:g} is the best ({scores}; {len(said.clips)} clips of val)")
+            edge = edge_of(said.rate, said.scores)
+            beyond = "" if edge is None else f": the {edge} of the sweep, a better one may lie beyond it"
+            self.say(f"{name}: learning rate {said.rate:g} is the best ({scores}; {len(said.clips)} clips of val){beyond}")
 
     def _left(self) -> str:
         if not self.updates:

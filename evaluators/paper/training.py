@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from evaluators.paper.tables import markdown_table
@@ -32,6 +32,18 @@ class TrainedArm:
     swept: Mapping[float, float] = field(default_factory=dict)
 
 
+def edge_of(rate: float, swept: Collection[float]) -> str | None:
+    """Return which end of the swept learning rates the chosen one is; None: it has others on both sides, or there was no choice.
+
+    Example:
+        >>> edge_of(1e-3, [1e-4, 3e-4, 1e-3])
+        'highest'
+    """
+    if len(swept) < 2:
+        return None
+    return {max(swept): "highest", min(swept): "lowest"}.get(rate)
+
+
 def training_table(arms: Sequence[TrainedArm]) -> str:
     """Return one line for each arm."""
     lines = []
@@ -43,7 +55,14 @@ def training_table(arms: Sequence[TrainedArm]) -> str:
 
 def training_section(arms: Sequence[TrainedArm]) -> str:
     """Return the table with what its numbers mean; empty where nothing is known of the training."""
-    return f"{HOW}\n{training_table(arms)}" if arms else ""
+    if not arms:
+        return ""
+    return f"{HOW}\n{training_table(arms)}{''.join(_at_an_edge(arms, edge) for edge in ('highest', 'lowest'))}"
+
+
+def _at_an_edge(arms: Sequence[TrainedArm], edge: str) -> str:
+    names = ", ".join(f"`{one.arm}`" for one in arms if edge_of(one.rate, one.swept) == edge)
+    return f"\nThe {edge} rate of its sweep was the best of {names}: a better one may lie beyond it.\n" if names else ""
 
 
 def _candidates(one: TrainedArm) -> str:
