@@ -41,22 +41,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(data: Path, *more: str, out: str = "arms", only: str = "omnidreams,self-forcing") -> list[str]:
-    fixed = [
-        "--latents",
-        "2",
-        "--stride",
-        "4",
-        "--clips",
-        "1",
-        "--accumulate",
-        "1",
-        "--columns",
-        "4",
-        "--base-steps",
-        "1",
-        "--size",
-        "48x32",
-    ]
+    fixed = [*CLIPS, "--accumulate", "1", "--columns", "4", "--base-steps", "1"]
     names = ["--vae", str(data / "vae.safetensors"), "--out", str(data / out), "--only", only]
     return ["train", "arms", str(data / "pairs"), *names, *fixed, *more]
 
