@@ -10,7 +10,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from alpasim_plugin.lazy import lazy_names
+from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from alpasim_plugin.alpasim.server.one_policy import serve_policy

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from alpasim_plugin.lazy import lazy_names
+from alpasim_plugin.core.lazy import lazy_names
 from evaluators.aggregate.summary import aggregate  # not on first use: its package bears the same name
 
 if TYPE_CHECKING:

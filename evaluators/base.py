@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import EvaluatorError, SimrunError
-from alpasim_plugin.parts import PartSpec, build, names, resolve
-from alpasim_plugin.parts.builtin import BUILTIN
-from alpasim_plugin.types import I64, Bool, Evaluator, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.errors import EvaluatorError, SimrunError
+from alpasim_plugin.core.types import I64, Bool, Evaluator, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
+from alpasim_plugin.plugins.parts.builtin import BUILTIN
 from evaluators.metrics import declare, info
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset

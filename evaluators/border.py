@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.box_distance import box_to_segments, nearest_segments
 from evaluators.footprint import Footprints, Geometries
 from evaluators.ragged import pairs_of, spans

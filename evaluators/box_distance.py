@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.footprint import Footprints
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.base import handover_us, series, with_preset
 from evaluators.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.presets import Preset

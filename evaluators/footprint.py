@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from alpasim_plugin.geometry import UNIT_CORNERS, rectangle_corners, slerp, yaw_from_quat
-from alpasim_plugin.types import F64, I64, Bool, RolloutLog, Trajectory
+from alpasim_plugin.core.geometry import UNIT_CORNERS, rectangle_corners, slerp, yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.presets import Preset
 
 Geometries = npt.NDArray[Any]  # of shapely geometries

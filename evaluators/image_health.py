@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.pixels import is_black
-from alpasim_plugin.types import U8, LoggedImage, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.pixels import is_black
+from alpasim_plugin.core.types import U8, LoggedImage, MetricSeries, RolloutLog, Scene
 from evaluators.base import series, with_preset
 from evaluators.presets import Preset
 
@@ -23,7 +23,7 @@ def decode(image: LoggedImage) -> U8:
     Raises:
         InputError: The bytes are no image, or one larger than the bounds.
     """
-    from alpasim_plugin.reading.images import decode_image
+    from alpasim_plugin.io.reading.images import decode_image
 
     where = f"camera {image.camera!r} at {image.end_us} us"
     return np.asarray(decode_image(image.data, where, "decoding a logged image", "log PNG or JPEG"), dtype=np.uint8)

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.pixels import BLACK_MAX
-from alpasim_plugin.types import Aggregation, Direction
-from alpasim_plugin.types import MetricInfo as MetricInfo
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.pixels import BLACK_MAX
+from alpasim_plugin.core.types import Aggregation, Direction
+from alpasim_plugin.core.types import MetricInfo as MetricInfo
 
 
 def _flag(

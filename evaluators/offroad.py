@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.geometry import wrap_angle, yaw_from_quat
-from alpasim_plugin.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.geometry import wrap_angle, yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene
 from evaluators.base import series, with_preset
 from evaluators.footprint import Footprints, ego_footprints, origin_of
 from evaluators.presets import Preset

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import interpolate, matrix_from_quat
-from alpasim_plugin.types import F64, I64, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.geometry import interpolate, matrix_from_quat
+from alpasim_plugin.core.types import F64, I64, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.base import series, with_preset
 from evaluators.footprint import ActorTable, ego_footprints_at, held, origin_of
 from evaluators.metrics import MIN_ADE

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.geometry import interpolate, wrap_angle
-from alpasim_plugin.types import F64, LoggedPlan, Trajectory
+from alpasim_plugin.core.geometry import interpolate, wrap_angle
+from alpasim_plugin.core.types import F64, LoggedPlan, Trajectory
 
 HORIZON_US = 3_000_000
 DIVERGED_M = 0.5  # a 1.88 m car has 0.8 m to either side in a 3.5 m lane

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.footprint import Geometries
 from evaluators.ragged import pairs_of, spans
 from evaluators.surface import segment_distance

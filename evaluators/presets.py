@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.types import I64, Bool
+from alpasim_plugin.core.types import I64, Bool
 
 
 def pairs_of(flags: Bool) -> tuple[I64, I64]:

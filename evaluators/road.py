@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry_lanes import lane_polygons, ring_area
-from alpasim_plugin.types import F64, I64, Bool, LaneMap
+from alpasim_plugin.core.geometry_lanes import lane_polygons, ring_area
+from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.border import Borders
 from evaluators.footprint import Geometries
 from evaluators.polylines import Polylines

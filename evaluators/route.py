@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import arc_lengths, interpolate, offset_trajectory
-from alpasim_plugin.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.geometry import arc_lengths, interpolate, offset_trajectory
+from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.base import relevant, series, with_preset
 from evaluators.footprint import ego_footprints, held, origin_of
 from evaluators.presets import Preset

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.types import F64, I64
 from evaluators.footprint import ActorTable, Footprints
 
 FRONT, REAR, LATERAL = 0, 1, 2

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.footprint import Geometries
 
 MARGIN_M = 1e-6  # accuracy of the margin

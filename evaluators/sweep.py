@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.types import F64, I64
 
 TOUCH_M = 1e-9  # bodies this near touch; the first contact is found to this much of motion
 _N_GAPS = 8  # both sides of four directions

@@ -17,8 +17,8 @@ import numpy as np
 import shapely
 from rtree import index
 
-from alpasim_plugin.geometry import rectangle_corners, wrap_angle
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.geometry import rectangle_corners, wrap_angle
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.footprint import ActorTable, Footprints
 from evaluators.step_contact import FRONT, LATERAL, REAR, Contacts
 from evaluators.sweep import Motions, first_contact, gaps

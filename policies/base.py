@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.parts import build, unidentified
-from alpasim_plugin.types import F64, I64, Policy, Scenario
+from alpasim_plugin.core.types import F64, I64, Policy, Scenario
+from alpasim_plugin.plugins.parts import build, unidentified
 
 PLAN_HORIZON_S = 5.0  # AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four metrics
 PLAN_STEP_US = 100_000
@@ -15,7 +15,7 @@ def make_policy(name: str, scenario: Scenario) -> Policy:
     """Return a policy for a scenario.
 
     Args:
-        name: A policy as `alpasim_plugin.parts.resolve` takes it: a registered name, ``package.module:Class`` or ``file.py:Class``.
+        name: A policy as `alpasim_plugin.plugins.parts.resolve` takes it: a registered name, ``package.module:Class`` or ``file.py:Class``.
         scenario: What the policy will drive in. A policy under test should take no more from it than its cameras.
 
     Raises:

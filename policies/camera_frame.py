@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.errors import PolicyError
-from alpasim_plugin.types import CameraSpec, Frame, Observation
+from alpasim_plugin.core.errors import PolicyError
+from alpasim_plugin.core.types import CameraSpec, Frame, Observation
 
 
 def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> Frame:

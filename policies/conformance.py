@@ -14,20 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.blank import blank_scenario
-from alpasim_plugin.errors import PolicyError, SimrunError
-from alpasim_plugin.geometry import inverse, se2, trajectory_from_poses, transform_points
-from alpasim_plugin.types import (
-    F64,
-    CameraSpec,
-    EgoState,
-    Frame,
-    Observation,
-    Plan,
-    Policy,
-    Route,
-    Scenario,
-)
+from alpasim_plugin.core.blank import blank_scenario
+from alpasim_plugin.core.errors import PolicyError, SimrunError
+from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
+from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Policy, Route, Scenario
 from policies.base import make_policy
 from policies.conformance_faults import (
     MIN_HORIZON_S,

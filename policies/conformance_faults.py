@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.plan_check import sensors_problem, shape_problem, unit_guess
-from alpasim_plugin.types import F64, Plan
+from alpasim_plugin.core.plan_check import sensors_problem, shape_problem, unit_guess
+from alpasim_plugin.core.types import F64, Plan
 
 MIN_HORIZON_S, MAX_STEP_S = 2.0, 0.5
 FIRST_POSE_M = 0.5

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import Observation, Plan, Policy, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import Observation, Plan, Policy, Route, Scenario, SensorSpec
 from policies.base import plan_times, seconds
 
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import PolicyError
-from alpasim_plugin.geometry import inverse
-from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec
+from alpasim_plugin.core.errors import PolicyError
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 
 FAR_M = 100.0
 NEAR_M = 4.5

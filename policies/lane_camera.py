@@ -8,10 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate, inverse, yaw_of
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, CameraSpec, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64, CameraSpec, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec
 from policies.base import plan_times, seconds
 from policies.camera_frame import camera_frame
 from policies.ground_grid import GroundGrid, make_grid

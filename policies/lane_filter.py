@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Bool
+from alpasim_plugin.core.types import F64, Bool
 from policies.lane_vision import PaintPoints
 
 OFFSET, HEADING, CURVATURE, BEND, WIDTH = range(5)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64
 from policies.lane_filter import LaneState
 from policies.obstacle_vision import ObstacleTrack
 from policies.paths import Path, make_path

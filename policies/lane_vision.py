@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.types import F32, F64, U8, Bool
+from alpasim_plugin.core.types import F32, F64, U8, Bool
 from policies.ground_grid import CELL_M, GroundGrid
 
 PAINT_WIDTH_M = 0.15

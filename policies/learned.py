@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, U8, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64, U8, Observation, Plan, Policy, Route, Scenario, SensorSpec
 from policies.base import plan_times, seconds
 from policies.camera_frame import camera_frame
 from policies.lane_camera import front_camera

@@ -6,8 +6,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from alpasim_plugin.geometry import wrap_angle
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.geometry import wrap_angle
+from alpasim_plugin.core.types import F64
 
 Command = Literal["keep", "left-ahead", "left-now", "right-ahead", "right-now"]
 COMMANDS: tuple[Command, ...] = get_args(Command)

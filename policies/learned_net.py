@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from alpasim_plugin.atomic import write_safetensors
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import check_regular, parsing
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
+from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.io.reading import check_regular, parsing
 from policies.learned_command import COMMANDS
 from policies.learned_view import CHANNELS, HEIGHT, WIDTH
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from alpasim_plugin.types import F32, F64, U8, CameraSpec
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec
 
 WIDTH, HEIGHT = 192, 80  # pixels
 FOCAL_PX = 125.0  # 75 degrees across

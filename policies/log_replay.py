@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.geometry import interpolate, inverse, yaw_of
-from alpasim_plugin.types import Observation, Plan, Policy, Route, Scenario, SensorSpec
+from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
+from alpasim_plugin.core.types import Observation, Plan, Policy, Route, Scenario, SensorSpec
 from policies.base import plan_times
 
 

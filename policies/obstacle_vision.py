@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.types import F64, U8
+from alpasim_plugin.core.types import F64, U8
 from policies.ground_grid import CELL_M, GroundGrid
 
 STRIPS = 4

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.geometry import inverse, se2
-from alpasim_plugin.types import F32, F64, U8, CameraSpec
+from alpasim_plugin.core.geometry import inverse, se2
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec
 
 Colour = tuple[int, int, int]
 WHITE, YELLOW = (235, 235, 235), (230, 190, 60)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64
 
 MAX_LATERAL_MPS2 = 2.5  # comfort in curves
 MIN_LOOKAHEAD_M = 3.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import F64, Observation, Plan, Policy, Route, Scenario, SensorSpec
 from policies.base import plan_times, seconds
 from policies.paths import curve_speeds, follow, make_path, smooth_line, speed_profile
 

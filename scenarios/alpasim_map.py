@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.geometry_lanes import HALF_WIDTH_M
-from alpasim_plugin.types import F64, Lane, LaneMap
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.geometry_lanes import HALF_WIDTH_M
+from alpasim_plugin.core.types import F64, Lane, LaneMap
 from scenarios.vertices import with_vertices
 
 NO_LANES_OF_CARS = ("sidewalk",)  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off

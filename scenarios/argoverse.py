@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
-from alpasim_plugin.reading.tables import Kind
-from alpasim_plugin.types import F64, I64, Actor, Box, CameraSpec, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.core.types import F64, I64, Actor, Box, CameraSpec, Trajectory, Vehicle
+from alpasim_plugin.io.reading.tables import Kind
 from scenarios.argoverse_map import read_ground, read_map
 from scenarios.reading import SourceFiles
 from scenarios.recorded import RecordedLog

@@ -1,7 +1,7 @@
 """What a scenario may hold and cost, computed before anything is built: the one gate that every source passes.
 
 `check_specification` looks at a built road's file before the road is made, `check_record` at what a reader returned, `check_scenario` at
-the finished scenario of either kind. Ranges of single quantities are in `alpasim_plugin.bounds`.
+the finished scenario of either kind. Ranges of single quantities are in `alpasim_plugin.io.limits`.
 
 The cost of the Gaussians follows what was counted on built roads of 0.1 to 5 km (docs/reliability.md): ground and kerbs by the drive's
 length, trees and walls by the surroundings.
@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from alpasim_plugin import bounds as b
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.types import F64, Actor, Box, CameraSpec, Environment, LaneMap, Scenario, Trajectory
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, Environment, LaneMap, Scenario, Trajectory
+from alpasim_plugin.io import limits as b
 from scenarios.recorded import RecordedLog
 from scenarios.schema import ScenarioSpec
 from scenarios.schema_actors import IdmActor, ParkedActor

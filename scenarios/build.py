@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Actor, LaneMap, Route, Trajectory, Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Actor, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneTaper, Profile
 from alpasim_plugin.world.roads import build_road

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.types import F64, CameraSpec
+from alpasim_plugin.core.types import F64, CameraSpec
 from scenarios.schema import CameraModel
 
 # Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate
-from alpasim_plugin.geometry_lanes import lane_polygon
-from alpasim_plugin.types import F64, I64, Actor, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.types import F64, I64, Actor, LaneMap, Trajectory, Vehicle
 
 MIN_GAP_M = 0.3
 STEP_US = 50_000

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Box, Lane, LaneMap
+from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.reading import MAX_REACH_M
 from scenarios.usdz_archive import Archive
 from scenarios.vertices import with_vertices

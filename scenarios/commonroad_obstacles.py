@@ -9,9 +9,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from alpasim_plugin.bounds import STEP
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import F64, I64, Box, Trajectory
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import F64, I64, Box, Trajectory
+from alpasim_plugin.io.limits import STEP
 from scenarios.commonroad_map import number, point
 from scenarios.reading import SourceFiles
 from scenarios.tracks import checked_trajectory

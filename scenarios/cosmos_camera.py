@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.types import F64, CameraSpec, FTheta
+from alpasim_plugin.core.types import F64, CameraSpec, FTheta
 from scenarios.reading import SourceFiles
 
 FRONT_WIDE = "camera_front_wide_120fov"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Box, Paint
+from alpasim_plugin.core.types import F64, Box, Paint
 from scenarios.reading import SourceFiles
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.roads import Road

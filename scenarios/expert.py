@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import F64, I64, Box, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import F64, I64, Box, Trajectory, Vehicle
 from alpasim_plugin.world.idm import Bodies, IdmParams, Leader, Spans, find_leader, idm_acceleration, nearest_ahead, spans
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.queue import find_leaders

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from alpasim_plugin import bounds
-from alpasim_plugin.bounds import Bound, number
+from alpasim_plugin.io import limits as bounds
+from alpasim_plugin.io.limits import Bound, number
 from scenarios import budget
 
 PAGE = "limits.md"

@@ -12,13 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.clock import Clock
-from alpasim_plugin.config import Document, apply_overrides, load_yaml, validate
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts.source import own_code_digest
-from alpasim_plugin.parts.spec import digest
-from alpasim_plugin.reading import check_regular, exists, parsing
-from alpasim_plugin.types import (
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import (  # fmt: skip
     BackgroundFile,
     Behaviour,
     Box,
@@ -29,7 +25,11 @@ from alpasim_plugin.types import (
     Rates,
     Scenario,
     Vehicle,
-)  # fmt: skip
+)
+from alpasim_plugin.io.config import Document, apply_overrides, load_yaml, validate
+from alpasim_plugin.io.reading import check_regular, exists, parsing
+from alpasim_plugin.plugins.parts.source import own_code_digest
+from alpasim_plugin.plugins.parts.spec import digest
 from alpasim_plugin.world.ground import flat
 from scenarios.alpasim_map import alpasim_view
 from scenarios.budget import check_record, check_scenario, check_specification
@@ -55,7 +55,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id. Seed 0 is the
             file as written, but for its ``variations`` and ``samples``.
         overrides: ``key=value`` with dotted keys, applied before validation.
-        source: Who reads a recorded log, as `alpasim_plugin.parts.resolve` takes it; None finds the source that recognises the path.
+        source: Who reads a recorded log, as `alpasim_plugin.plugins.parts.resolve` takes it; None finds the source that recognises the path.
 
     Returns:
         The scenario. The same input and seed give a bit-identical one.

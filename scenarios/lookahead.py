@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.geometry import yaw_from_quat
-from alpasim_plugin.types import F64, I64, Bool, Box, Trajectory
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, Bool, Box, Trajectory
 from alpasim_plugin.world.idm import Bodies, spans
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.state import NO_BODIES, bodies_from

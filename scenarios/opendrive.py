@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.bounds import ASIDE_M
-from alpasim_plugin.geometry import transform_points
-from alpasim_plugin.geometry_lanes import densify, lane_polygon
-from alpasim_plugin.types import F64, Lane, LaneMap, Paint
+from alpasim_plugin.core.geometry import transform_points
+from alpasim_plugin.core.geometry_lanes import densify, lane_polygon
+from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
+from alpasim_plugin.io.limits import ASIDE_M
 from scenarios.opendrive_geometry import beside, cubics_at, reference_line
 from scenarios.opendrive_links import following
 from scenarios.opendrive_road import MAX_ROAD_M, OdrLane, OdrMap, Road, Section, curved, lane_key

@@ -19,8 +19,8 @@ from collections.abc import Mapping
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import transform_points
-from alpasim_plugin.types import F64, Lane, LaneMap
+from alpasim_plugin.core.geometry import transform_points
+from alpasim_plugin.core.types import F64, Lane, LaneMap
 from scenarios.opendrive_geometry import Cubic, beside, cubics_at
 from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road
 from scenarios.vertices import with_vertices

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 Kind = Literal["line", "arc", "spiral", "poly3", "paramPoly3"]
 KINDS: tuple[Kind, ...] = ("line", "arc", "spiral", "poly3", "paramPoly3")

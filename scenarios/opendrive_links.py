@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from alpasim_plugin.types import Lane
+from alpasim_plugin.core.types import Lane
 from scenarios.opendrive_road import OdrLane, OdrMap, Road, RoadLink, lane_key
 
 

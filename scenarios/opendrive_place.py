@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 # WGS 84 ellipsoid (NIMA TR8350.2).
 SEMI_MAJOR_M = 6378137.0

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from alpasim_plugin.bounds import MAP_CURVATURE_PER_M, MAP_ROAD_M
+from alpasim_plugin.io.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
 from scenarios.opendrive_geometry import KINDS, Cubic, Geometry
 from scenarios.reading import SourceFiles
 

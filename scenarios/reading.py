@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather
 
-from alpasim_plugin import reading
-from alpasim_plugin.bounds import COORDINATE_M, MEMBERS, SOURCE_BYTES
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading.arrays import parse_npy
-from alpasim_plugin.reading.tables import Kind, check_columns
-from alpasim_plugin.reading.xml_files import parse_xml
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
+from alpasim_plugin.io import reading
+from alpasim_plugin.io.limits import COORDINATE_M, MEMBERS, SOURCE_BYTES
+from alpasim_plugin.io.reading.arrays import parse_npy
+from alpasim_plugin.io.reading.tables import Kind, check_columns
+from alpasim_plugin.io.reading.xml_files import parse_xml
 
 MAX_REACH_M = COORDINATE_M.high
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from alpasim_plugin.types import Actor, CameraSpec, HeightField, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.core.types import Actor, CameraSpec, HeightField, LaneMap, Trajectory, Vehicle
 
 
 @dataclass(frozen=True)

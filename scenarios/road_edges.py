@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.geometry_lanes import densify
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.geometry_lanes import densify
+from alpasim_plugin.core.types import F64
 
 SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
 MIN_HOLE_M2 = 0.5  # smaller holes are seams too

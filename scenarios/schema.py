@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from alpasim_plugin import bounds as b
+from alpasim_plugin.io import limits as b
 from scenarios.schema_actors import ActorSpec
 from scenarios.schema_base import BuildingHeight, Part, within
 from scenarios.schema_road import LogSpec, RoadSpec

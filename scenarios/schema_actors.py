@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from alpasim_plugin import bounds as b
+from alpasim_plugin.io import limits as b
 from scenarios.schema_base import Coordinate, Moment, Part, Side, Speed, Turn, within
 
 Label = Literal["car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "other"]

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from alpasim_plugin import bounds as b
+from alpasim_plugin.io import limits as b
 
 
 def within(bound: b.Bound) -> Any:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from alpasim_plugin import bounds as b
+from alpasim_plugin.io import limits as b
 from scenarios.schema_base import Part, within
 
 Turn = Literal["left", "straight", "right"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import PartSpec, build, names, resolve
-from alpasim_plugin.types import Source
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Source
+from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
 from scenarios.recorded import RecordedLog
 
 
@@ -101,7 +101,7 @@ def read_log(kind: str, path: Path, ego: int | str | None) -> RecordedLog:
     """Read a recorded log.
 
     Args:
-        kind: Its source as `alpasim_plugin.parts.resolve` takes it.
+        kind: Its source as `alpasim_plugin.plugins.parts.resolve` takes it.
         path: File or folder.
         ego: Which recorded vehicle becomes the ego, where the format does not say it.
 

@@ -12,10 +12,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from alpasim_plugin.bounds import LISTED, SEED, SEEDS
-from alpasim_plugin.config import Document, load_yaml, validate
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import exists
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.config import Document, load_yaml, validate
+from alpasim_plugin.io.limits import LISTED, SEED, SEEDS
+from alpasim_plugin.io.reading import exists
 from scenarios.library import shipped_names, suites
 from scenarios.schema_base import Part, within
 from scenarios.sources import source_of

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Actor, Box, Trajectory
+from alpasim_plugin.core.types import F64, I64, Actor, Box, Trajectory
 from scenarios.reading import SourceFiles
 
 MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import F64, I64, Actor, Behaviour, Box, Trajectory, Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import F64, I64, Actor, Behaviour, Box, Trajectory, Vehicle
 from alpasim_plugin.world.idm import IdmParams
 from alpasim_plugin.world.path import Path, polyline_path
 from alpasim_plugin.world.roads import Road, polyline

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.geometry import quat_from_matrix
-from alpasim_plugin.types import F64, Actor, Box, LaneMap, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import quat_from_matrix
+from alpasim_plugin.core.types import F64, Actor, Box, LaneMap, Scene, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.clipgt import clipgt_map, without_rails
 from scenarios.cosmos_camera import FRONT_WIDE

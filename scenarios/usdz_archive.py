@@ -8,12 +8,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from alpasim_plugin.bounds import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
-from alpasim_plugin.reading import parsing
-from alpasim_plugin.reading.files import open_regular
-from alpasim_plugin.reading.packed import check_names
-from alpasim_plugin.reading.tables import parse_parquet
-from alpasim_plugin.yaml_marks import parse
+from alpasim_plugin.io.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
+from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.reading.files import open_regular
+from alpasim_plugin.io.reading.packed import check_names
+from alpasim_plugin.io.reading.tables import parse_parquet
+from alpasim_plugin.io.yaml_positions import parse
 from scenarios.reading import SourceFiles
 
 

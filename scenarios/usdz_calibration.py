@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin.types import F64, CameraSpec
+from alpasim_plugin.core.types import F64, CameraSpec
 from scenarios.usdz_camera import FLU_FROM_CAMERA
 
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, CameraSpec
+from alpasim_plugin.core.types import F64, CameraSpec
 from scenarios.cosmos_camera import FRONT_WIDE, front_camera, lens_of
 from scenarios.usdz_archive import Archive
 

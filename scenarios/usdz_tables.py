@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 
-from alpasim_plugin.types import F64, Lane, LaneMap
+from alpasim_plugin.core.types import F64, Lane, LaneMap
 from scenarios.alpasim_map import NO_LANES_OF_CARS, rails
 
 _XYZ = pa.struct([("x", pa.float64()), ("y", pa.float64()), ("z", pa.float64())])

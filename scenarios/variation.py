@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from alpasim_plugin.config import Document, apply_overrides
-from alpasim_plugin.config_validate import dotted
-from alpasim_plugin.seeding import stream
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.io.config import Document, apply_overrides
+from alpasim_plugin.io.config_validate import dotted
 from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
 from scenarios.schema_base import Part
 

@@ -19,7 +19,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "alpasim_plugin.nets": set(),
     "alpasim_plugin.semantic_map": {"alpasim_plugin.gaussians"},
     "alpasim_plugin.fixers": {"alpasim_plugin.gaussians", "alpasim_plugin.nets", "alpasim_plugin.semantic_map", "alpasim_plugin.world"},
-    "alpasim_plugin.training": {
+    "alpasim_plugin.lab.training": {
         "alpasim_plugin.fixers",
         "alpasim_plugin.gaussians",
         "alpasim_plugin.log",
@@ -66,7 +66,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
 }
 # What stands outside the stages: it may import everything, and nothing imports it.
-OUTSIDE = ("alpasim_plugin.cli", "alpasim_plugin.bench", "alpasim_plugin.gym", "alpasim_plugin.notebook")
+OUTSIDE = ("alpasim_plugin.cli", "alpasim_plugin.lab.bench", "alpasim_plugin.gym", "alpasim_plugin.notebook")
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs")
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.atomic import write_json
+from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.runtime.overall import aggregate_runs
 from evaluators.report import render_table
 from evaluators.report.metric_info import HEADLINE

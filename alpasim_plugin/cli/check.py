@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from alpasim_plugin.cli.progress import make_progress
-from alpasim_plugin.escape import terminal
+from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.runtime.check import Inspection, inspect_run
 from alpasim_plugin.runtime.contents import RUN_INFO
 from alpasim_plugin.runtime.manifests import DERIVED, MANIFEST

@@ -9,7 +9,7 @@ import typer
 
 from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
 from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, findings, outside_view, tolerances
-from alpasim_plugin.errors import PolicyError
+from alpasim_plugin.core.errors import PolicyError
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.rollout import run_rollout
 from scenarios.load import load_scenario

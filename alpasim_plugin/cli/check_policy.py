@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from alpasim_plugin.stdout import parts_print_to_stderr
+from alpasim_plugin.process.stdout import parts_print_to_stderr
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
 

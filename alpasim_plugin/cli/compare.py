@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.repair import use_run
 from evaluators.gate.across import Comparison, compare_runs, compare_within
 from evaluators.gate.spec import load_gate

@@ -15,7 +15,7 @@ import typer
 
 from alpasim_plugin.cli.completion_shells import SCRIPTS
 from alpasim_plugin.cli.main import VERBS
-from alpasim_plugin.parts import names
+from alpasim_plugin.plugins.parts import names
 from evaluators import PRESETS
 from scenarios.library import shipped_names, suites
 

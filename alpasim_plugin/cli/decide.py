@@ -24,7 +24,7 @@ from alpasim_plugin.cli.deciding import (
 from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.cli.run import check_preset, parse_seeds, split_overrides
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.decide import Design
 from alpasim_plugin.runtime.executors.choice import parse_executor

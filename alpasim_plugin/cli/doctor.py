@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.runtime.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"
@@ -67,8 +67,8 @@ def _raster(backend: Literal["cpu", "gsplat"]) -> str:
 
 
 def _fixer() -> str:
+    from alpasim_plugin.core.types import Frame
     from alpasim_plugin.fixers import make_fixer
-    from alpasim_plugin.types import Frame
 
     fixer = make_fixer("onefixer", scene_id="doctor", threads=1)
     grey = [Frame(i, "front", np.full((32, 48, 3), 40 * i, dtype=np.uint8)) for i in range(fixer.blocks.first)]
@@ -88,7 +88,7 @@ def _video() -> str:
 
 
 def _wire() -> str:
-    from alpasim_plugin.alpasim import wire
+    from alpasim_plugin import wire
 
     return f"compiled messages load: {wire.__name__}"
 

@@ -12,7 +12,7 @@ import typer
 from alpasim_plugin.cli.export_recording import FORMATS, Asked, Exported, export_recording
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.cli.rollout_folders import is_run
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.export import Export, export_run, export_scenes
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.viewer.cells import Wanted

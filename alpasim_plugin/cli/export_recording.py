@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.cli.rollout_folders import find_cell, narrowed
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.recordings.content import DOING, Recording, collect
 from alpasim_plugin.recordings.mcap_file import require_mcap, write_mcap
 from alpasim_plugin.recordings.rerun_file import require_rerun, write_rrd

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import resolve, resolve_renderer
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.plugins.parts import resolve, resolve_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
 from alpasim_plugin.runtime.logged_rollout import find_rollout
 from alpasim_plugin.runtime.plan import slug

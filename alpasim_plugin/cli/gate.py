@@ -15,7 +15,7 @@ from alpasim_plugin.cli.deciding import What, decide_into, plan_of, population_o
 from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.progress import make_progress, warn
 from alpasim_plugin.cli.run import parse_seeds
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.decide import Design
 from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from alpasim_plugin.parts import names, unidentified
-from alpasim_plugin.parts.loading import load
-from alpasim_plugin.parts.resolve import declaration_of, note_of
+from alpasim_plugin.plugins.parts import names, unidentified
+from alpasim_plugin.plugins.parts.loading import load
+from alpasim_plugin.plugins.parts.resolve import declaration_of, note_of
 
 EPILOG = "Example: `simrun list scenarios`"
 

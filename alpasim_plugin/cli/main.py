@@ -14,8 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from alpasim_plugin.errors import InputError, SimrunError
-from alpasim_plugin.stopping import Stopped, leave_at_once, stoppable
+from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.process.signals import Stopped, leave_at_once, stoppable
 
 if TYPE_CHECKING:
     import typer
@@ -87,7 +87,7 @@ VERBS: dict[str, tuple[str, str, str, str]] = {
     ),
     "bench": ("bench", "app", "", "Measure speed and error of parts."),
     "train": ("train", "app", "", "Make training data and train networks."),
-    "judge": ("judge", "app", "", "Check, freeze and describe the judges: networks that measure images (docs/judges.md)."),
+    "judge": ("judge", "app", "", "Check, freeze and describe the judges: networks that measure images (docs/lab/judges.md)."),
 }  # fmt: skip
 OWN_OPTIONS = ("--help",)
 

@@ -13,8 +13,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from alpasim_plugin.atomic import write_text
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import write_text
 
 DOING = "writing a template"
 Kind = Literal["policy", "scenario", "renderer", "fixer", "metric"]

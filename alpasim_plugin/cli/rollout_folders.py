@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.contents import CONTENTS, RUN_INFO
 from alpasim_plugin.runtime.manifests import MANIFEST, read_manifest
 from alpasim_plugin.viewer.cells import Wanted

@@ -13,17 +13,17 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
-from alpasim_plugin.bounds import SEED, SEEDS
 from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
 from alpasim_plugin.cli.progress import background_lines, fixer_labels, make_progress, varied_lines
 from alpasim_plugin.cli.report import report_line
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.limits import SEED, SEEDS
+from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
-from alpasim_plugin.stopping import Stopped
 from evaluators import PRESETS
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 from evaluators.report.run_folder import read_run

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
 from evaluators.report.metric_info import HEADLINE
 from evaluators.report.numbers import plural

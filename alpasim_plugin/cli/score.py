@@ -12,7 +12,7 @@ from rich.console import Console
 
 from alpasim_plugin.cli.progress import describe
 from alpasim_plugin.cli.report import report_line
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
 from alpasim_plugin.runtime.score_run import ScoreResult, execute_score

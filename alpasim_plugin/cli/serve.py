@@ -11,8 +11,8 @@ import typer
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, Security, is_loopback
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.stopping import Stopped
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.process.signals import Stopped
 
 DOING = "reading the options of simrun serve"
 MIB = 1 << 20

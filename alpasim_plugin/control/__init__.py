@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.parts import build, unidentified
-from alpasim_plugin.types import Controller, Vehicle
+from alpasim_plugin.core.types import Controller, Vehicle
+from alpasim_plugin.plugins.parts import build, unidentified
 
 __all__ = ["Controller", "make_controller"]
 
@@ -12,7 +12,7 @@ def make_controller(name: str, vehicle: Vehicle) -> Controller:
     """Return a controller for a vehicle.
 
     Args:
-        name: A controller as `alpasim_plugin.parts.resolve` takes it.
+        name: A controller as `alpasim_plugin.plugins.parts.resolve` takes it.
         vehicle: What it moves.
 
     Raises:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
-from alpasim_plugin.errors import InputError, PolicyError
-from alpasim_plugin.geometry import se2, yaw_of
-from alpasim_plugin.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.geometry import se2, yaw_of
+from alpasim_plugin.core.types import EgoState, Trajectory, Vehicle
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 

@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Vehicle
 
 MAX_SUBSTEP_S = 0.01
 

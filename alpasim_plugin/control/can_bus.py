@@ -18,7 +18,7 @@ import numpy as np
 
 from alpasim_plugin.control.can_codec import BadFrame, Codec
 from alpasim_plugin.control.can_map import Received
-from alpasim_plugin.errors import InputError, PolicyError
+from alpasim_plugin.core.errors import InputError, PolicyError
 
 DOING = "opening a CAN bus"
 HOLD_US = 200_000  # how long the last command stands in for a missing one

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.control.can_map import CanMap, Checksum, ChecksumKind, Received, Sent
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 DOING = "opening a CAN database"
 _POLYNOMIAL, _START = 0x1D, 0xFF  # CRC-8 SAE J1850

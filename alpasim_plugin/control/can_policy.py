@@ -15,9 +15,9 @@ from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.control.can_bus import Address, Commands, Exchange, open_bus
 from alpasim_plugin.control.can_codec import open_codec
 from alpasim_plugin.control.can_map import load_map
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import transform_points, yaw_of
-from alpasim_plugin.types import F64, EgoState, Observation, Plan, Policy, Route, Scenario, SensorSpec, Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import transform_points, yaw_of
+from alpasim_plugin.core.types import F64, EgoState, Observation, Plan, Policy, Route, Scenario, SensorSpec, Vehicle
 
 PLAN_US, PLAN_STEP_US = 5_000_000, 100_000
 TRACK_M = 1.6  # between the wheels of an axle

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop
-from alpasim_plugin.geometry import interpolate, wrap_angle, yaw_of
-from alpasim_plugin.types import Controller, EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import interpolate, wrap_angle, yaw_of
+from alpasim_plugin.core.types import Controller, EgoState, Trajectory, Vehicle
 
 
 class PerfectController(Controller):

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.geometry import yaw_from_quat
-from alpasim_plugin.types import F64, Trajectory
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import F64, Trajectory
 
 MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
 

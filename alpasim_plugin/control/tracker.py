@@ -17,7 +17,7 @@ import numpy as np
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop, planar, spatial
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.control.reference_path import ReferencePath, build_reference_path
-from alpasim_plugin.types import F64, Controller, EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, Controller, EgoState, Trajectory, Vehicle
 
 MAX_LATERAL_MPS2 = 8.0  # beyond it tyres slip and a kinematic bicycle is no model of a car
 CONTROL_S = 0.05  # how often the law looks again within one call

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from alpasim_plugin.errors import FixerError, SimrunError
+from alpasim_plugin.core.errors import FixerError, SimrunError
+from alpasim_plugin.core.types import U8, Actor, Fixer, Frame, RenderRequest
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
 from alpasim_plugin.semantic_map.prepare import PreparedMap
-from alpasim_plugin.types import U8, Actor, Fixer, Frame, RenderRequest
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 DOING = "fixing a block of frames"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from alpasim_plugin.core.types import BlockRule, Fixer, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.block_runner import BlockRunner
 from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.per_frame import PerFrameRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
-from alpasim_plugin.parts import complete
+from alpasim_plugin.plugins.parts import complete
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.types import BlockRule, Fixer, Frame, RenderRequest, Scenario
 
 FixedRenderer = PerFrameRenderer | SpeculativeRenderer | ChunkRenderer
 ONE_BY_ONE = BlockRule(1, 1)

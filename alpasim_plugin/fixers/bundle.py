@@ -15,14 +15,14 @@ from pathlib import Path
 
 from torch import Tensor
 
-from alpasim_plugin.atomic import write_safetensors
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import LatentFixerSettings
+from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.io.reading.json_files import kind_of, parse_json
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE
-from alpasim_plugin.reading.json_files import kind_of, parse_json
 
 BundleSettings = LatentFixerSettings | PixelFixerSettings
 FORMAT = "simrun-fixer-1"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from alpasim_plugin.errors import RendererError
+from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.types import Fixer, Frame, Renderer, RenderRequest
 from alpasim_plugin.fixers.block_runner import BlockRunner
-from alpasim_plugin.types import Fixer, Frame, Renderer, RenderRequest
 
 
 class ChunkRenderer(Renderer):

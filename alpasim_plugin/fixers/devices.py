@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from alpasim_plugin.errors import FixerError
+from alpasim_plugin.core.errors import FixerError
 from alpasim_plugin.nets.machine_probe import choose_threads
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.interfaces import Declaration
 from alpasim_plugin.nets.headers import read_metadata
+from alpasim_plugin.plugins.interfaces import Declaration
 
 if TYPE_CHECKING:
     from alpasim_plugin.fixers.image_fixer import ImageFixer

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from alpasim_plugin.pixels import is_black
-from alpasim_plugin.types import U8
+from alpasim_plugin.core.pixels import is_black
+from alpasim_plugin.core.types import U8
 
 NAN, RANGE, BLACK, FROZEN = "fixer-nan", "fixer-range", "fixer-black", "fixer-frozen"
 LIMIT = 1.5  # a quarter of the range from black to white beyond either end

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from alpasim_plugin.core.types import U8, BlockRule, Fixer, Frame
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
 class IdentityFixer(Fixer):

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8, BlockRule, Fixer, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.devices import take_threads
 from alpasim_plugin.fixers.image_pipeline import fix_images, sample_window
@@ -24,7 +25,6 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import Clip, Views, check_continues, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE, crop_clip
-from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
 from alpasim_plugin.fixers.gather import gather_cells_cpu
-from alpasim_plugin.geometry import se2
 from alpasim_plugin.nets.pixel_generator import CELL, PixelState
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import ActorBox
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.types import Box, CameraSpec, LaneMap
 
 SIDE_PX = 16
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x

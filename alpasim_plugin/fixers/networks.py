@@ -10,7 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
 from alpasim_plugin.fixers.factory import weights_to_give
@@ -24,7 +25,6 @@ from alpasim_plugin.nets.schedule import CONTEXT_STEP
 from alpasim_plugin.nets.streaming_state import State
 from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
-from alpasim_plugin.seeding import derive_seed
 
 DOING = "loading the networks of a fixer"
 TAEHV_WIDTHS = (256, 128, 64, 64)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.seeding import stream
+from alpasim_plugin.core.seeding import stream
 
 
 def latent_noise(scene_id: str, seed: int, cameras: Sequence[str], draws: int, latents: range, shape: tuple[int, int, int]) -> list[Tensor]:

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8, BlockRule, Fixer, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.devices import take_threads
 from alpasim_plugin.fixers.networks import LATENT, load_networks
@@ -21,7 +22,6 @@ from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.fixers.views import DOING, SIDE, Views, group_views, to_clip, to_images
 from alpasim_plugin.nets.clips import SIDE as LATENT_SIDE
 from alpasim_plugin.nets.clips import crop_clip
-from alpasim_plugin.types import U8, BlockRule, Fixer, Frame
 
 
 @dataclass(frozen=True)

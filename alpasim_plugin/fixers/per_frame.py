@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from alpasim_plugin.core.types import Fixer, Frame, Renderer, RenderRequest
 from alpasim_plugin.fixers.block_runner import BlockRunner
-from alpasim_plugin.types import Fixer, Frame, Renderer, RenderRequest
 
 
 class PerFrameRenderer(Renderer):

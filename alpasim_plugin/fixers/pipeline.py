@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.networks import Networks, decode
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.nets.graphs import CudaRecorder, Function, GraphedFunction, Recorder

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F32, I64, U8, BlockRule, Fixer, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.devices import take_threads
 from alpasim_plugin.fixers.pixel_noise import content_key, pixel_noise
@@ -20,7 +21,6 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
 from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
 from alpasim_plugin.nets.pixel_source import sparse_source
-from alpasim_plugin.types import F32, I64, U8, BlockRule, Fixer, Frame
 
 
 @dataclass(frozen=True)

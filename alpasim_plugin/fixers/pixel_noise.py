@@ -6,8 +6,8 @@ import hashlib
 
 import numpy as np
 
-from alpasim_plugin.seeding import derive_seed
-from alpasim_plugin.types import F32, I64, U8
+from alpasim_plugin.core.seeding import derive_seed
+from alpasim_plugin.core.types import F32, I64, U8
 
 ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Steele et al., 2014, SplitMix64)
 MIX = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))

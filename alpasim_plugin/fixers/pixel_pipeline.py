@@ -13,7 +13,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle
 from alpasim_plugin.fixers.devices import require_device
 from alpasim_plugin.fixers.factory import weights_to_give
@@ -24,7 +25,6 @@ from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, Pixe
 from alpasim_plugin.nets.precision import Choice, choose_precision
 from alpasim_plugin.nets.sampling import interpolant
 from alpasim_plugin.nets.schedule import from_names
-from alpasim_plugin.seeding import derive_seed
 
 DOING = "loading the network of a fixer"
 DTYPES: Mapping[Literal["fp32", "bf16"], torch.dtype] = {"fp32": torch.float32, "bf16": torch.bfloat16}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.types import F64, RenderRequest
+from alpasim_plugin.core.types import F64, RenderRequest
 
 NEAR_M = 10.0  # beyond this distance an actor's displacement counts in proportion to its size in the image
 ARM_M = 2.5  # an actor's rotation counts as the displacement of a point this far from its centre

@@ -12,11 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from alpasim_plugin.config import apply_overrides, load_yaml, validate
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.config import apply_overrides, load_yaml, validate
+from alpasim_plugin.io.yaml_positions import Document
 from alpasim_plugin.nets import schedule
 from alpasim_plugin.nets.styles import CLEAR
-from alpasim_plugin.yaml_marks import Document
 
 DOING = "reading the settings of a fixer"
 Positive = Annotated[int, Field(ge=1)]

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.errors import RendererError
+from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.types import Fixer, Frame, Renderer, RenderRequest
 from alpasim_plugin.fixers.block_runner import BlockRunner, ConditionedFrame
 from alpasim_plugin.fixers.prediction_error import Deviation, deviation, same_view
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.types import Fixer, Frame, Renderer, RenderRequest
 
 
 @dataclass

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.nets.clips import ClipSize, crop_clip, pad_clip
 from alpasim_plugin.nets.sampling import RANGE_SLACK as SLACK
-from alpasim_plugin.types import F32, U8, Frame
 
 DOING = "giving a block of frames to a fixer"
 SIDE = 16  # pixels of a token's side

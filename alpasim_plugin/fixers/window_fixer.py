@@ -14,7 +14,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8, BlockRule, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.image_fixer import MaplessFixer
 from alpasim_plugin.fixers.image_pipeline import sample_window
@@ -25,7 +26,6 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import Views, group_views, to_clip, to_images
 from alpasim_plugin.fixers.windows import fade_in, windows
 from alpasim_plugin.nets.clips import SIDE, crop_clip
-from alpasim_plugin.types import U8, BlockRule, Frame
 
 WHOLE_CLIP = sys.maxsize  # frames of a block: as many as there are
 

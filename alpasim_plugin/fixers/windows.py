@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import F32
+from alpasim_plugin.core.types import F32
 
 
 def windows(frames: int, length: int, stride: int) -> list[range]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.gaussians.constants import SLOPE_MARGIN
-from alpasim_plugin.geometry import inverse
-from alpasim_plugin.types import F64
 
 
 @dataclass(frozen=True, eq=False)

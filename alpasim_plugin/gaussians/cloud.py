@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.constants import LOG_SCALE_LIMIT
 from alpasim_plugin.gaussians.sh import SH_SIZES, rotate_sh
-from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix
-from alpasim_plugin.types import F64
 
 FloatArray = npt.NDArray[np.floating]
 LARGEST_SCALE_M = np.exp(LOG_SCALE_LIMIT) * 1.0001  # room for float32 rounding

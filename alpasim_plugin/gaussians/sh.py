@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 SH_SIZES = (1, 4, 9, 16)  # (degree + 1)^2
 

@@ -5,7 +5,7 @@ Needs the extra ``gym``. See docs/gym.md.
 
 from __future__ import annotations
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 try:
     import gymnasium

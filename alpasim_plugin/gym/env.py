@@ -11,16 +11,16 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.plan_check import plan_problem
+from alpasim_plugin.core.seeding import derive_seed
+from alpasim_plugin.core.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec
 from alpasim_plugin.gym.actions import Actions, Controls, Trajectories
 from alpasim_plugin.gym.reward import Instant, Judge, Reward
-from alpasim_plugin.plan_check import plan_problem
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import Loop
 from alpasim_plugin.runtime.scoring import score_log
-from alpasim_plugin.seeding import derive_seed
-from alpasim_plugin.types import F64, U8, EgoState, Observation, Plan, Scenario, SensorSpec
 from scenarios.load import load_scenario
 
 DOING = "making an environment"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.geometry import trajectory_from_poses
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.geometry import trajectory_from_poses
+from alpasim_plugin.core.types import F64, Actor, EgoState, MetricSeries, RolloutLog, Scenario
 from alpasim_plugin.log.schema import T_rig_box
-from alpasim_plugin.parts import build
-from alpasim_plugin.types import F64, Actor, EgoState, MetricSeries, RolloutLog, Scenario
+from alpasim_plugin.plugins.parts import build
 from evaluators import resolve_evaluators
 from evaluators.base import check_rollout, run_evaluator
 from evaluators.presets import preset as find_preset

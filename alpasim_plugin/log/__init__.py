@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from alpasim_plugin.lazy import lazy_names
+from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from alpasim_plugin.log.facts import read_facts as read_facts

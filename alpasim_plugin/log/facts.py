@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from alpasim_plugin.atomic import atomic_file
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import read_json_lines
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import atomic_file
+from alpasim_plugin.io.reading import read_json_lines
 
 Fact = str | int | float | bool | None
 

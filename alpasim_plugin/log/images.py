@@ -7,9 +7,9 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import images
-from alpasim_plugin.types import U8
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8
+from alpasim_plugin.io.reading import images
 
 ImageEncoding = Literal["png", "jpeg"]
 

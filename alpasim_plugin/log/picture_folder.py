@@ -12,10 +12,10 @@ from typing import Self
 import cv2
 import numpy as np
 
-from alpasim_plugin.atomic import atomic_folder, write_bytes
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import U8
+from alpasim_plugin.io.atomic import atomic_folder, write_bytes
 from alpasim_plugin.log.video_reader import UNSPECIFIED, TimedFrame, VideoFormat
-from alpasim_plugin.types import U8
 
 PERIOD = Fraction(1, 10)  # seconds from picture to picture: they have no times of their own
 WRITING = "writing a folder of pictures"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 
 
 def load_av(doing: str) -> Any:

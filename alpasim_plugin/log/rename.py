@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.alpasim.asl import AslFile, AslReader
-from alpasim_plugin.alpasim.wire import logging_pb2
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.asl import AslFile, AslReader
+from alpasim_plugin.wire import logging_pb2
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import matrix_from_quat, quat_from_matrix, se3
+from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory, Vehicle
 from alpasim_plugin.log.images import ImageEncoding
-from alpasim_plugin.types import F64, Actor, Box, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory, Vehicle
+from alpasim_plugin.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
 EGO = "EGO"
 QUAT_NORM_TOLERANCE = 1e-4  # on |q|^2, as AlpaSim's reader checks it

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.alpasim.asl import AslReader
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.facts import Fact
 from alpasim_plugin.log.schema import EGO
 

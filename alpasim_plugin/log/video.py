@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import I64, U8
 from alpasim_plugin.log.video_reader import VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
-from alpasim_plugin.types import I64, U8
 
 _MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000/1001)
 

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from alpasim_plugin.bounds import ARCHIVE_BYTES
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8
+from alpasim_plugin.io.limits import ARCHIVE_BYTES
+from alpasim_plugin.io.reading import check_regular
 from alpasim_plugin.log.pyav import exact_conversion, load_av
-from alpasim_plugin.reading import check_regular
-from alpasim_plugin.types import U8
 
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"

@@ -9,11 +9,11 @@ from typing import Self
 
 import numpy as np
 
-from alpasim_plugin.atomic import temporary_path
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import U8
+from alpasim_plugin.io.atomic import temporary_path
 from alpasim_plugin.log.pyav import exact_conversion, load_av
 from alpasim_plugin.log.video_reader import UNSPECIFIED
-from alpasim_plugin.types import U8
 
 BT601, BT709 = 5, 1  # matrices of ITU-T H.273
 WRITABLE = {UNSPECIFIED: BT601, BT709: BT709, 4: 4, BT601: BT601, 6: BT601, 7: 7, 9: 9}  # stated matrix -> the one to convert with

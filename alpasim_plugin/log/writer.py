@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin import __version__
-from alpasim_plugin.alpasim.asl import AslFile
-from alpasim_plugin.alpasim.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate, inverse, quat_from_matrix, se3, trajectory_from_poses
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse, quat_from_matrix, se3, trajectory_from_poses
+from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
+from alpasim_plugin.log.asl import AslFile
 from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.schema import (
     EGO,
@@ -28,7 +28,7 @@ from alpasim_plugin.log.schema import (
     wire_traffic_session,
     wire_trajectory,
 )
-from alpasim_plugin.types import F64, CameraSpec, EgoState, Frame, RenderRequest, Trajectory
+from alpasim_plugin.wire import api_version, common_pb2, controller_pb2, egodriver_pb2, logging_pb2, sensorsim_pb2
 
 _SERVICES = ("runtime", "egodriver", "sensorsim", "physics", "traffic", "controller", "video_model")
 

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 Kernel = Literal["auto", "flash", "cudnn", "efficient", "math"]
 BACKENDS = {

@@ -15,9 +15,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from alpasim_plugin.bounds import WEIGHT_BYTES
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import check_regular, parsing
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.limits import WEIGHT_BYTES
+from alpasim_plugin.io.reading import check_regular, parsing
 
 StateDict = dict[str, Tensor]
 WRAPPERS = ("model", "state_dict")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 GROUP = 4  # temporal compression: frames of every latent but the first
 SIDE = 8  # spatial compression: pixels per latent along a side

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin import seeding
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core import seeding
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import convert, listed
 
 

@@ -19,7 +19,7 @@ from typing import Self, cast
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets import checkpoints
 from alpasim_plugin.nets.attention import Attend, block_causal_attention
 from alpasim_plugin.nets.blocks import Block, FinalLayer, KeysValues, TimeSignal

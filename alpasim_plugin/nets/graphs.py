@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_map_only
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 
 Function = Callable[..., Any]  # tensors in tuples, lists, dictionaries or None, in and out
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from safetensors import safe_open
 
-from alpasim_plugin.bounds import WEIGHT_BYTES
-from alpasim_plugin.reading import check_regular, parsing
+from alpasim_plugin.io.limits import WEIGHT_BYTES
+from alpasim_plugin.io.reading import check_regular, parsing
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:

@@ -20,7 +20,7 @@ def initial_weights(sizes: DiTSizes, seed: int, zero_velocity: bool = False) -> 
 
     Args:
         sizes: The network.
-        seed: Of the draw, for example from `alpasim_plugin.seeding.derive_seed`.
+        seed: Of the draw, for example from `alpasim_plugin.core.seeding.derive_seed`.
         zero_velocity: Also zero the output layer: the predicted velocity is then zero, and one step returns its source unchanged.
 
     Returns:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.random import fork_rng
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import listed, weight
 from alpasim_plugin.nets.pixel_layers import Conv3, Downsample, ResidualBlock, Upsample, activation, cells, pixels, repeat_per_pixel, small
 from alpasim_plugin.nets.pixel_memory import FrameMemory, MemoryState

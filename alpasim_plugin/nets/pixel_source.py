@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.types import F32, I64
+from alpasim_plugin.core.types import F32, I64
 
 HOLE = 0.5  # opacity below which noise enters the source
 

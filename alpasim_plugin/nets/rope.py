@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 BASE = 10000.0
 RopeTable = tuple[Tensor, Tensor]  # cos, sin: (L, head_width / 2) float32

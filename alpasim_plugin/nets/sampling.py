@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.dit import TextContext
 from alpasim_plugin.nets.kv_cache import BlockCache
 from alpasim_plugin.nets.schedule import NoiseLevel, context_level

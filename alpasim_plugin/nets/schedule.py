@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 SHIFT = 5.0
 TABLE = 1000

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 State = tuple[Tensor, ...]
 Step = Callable[..., tuple[Tensor, State]]

@@ -18,7 +18,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import StateDict, unwrap
 from alpasim_plugin.nets.clips import GROUP, check_latents, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked
@@ -41,7 +41,7 @@ DROPPED = GROUP - 1  # frames dropped at the start of a video
 STAGE = 6  # entries of one stage: three memory blocks, upsampling, growth, convolution
 FIRST = 3  # entry of the first stage
 DOING = "loading tiny decoder weights"
-DO = "give the state dict of TAEHV or LightTAE for Wan 2.1 (keys decoder.*; docs/vae.md lists shapes)"
+DO = "give the state dict of TAEHV or LightTAE for Wan 2.1 (keys decoder.*; docs/lab/vae.md lists shapes)"
 
 
 class SoftClamp(nn.Module):

@@ -28,8 +28,8 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.atomic import write_safetensors
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.nets.checkpoints import load_weights, unwrap
 from alpasim_plugin.nets.clips import GROUP, SIDE, check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.clips import GROUP
 from alpasim_plugin.nets.frame_layers import FrameConv, PointwiseConv, channels_to_frames, conv_frames, run_layers
 from alpasim_plugin.nets.streaming_state import StreamingState

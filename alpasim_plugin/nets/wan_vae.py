@@ -13,7 +13,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import unwrap
 from alpasim_plugin.nets.clips import check_frames, check_latents, group_ends, pass_ends
 from alpasim_plugin.nets.codec_weights import fill_random, load_checked

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 STAGES = 4
 ENCODER_TIME = (False, True, True)  # which of the three halvings also halve the frame rate
 DECODER_TIME = (True, True, False)
 DOING = "loading Wan VAE weights"
-DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix; docs/vae.md lists shapes)"
+DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix; docs/lab/vae.md lists shapes)"
 
 
 @dataclass(frozen=True)

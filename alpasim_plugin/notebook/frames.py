@@ -8,8 +8,8 @@ from typing import Any, Literal
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.optional import require_library
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.plugins.extras import require_library
 
 Library = Literal["pandas", "polars"]
 LIBRARIES: tuple[Library, ...] = ("pandas", "polars")

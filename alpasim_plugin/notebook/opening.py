@@ -10,12 +10,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.io.reading.tables import read_parquet
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.notebook.frames import Library, frame_of, paired_table, require, summary_table, valid_only
 from alpasim_plugin.notebook.html import outcome, rollout_html, run_html, title
-from alpasim_plugin.reading.tables import read_parquet
-from alpasim_plugin.types import RolloutLog
 from evaluators.report.headline import find
 from evaluators.report.run_folder import AGAIN, DOING, KEY_COLUMNS, ROLLOUT_COLUMNS, STEP_COLUMNS, Rollout, Run, read_run
 

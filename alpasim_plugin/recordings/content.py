@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.types import F64, I64, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
-from alpasim_plugin.types import F64, I64, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import Logs, no_frames
 from alpasim_plugin.viewer.pictures import Source, sources

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, CameraSpec
+from alpasim_plugin.core.types import F64, CameraSpec
 
 NS_PER_US, NS_PER_S = 1_000, 1_000_000_000
 LINE_STRIP = 0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, BackgroundFile, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.formats import read_gaussians
 from alpasim_plugin.gaussians.scene.builder import placed_cloud
 from alpasim_plugin.gaussians.scene.coverage import Coverage, coverage_of, suggested_transform
-from alpasim_plugin.types import F64, BackgroundFile, Scenario
 
 LEAST = 0.05  # share of the route with Gaussians near it; below it the cameras look into emptiness
 

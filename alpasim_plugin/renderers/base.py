@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.parts import build, unidentified
-from alpasim_plugin.types import Renderer, Scenario
+from alpasim_plugin.core.types import Renderer, Scenario
+from alpasim_plugin.plugins.parts import build, unidentified
 
 
 def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "cpu", threads: int | None = None) -> Renderer:
@@ -12,7 +12,7 @@ def make_renderer(name: str, scenario: Scenario, seed: int = 0, device: str = "c
     Scenes are built once per process and shared between renderers.
 
     Args:
-        name: A renderer as `alpasim_plugin.parts.resolve` takes it.
+        name: A renderer as `alpasim_plugin.plugins.parts.resolve` takes it.
         scenario: What is rendered.
         seed: The rollout's seed: what wanders from frame to frame depends on it, the scene does not.
         device: ``cpu`` or ``cuda``.

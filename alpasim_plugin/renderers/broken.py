@@ -14,8 +14,8 @@ from functools import partial
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.types import U8, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.renderers.gaussian import CleanRenderer
-from alpasim_plugin.types import U8, Frame, Renderer, RenderRequest, Scenario
 
 SHIFT_M = 0.5
 BLUR_SHARE = 0.02  # of the image's width

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from alpasim_plugin.atomic import atomic_folder
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.lock import one_writer
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import atomic_folder
+from alpasim_plugin.io.lock import one_writer
 
 T = TypeVar("T")
 DOING, DO_THIS = "writing to the cache", "free disk space, or name a writable folder in SIMRUN_CACHE"

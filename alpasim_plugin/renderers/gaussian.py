@@ -15,7 +15,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.output import RasterOutput
@@ -26,9 +28,7 @@ from alpasim_plugin.gaussians.scene.log_views import LogView
 from alpasim_plugin.gaussians.scene.nodes import SceneNode
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
-from alpasim_plugin.geometry import interpolate, inverse
 from alpasim_plugin.renderers.background import read_background
-from alpasim_plugin.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4

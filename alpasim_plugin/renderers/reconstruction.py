@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from alpasim_plugin.core.types import Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import LIGHT, lit
@@ -19,7 +20,6 @@ from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, 
 from alpasim_plugin.renderers.reconstruction_files import read_model
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe, recipe_of
-from alpasim_plugin.types import Frame, Renderer, RenderRequest, Scenario
 
 KIND = "reconstructions"
 TILE_M = 24.0  # the background is culled in blocks of this size

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Box, Scenario
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import Start
@@ -20,7 +21,6 @@ from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.reconstruction_files import write_model
 from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe
 from alpasim_plugin.renderers.reconstruction_start import misplaced, rough_start
-from alpasim_plugin.types import Box, Scenario
 
 FEWEST_GAUSSIANS = 40  # an actor with fewer was hardly seen: the scene's own is spliced in
 

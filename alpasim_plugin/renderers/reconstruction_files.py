@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.atomic import write_json
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.scene.sky_mask import SkyView
-from alpasim_plugin.reading import read_json_as
-from alpasim_plugin.vouched import sha256_of
+from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.io.checksums import sha256_of
+from alpasim_plugin.io.reading import read_json_as
 
 HASHES, SKY_VIEWS = "hashes.json", "sky_views.npz"
 DOING, DO_THIS = "reading a reconstruction", "remove its folder; it is made again when it is needed"

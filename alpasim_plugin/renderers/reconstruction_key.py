@@ -10,9 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
-from alpasim_plugin.types import Scenario
 
 BUILD = "alpasim_plugin.renderers.reconstruction_build"  # what it imports decides, with the scene and the recipe, what the model is
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.types import Degradation, Scenario
 
 # By second of the log and camera, so that a longer drive is fitted no worse.
 POINTS_PER_S, FULL_STEPS_PER_S = 2_400, 50.0

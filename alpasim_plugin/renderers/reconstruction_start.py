@@ -8,12 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F32, Box
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.start import Start, start_from_depth
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.renderers.reconstruction_recipe import ReconstructionRecipe
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F32, Box
 
 PATCH_SHARE = 0.075  # of the image's width: neighbours within a patch are wrong together
 LEAST, MOST = 0.5, 2.0  # a depth is never wrong by more than these factors

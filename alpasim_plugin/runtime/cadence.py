@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.clock import Clock
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import I64, BlockRule, Scenario, SensorSpec
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import I64, BlockRule, Scenario, SensorSpec
 
 DOING = "setting up a loop in whole blocks of frames"
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import islice
 
-from alpasim_plugin.clock import Clock, Tick
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.clock import Clock, Tick
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
 from alpasim_plugin.runtime.cadence import Cadence, make_cadence
 from alpasim_plugin.runtime.forecast import Forecaster, PredictedRequests, shutter_poses
-from alpasim_plugin.types import F64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
 
 
 class CameraRig:

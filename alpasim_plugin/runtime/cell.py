@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from alpasim_plugin.atomic import disk_error
 from alpasim_plugin.control import Controller
-from alpasim_plugin.errors import PolicyError, SimrunError
-from alpasim_plugin.parts import build, complete
+from alpasim_plugin.core.errors import PolicyError, SimrunError
+from alpasim_plugin.core.types import Policy, Renderer, Scenario
+from alpasim_plugin.io.atomic import disk_error
+from alpasim_plugin.plugins.parts import build, complete
+from alpasim_plugin.process.stdout import parts_print_to_stderr
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, STEPS_NAME, Remedy, RolloutState, inspect_rollout, write_manifest
 from alpasim_plugin.runtime.pictures import VIDEO_NAME
@@ -25,8 +27,6 @@ from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, OUTPUT_NAME, 
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
 from alpasim_plugin.runtime.store import STEPS_SCHEMA, write_table
-from alpasim_plugin.stdout import parts_print_to_stderr
-from alpasim_plugin.types import Policy, Renderer, Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 

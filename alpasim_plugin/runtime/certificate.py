@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import pyarrow.parquet as pq
 
-from alpasim_plugin.atomic import scratch_folder
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.io.atomic import scratch_folder
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Key, digests, first_difference, sha256, trace_log
 from alpasim_plugin.runtime.cell import run_cell

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.contents import AGAIN, CONTENTS, DOING, RUN_INFO, Contents, damaged_files, read_contents, read_run_json
 from alpasim_plugin.runtime.manifests import MANIFEST, Damage, inspect_rollout
 from alpasim_plugin.runtime.plan import rollout_folder

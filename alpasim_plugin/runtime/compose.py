@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from alpasim_plugin.parts import RendererSpec, build, resolve_renderer
+from alpasim_plugin.core.types import Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.plugins.parts import RendererSpec, build, resolve_renderer
 from alpasim_plugin.runtime.guards import checked_frames
-from alpasim_plugin.types import Frame, Renderer, RenderRequest, Scenario
 
 
 def make_renderer(
@@ -20,7 +20,7 @@ def make_renderer(
     """Build one rollout's renderer.
 
     Args:
-        name: A renderer, or a fixer over one, as `alpasim_plugin.parts.resolve_renderer` takes it; or its resolved spec.
+        name: A renderer, or a fixer over one, as `alpasim_plugin.plugins.parts.resolve_renderer` takes it; or its resolved spec.
         scenario: What is rendered.
         seed: The rollout's seed, for temporal noise and the fixer's noise.
         device: ``cpu`` or ``cuda``.

@@ -13,10 +13,10 @@ from typing import Any, cast
 
 from typing_extensions import TypedDict
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading.json_files import as_shape
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.checksums import FileFacts, problem_of, read_sealed, vouch, write_sealed
+from alpasim_plugin.io.reading.json_files import as_shape
 from alpasim_plugin.runtime.manifests import Damage
-from alpasim_plugin.vouched import FileFacts, problem_of, read_sealed, vouch, write_sealed
 
 CONTENTS, RUN_INFO, SCENES, AGGREGATE = "contents.json", "run.json", "scenes", "aggregate"
 SUMMARY, ROLLOUTS, STEPS = "summary.json", "rollouts.parquet", "steps.parquet"
@@ -89,7 +89,7 @@ def find_contents(root: Path) -> Contents | None:
 
 
 def damaged_files(root: Path, contents: Contents, full: bool = False) -> list[Damage]:
-    """Return the damaged tables and scene files of a run folder; ``full`` as in `alpasim_plugin.vouched.problem_of`."""
+    """Return the damaged tables and scene files of a run folder; ``full`` as in `alpasim_plugin.io.checksums.problem_of`."""
     found = ((name, problem_of(root / name, facts, full)) for name, facts in contents.files.items())
     return [Damage("", name, problem) for name, problem in found if problem is not None]
 

@@ -14,9 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from alpasim_plugin.child import end_children
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import digest
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.plugins.parts import digest
+from alpasim_plugin.process.subprocesses import end_children
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.contents import find_contents, read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
@@ -25,7 +26,6 @@ from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
 from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, publish, write_run_info
 from alpasim_plugin.runtime.tables import pool_of, rollout_rows
 from alpasim_plugin.runtime.writing import writing
-from alpasim_plugin.seeding import stream
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.aggregate.rows import RendererRows, by_renderer
 from evaluators.gate.judge import failures_of

@@ -11,8 +11,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Protocol, TypeVar
 
-from alpasim_plugin.errors import InfrastructureError
-from alpasim_plugin.processes import end_with_parent
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.process.processes import end_with_parent
 from alpasim_plugin.runtime.workers import GRACE_S, thread_environment
 
 Say = Callable[[Any], None]

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InfrastructureError
-from alpasim_plugin.measured import share_measurements
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.io.measured import share_measurements
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runtime.executors.assignment import assignment_as_here
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool

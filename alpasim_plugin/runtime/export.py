@@ -16,12 +16,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.atomic import atomic_folder, write_json
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import RolloutLog, Scenario
+from alpasim_plugin.io.atomic import atomic_folder, write_json
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.rename import Renaming, Stage, copy_log
 from alpasim_plugin.log.session import session_uuid
-from alpasim_plugin.parts import resolve_renderer
+from alpasim_plugin.plugins.parts import resolve_renderer
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.contents import read_contents
 from alpasim_plugin.runtime.execute import thread_budget
@@ -32,7 +33,6 @@ from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import RunOptions, slug
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.score_logs import check_vouched
-from alpasim_plugin.types import RolloutLog, Scenario
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand
 from scenarios.usdz_write import alpasim_cameras

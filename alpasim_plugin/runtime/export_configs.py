@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from alpasim_plugin.atomic import write_text
+from alpasim_plugin.io.atomic import write_text
 from evaluators.alpasim import EvalSettings
 from scenarios.cosmos_camera import FRONT_WIDE
 

@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import logging_pb2, sensorsim_pb2
-from alpasim_plugin.geometry import inverse, offset_trajectory, se3
+from alpasim_plugin.core.geometry import inverse, offset_trajectory, se3
+from alpasim_plugin.core.types import F64, CameraSpec, Renderer, RenderRequest, RolloutLog, Trajectory
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.schema import wire_camera, wire_image, wire_render_request
 from alpasim_plugin.runtime.forecast import shutter_poses
 from alpasim_plugin.runtime.guards import checked_frames
-from alpasim_plugin.types import F64, CameraSpec, Renderer, RenderRequest, RolloutLog, Trajectory
+from alpasim_plugin.wire import logging_pb2, sensorsim_pb2
 
 
 class AddedFrames:

@@ -10,10 +10,10 @@ from typing import Any
 
 import yaml
 
-from alpasim_plugin.atomic import atomic_file
-from alpasim_plugin.config import load_yaml
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Scenario
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.io.atomic import atomic_file
+from alpasim_plugin.io.config import load_yaml
 from scenarios.load import find, load_scenario
 from scenarios.suite import ScenarioRef
 from scenarios.usdz_write import rig_box, write_usdz

@@ -11,11 +11,11 @@ from typing import Any
 
 import cv2
 
-from alpasim_plugin.atomic import write_bytes, write_json
-from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.log import decode_image, encode_image, read_asl
 from alpasim_plugin.runtime.probe_files import find_probe
-from alpasim_plugin.types import RolloutLog
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.report.flips import FLIPS_NAME, Flip, find_flips
 from evaluators.report.run_folder import read_run

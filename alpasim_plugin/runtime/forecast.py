@@ -13,10 +13,10 @@ from typing import overload
 import numpy as np
 
 from alpasim_plugin.control import Controller
-from alpasim_plugin.geometry import interpolate, quat_from_matrix
+from alpasim_plugin.core.geometry import interpolate, quat_from_matrix
+from alpasim_plugin.core.types import F64, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory
 from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState, advance_ego
-from alpasim_plugin.types import F64, CameraSpec, EgoState, RenderRequest, Scenario, Trajectory
 from alpasim_plugin.world.actors import ActorForecast, Actors
 
 

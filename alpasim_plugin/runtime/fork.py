@@ -15,9 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.trace import Difference, Trace, first_difference
-from alpasim_plugin.parts import digest, resolve, resolve_renderer
+from alpasim_plugin.plugins.parts import digest, resolve, resolve_renderer
 from alpasim_plugin.runtime.cell import RolloutParts, build_parts, run_cell
 from alpasim_plugin.runtime.certificate import log_trace
 from alpasim_plugin.runtime.contents import read_run_json, write_run_json
@@ -30,7 +31,6 @@ from alpasim_plugin.runtime.run import RunResult, finish_run, write_run_info
 from alpasim_plugin.runtime.switch import SwitchedController, SwitchedPolicy, SwitchedRenderer
 from alpasim_plugin.runtime.tables import pool_of
 from alpasim_plugin.runtime.writing import writing
-from alpasim_plugin.types import Scenario
 
 DOING = "continuing a logged rollout"
 UNCHANGED = "replay"

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.errors import PolicyError, RendererError, SimrunError
-from alpasim_plugin.pixels import is_black
-from alpasim_plugin.plan_check import plan_problem, sensors_problem
-from alpasim_plugin.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec
+from alpasim_plugin.core.errors import PolicyError, RendererError, SimrunError
+from alpasim_plugin.core.pixels import is_black
+from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
+from alpasim_plugin.core.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec
 
 CHECK = "simrun check-policy finds all faults of a policy"
 TRACEBACK = "see the traceback in the rollout's manifest"

@@ -16,12 +16,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import alpasim_plugin
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.runtime.plan import Cell
 from alpasim_plugin.runtime.provenance import hardware
 from alpasim_plugin.runtime.workers import Lost, in_workers
-from alpasim_plugin.types import Scenario
 
 KIND = "kernels"
 SUBJECTS = {  # subject -> tiny case, imported in the process that compiles

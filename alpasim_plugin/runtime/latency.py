@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from alpasim_plugin.types import Latency, Trajectory
+from alpasim_plugin.core.types import Latency, Trajectory
 
 
 @dataclass

@@ -11,12 +11,12 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import overrides_of, resolve_renderer
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.parts import overrides_of, resolve_renderer
 from alpasim_plugin.runtime.contents import read_run_json
 from alpasim_plugin.runtime.manifests import inspect_rollout
 from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan, refuse_commands
-from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
 
 DOING = "finding a logged rollout"

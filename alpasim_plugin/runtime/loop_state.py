@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from alpasim_plugin.control import Controller
-from alpasim_plugin.geometry import quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
-from alpasim_plugin.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Scenario, Trajectory
+from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
+from alpasim_plugin.core.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Scenario, Trajectory
 from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 from typing_extensions import TypedDict
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading.json_files import as_shape
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.checksums import FileFacts, problem_of, read_sealed, vouch, write_sealed
+from alpasim_plugin.io.reading.json_files import as_shape
 from alpasim_plugin.runtime.pictures import STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, OUTPUT_NAME
-from alpasim_plugin.vouched import FileFacts, problem_of, read_sealed, vouch, write_sealed
 
 MANIFEST, STEPS_NAME = "manifest.json", "steps.parquet"
 DRIVEN = (LOG_NAME, FRAMES_NAME, STRIP_NAME, VIDEO_NAME, OUTPUT_NAME)  # files that only driving makes

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.contents import ROLLOUTS, damaged_files, find_contents, read_run_json
 from evaluators.aggregate.columns import AGAIN, DOING, RolloutTable
 from evaluators.aggregate.overall import numbers

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.runtime.workers import Lost, in_workers
 
 A = TypeVar("A")

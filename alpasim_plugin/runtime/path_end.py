@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.geometry import arc_lengths, interpolate, project
-from alpasim_plugin.types import F64, Trajectory
+from alpasim_plugin.core.geometry import arc_lengths, interpolate, project
+from alpasim_plugin.core.types import F64, Trajectory
 
 DIRECTION_M = 1.0
 STANDS_MPS = 1.0

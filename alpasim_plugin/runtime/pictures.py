@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.atomic import write_bytes
-from alpasim_plugin.clock import Clock
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.log import encode_image, write_mp4
-from alpasim_plugin.types import U8, Frame
 
 STRIP_NAME, VIDEO_NAME = "strip.jpg", "front.mp4"
 STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, as fractions of the rollout

@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
-from alpasim_plugin.parts.loading import COMMAND
-from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
+from alpasim_plugin.plugins.parts.loading import COMMAND
+from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.renderers.background import background_note
-from alpasim_plugin.types import Scenario
 from evaluators import resolve_evaluators
 from evaluators.presets import preset
 from scenarios.load import code_digest_of, load_scenario

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.plan_check import unit_guess
-from alpasim_plugin.types import EgoState, Plan, Vehicle
+from alpasim_plugin.core.plan_check import unit_guess
+from alpasim_plugin.core.types import EgoState, Plan, Vehicle
 
 REACH_S = 1.0
 MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit
@@ -30,7 +30,7 @@ class PlanMotion:
         self._ratios: list[float] = []
 
     def add(self, plan: Plan, ego: EgoState) -> None:
-        """Count a plan that `alpasim_plugin.plan_check.plan_problem` has passed."""
+        """Count a plan that `alpasim_plugin.core.plan_check.plan_problem` has passed."""
         t_s = (plan.times_us - plan.times_us[0]) * 1e-6
         reach_s = min(REACH_S, float(t_s[-1]))
         if reach_s <= 0.0:

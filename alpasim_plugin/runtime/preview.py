@@ -17,13 +17,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from alpasim_plugin.atomic import write_bytes
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
+from alpasim_plugin.core.types import F64, U8, Actor, RenderRequest, Scenario
+from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.renderers.background import background_note
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.guards import checked_frames
-from alpasim_plugin.types import F64, U8, Actor, RenderRequest, Scenario
 
 DOING = "previewing a scenario"
 MARGIN_M = 15.0

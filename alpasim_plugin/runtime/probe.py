@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.geometry import quat_from_yaw
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
 from alpasim_plugin.log.trace import first_difference
-from alpasim_plugin.parts import resolve_renderer
+from alpasim_plugin.plugins.parts import resolve_renderer
 from alpasim_plugin.runtime.cell import build_parts
 from alpasim_plugin.runtime.certificate import log_trace
 from alpasim_plugin.runtime.execute import thread_budget
@@ -25,7 +26,6 @@ from alpasim_plugin.runtime.guards import checked_frames, checked_plan
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.types import F64, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US, plan_gap
 
 HORIZONS_S = (1.0, 3.0)

@@ -9,7 +9,7 @@ import pyarrow as pa
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from alpasim_plugin.atomic import write_bytes, write_json
+from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
 from alpasim_plugin.runtime.probe import HORIZONS_S, Probe, summarise

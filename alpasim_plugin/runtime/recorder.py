@@ -12,14 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.clock import Clock
-from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
-from alpasim_plugin.log.session import session_uuid
-from alpasim_plugin.runtime.path_end import PathEnd
-from alpasim_plugin.runtime.pictures import Pictures
-from alpasim_plugin.runtime.plan_motion import PlanMotion
-from alpasim_plugin.runtime.stages import StageTimes
-from alpasim_plugin.types import (
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
     EgoState,
@@ -32,6 +26,12 @@ from alpasim_plugin.types import (
     SensorSpec,
     Trajectory,
 )
+from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
+from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.runtime.path_end import PathEnd
+from alpasim_plugin.runtime.pictures import Pictures
+from alpasim_plugin.runtime.plan_motion import PlanMotion
+from alpasim_plugin.runtime.stages import StageTimes
 from alpasim_plugin.world.ego import ego_states_from_log
 
 LOG_NAME, FRAMES_NAME, OUTPUT_NAME = "rollout.asl", "frames.jsonl", "output.log"

@@ -9,9 +9,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import parsing
-from alpasim_plugin.reading.json_files import as_shape
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.reading.json_files import as_shape
 from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.check import Inspection, inspect_run
 from alpasim_plugin.runtime.contents import CONTENTS, DOING, REPORTS, RUN_INFO, TABLES, write_run_json

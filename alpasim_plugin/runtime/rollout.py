@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Mapping, Sequence
 
-from alpasim_plugin.clock import Clock
 from alpasim_plugin.control import make_controller
-from alpasim_plugin.parts import complete
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.types import F64, Controller, Observation, Plan, Policy, Renderer, Scenario, SensorSpec
+from alpasim_plugin.plugins.parts import complete
 from alpasim_plugin.runtime.cadence import make_cadence
 from alpasim_plugin.runtime.cameras import CameraRig
 from alpasim_plugin.runtime.forecast import Forecaster
@@ -16,7 +17,6 @@ from alpasim_plugin.runtime.latency import PlanQueue
 from alpasim_plugin.runtime.loop_state import LoopState
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.recorder import Recorder
-from alpasim_plugin.types import F64, Controller, Observation, Plan, Policy, Renderer, Scenario, SensorSpec
 from alpasim_plugin.world.actors import Actors, make_actors
 
 
@@ -38,7 +38,7 @@ def run_rollout(
         scenario: The scenario.
         renderer: A session for this rollout alone; see `make_renderer`.
         policy: Plans from the frames; see `make_policy`.
-        seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.seeding`.
+        seed: Rollout seed: the policy's sampling noise; see `alpasim_plugin.core.seeding`.
         recorder: Records the rollout; by default into a temporary folder.
         controller: Vehicle model; by default the policy's, else the bicycle with a tracker.
         actors: Road users at their beginning; by default those of the scenario.

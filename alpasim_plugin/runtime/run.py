@@ -10,10 +10,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from alpasim_plugin.atomic import write_json
-from alpasim_plugin.child import end_children
-from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.plugins.parts.source import own_code_digest
+from alpasim_plugin.process.subprocesses import end_children
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.certificate import Certify, certify

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.geometry import yaw_from_quat
-from alpasim_plugin.types import F64, Actor, LaneMap, Scenario, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import F64, Actor, LaneMap, Scenario, Scene, Trajectory, Vehicle
 
 ACTOR_STEP_US = 250_000
 

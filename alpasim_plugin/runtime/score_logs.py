@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.config import load_yaml
-from alpasim_plugin.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
-from alpasim_plugin.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.types import RolloutLog
+from alpasim_plugin.io.checksums import problem_of
+from alpasim_plugin.io.config import load_yaml
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.parts import PartSpec
+from alpasim_plugin.plugins.parts import PartSpec
 from alpasim_plugin.runtime.contents import RUN_INFO
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.manifests import MANIFEST, STEPS_NAME, read_manifest
@@ -22,8 +24,6 @@ from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.scoring import contacts_of, tabulate
 from alpasim_plugin.runtime.store import steps_schema, write_table
-from alpasim_plugin.types import RolloutLog
-from alpasim_plugin.vouched import problem_of
 from evaluators import reduce_rollout, score
 from evaluators.alpasim import ScoredRollout
 from evaluators.presets import Preset

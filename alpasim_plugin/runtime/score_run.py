@@ -11,10 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.atomic import write_json
-from alpasim_plugin.errors import EvaluatorError, InputError
-from alpasim_plugin.parts import PartSpec, digest
-from alpasim_plugin.parts.source import own_code_digest
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.plugins.parts import PartSpec, digest
+from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.runtime.contents import AGGREGATE, CONTENTS, SCENES, find_contents, read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes

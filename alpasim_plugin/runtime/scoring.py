@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.geometry import arc_lengths, inverse, offset_trajectory, project, yaw_from_quat
+from alpasim_plugin.core.geometry import arc_lengths, inverse, offset_trajectory, project, yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from alpasim_plugin.log import read_asl, read_facts
-from alpasim_plugin.parts import PartSpec
-from alpasim_plugin.types import F64, I64, MetricSeries, RolloutLog, Scenario
+from alpasim_plugin.plugins.parts import PartSpec
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
 

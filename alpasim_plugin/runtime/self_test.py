@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.parts import names
+from alpasim_plugin.plugins.parts import names
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import Progress, execute_run
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures, worst

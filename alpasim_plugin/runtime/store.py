@@ -9,8 +9,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from alpasim_plugin import reading
-from alpasim_plugin.atomic import atomic_file, write_bytes
+from alpasim_plugin.io import reading
+from alpasim_plugin.io.atomic import atomic_file, write_bytes
 
 GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import (
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import (
     Controller,
     EgoState,
     Frame,

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from alpasim_plugin.lock import one_writer
-from alpasim_plugin.processes import is_running
+from alpasim_plugin.io.lock import one_writer
+from alpasim_plugin.process.processes import is_running
 
 LOCK = ".simrun.lock"
 DOING = "writing a run folder"
-_TEMPORARY = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp")  # as `alpasim_plugin.atomic.temporary_path` makes them
+_TEMPORARY = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp")  # as `alpasim_plugin.io.atomic.temporary_path` makes them
 
 
 @contextmanager

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.gaussians.raster.workers import run_on_threads, thread_count
-from alpasim_plugin.geometry import inverse
 from alpasim_plugin.semantic_map.kernels import SHAPE, STROKE
 from alpasim_plugin.semantic_map.kernels import shapes as project_shapes
 from alpasim_plugin.semantic_map.kernels import strokes as project_strokes
@@ -22,7 +23,6 @@ from alpasim_plugin.semantic_map.prepare import CORNERS, EDGES, TRIANGLES, Prepa
 from alpasim_plugin.semantic_map.projection import KernelCamera, MapCamera, kernel_camera
 from alpasim_plugin.semantic_map.raster import SAMPLES_1, SAMPLES_4, draw_bands, rows_of
 from alpasim_plugin.semantic_map.style import WIDTH_DEFINED_AT_PX, MapStyle, box_class
-from alpasim_plugin.types import F64, U8
 
 DOING = "drawing the semantic map"
 _MARGIN_RAD = 0.1  # half of the widest line reaches this far into the view from outside

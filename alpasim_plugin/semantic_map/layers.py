@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths, resample
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64, Actor, Box, LaneMap, Paint
 from alpasim_plugin.semantic_map.style import AreaKind, LightState, LineColour, Pattern
-from alpasim_plugin.types import F64, Actor, Box, LaneMap, Paint
 
 POLE_HEIGHT_M = 3.0  # of poles given as one point
 SAME_EDGE_M = 0.45  # edges of two lanes nearer than this are one edge

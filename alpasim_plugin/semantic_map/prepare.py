@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, Bool, Box, LaneMap
 from alpasim_plugin.gaussians.cloud import require_rigid
 from alpasim_plugin.semantic_map.layers import POLE_HEIGHT_M, LaneLine, MapExtras, lane_lines
 from alpasim_plugin.semantic_map.style import OPENGL, MapStyle, Rgb
-from alpasim_plugin.types import F64, Bool, Box, LaneMap
 
 GROUP = 32  # segments that share a bounding sphere
 # Depth bias of ground areas, so that lines on them stay visible, and smaller areas on larger ones.

@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, CameraSpec, FTheta
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, CameraSpec, FTheta
 
 TABLE = 4096  # angles of the radius table; linear interpolation errs by less than 1e-4 px
 _BEYOND_RAD = 0.05  # part of the table beyond the largest angle

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.report.flips import Flip, baseline_of, events, find_flips, in_words
 from evaluators.report.run_folder import Rollout, Run
 

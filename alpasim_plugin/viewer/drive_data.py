@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log import read_facts
-from alpasim_plugin.types import F64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.viewer.units import Place, mrad, rounded
 from evaluators.report.events import SERIES, Event, events_of
 from evaluators.report.run_folder import Rollout, Run, series_by_cell

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.viewer.units import Place
 from evaluators.report.birdseye import chord_angle, lane_ring, painted_edges
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InputError, SimrunError
+from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import RolloutLog
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
 from alpasim_plugin.viewer.map_data import map_data, recorded_drive

@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8, LoggedImage, RolloutLog
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.video_reader import VideoReader
-from alpasim_plugin.types import U8, LoggedImage, RolloutLog
 from evaluators.report.run_folder import Rollout, Run
 
 VIDEO = "front.mp4"

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from alpasim_plugin.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.viewer.budget import as_json
 from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted
 from alpasim_plugin.viewer.page import Options, render

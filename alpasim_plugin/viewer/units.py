@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.geometry import yaw_from_quat
-from alpasim_plugin.types import F64, I64, Trajectory
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import F64, I64, Trajectory
 
 METRIC_DIGITS = 5
 

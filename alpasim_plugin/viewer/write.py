@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
 
-from alpasim_plugin.atomic import write_text
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted, shown_by_default, telling
 from alpasim_plugin.viewer.page import MB, Options, make_page
 from alpasim_plugin.viewer.pictures import Fineness

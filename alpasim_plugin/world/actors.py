@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
-from alpasim_plugin.types import F64, I64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
+from alpasim_plugin.core.types import F64, I64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
 from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import Bodies, IdmParams, Spans, find_leader, idm_acceleration, nearest_ahead, spans, wanted_gap_m

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 

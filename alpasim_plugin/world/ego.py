@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.geometry import interpolate, wrap_angle
-from alpasim_plugin.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import interpolate, wrap_angle
+from alpasim_plugin.core.types import EgoState, Trajectory, Vehicle
 
 DIFFERENCE_US = 100_000  # half window of the differences: long enough to bridge the noise of 200 Hz poses
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, HeightField
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, HeightField
 
 MAX_NODES = 30_000_000  # 240 MB of heights
 SIGHT_M = 400.0  # nothing farther from a drive is built or seen, so no ground is fitted there

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.world.path import Path
 
 

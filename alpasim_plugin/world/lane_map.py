@@ -8,10 +8,10 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths, project, resample, wrap_angle
-from alpasim_plugin.geometry_lanes import HALF_WIDTH_M, densify, lane_polygon
-from alpasim_plugin.types import F64, I64, LaneMap
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths, project, resample, wrap_angle
+from alpasim_plugin.core.geometry_lanes import HALF_WIDTH_M, densify, lane_polygon
+from alpasim_plugin.core.types import F64, I64, LaneMap
 
 VERTEX_STEP_M = 1.0  # the KD-trees hold a centre vertex at least this often
 
@@ -31,7 +31,7 @@ class LaneIndex:
     answer for the road below it, and in plan view where it has none. Answers are in the map's own order of lanes.
 
     Example:
-        >>> from alpasim_plugin.types import Lane
+        >>> from alpasim_plugin.core.types import Lane
         >>> lane = Lane("a", np.array([[0.0, 0, 0], [10, 0, 0]]), None, None)
         >>> LaneIndex(LaneMap({"a": lane})).containing(np.array([5.0, 1.0]))
         ('a',)

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.types import F64, I64
 
 FEW_DISTANCES = 200_000  # above it, a tree over the stations is quicker than all distances, and takes no memory
 

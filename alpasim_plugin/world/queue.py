@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.world.idm import NO_LEADER, Bodies, Leader, Spans, find_leader, spans
 from alpasim_plugin.world.path import Path
 

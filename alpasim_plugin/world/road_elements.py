@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from alpasim_plugin.types import Paint
+from alpasim_plugin.core.types import Paint
 
 Turn = Literal["left", "straight", "right"]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import wrap_angle
-from alpasim_plugin.types import F64, Lane, Marking
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import wrap_angle
+from alpasim_plugin.core.types import F64, Lane, Marking
 from alpasim_plugin.world.curves import connect, offset_line, sample_clothoid
 from alpasim_plugin.world.road_elements import Intersection, Profile, Turn
 from alpasim_plugin.world.road_strip import Joint, MapDraft, build_strip, make_lines

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, Lane, LaneMap, Marking, Paint
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Paint
 from alpasim_plugin.world.curves import offset_line
 from alpasim_plugin.world.road_elements import Profile
 

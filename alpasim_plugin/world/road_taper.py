@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Lane
+from alpasim_plugin.core.types import F64, Lane
 from alpasim_plugin.world.curves import offset_line, smoothstep
 from alpasim_plugin.world.road_elements import Profile
 from alpasim_plugin.world.road_strip import Joint, MapDraft, Strip, add_sides, build_strip, make_lines, reverse

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, LaneMap
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, LaneMap
 from alpasim_plugin.world.curves import sample_clothoid
 from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneTaper, Profile, Stretch
 from alpasim_plugin.world.road_intersection import Junction, build_intersection

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths, inverse, project, resample, transform_points, wrap_angle, yaw_from_quat, yaw_of
-from alpasim_plugin.types import F64, LaneMap, Route, Trajectory
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths, inverse, project, resample, transform_points, wrap_angle, yaw_from_quat, yaw_of
+from alpasim_plugin.core.types import F64, LaneMap, Route, Trajectory
 from alpasim_plugin.world.lane_map import LaneIndex
 
 MIN_STEP_M = 0.2  # recorded points closer than this to the last kept one are dropped: a car at rest only adds noise

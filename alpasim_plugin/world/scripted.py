@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import F64, I64, Box, Trajectory
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.path import Path
 

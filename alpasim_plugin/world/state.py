@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Box, Trajectory
+from alpasim_plugin.core.types import F64, Box, Trajectory
 from alpasim_plugin.world.idm import Bodies
 
 NO_BODIES = Bodies(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 2)))

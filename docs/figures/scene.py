@@ -14,10 +14,10 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 
-from alpasim_plugin.geometry import interpolate
-from alpasim_plugin.image_metrics import psnr_db
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.types import F64, Renderer, RenderRequest, Scenario
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.types import F64, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
 
 SURROGATE = ("degradation.kind=surrogate",)

@@ -21,8 +21,8 @@ import pyarrow.parquet as pq
 import yaml
 from results import DOCS, number, replace
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.training.frozen_scenes import check_scenes
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.lab.training.frozen_scenes import check_scenes
 from scenarios.load import load_scenario
 
 VERDICTS = (1, 3)  # exit codes of a run that ended with a regression, or undecided

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.image_metrics import psnr_db, ssim
+from alpasim_plugin.core.types import F64, U8, Degradation, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
-from alpasim_plugin.image_metrics import psnr_db, ssim
+from alpasim_plugin.lab.training.pair_sheet import HOLE_BELOW
+from alpasim_plugin.lab.training.pairs import offset_from_log
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.training.pair_sheet import HOLE_BELOW
-from alpasim_plugin.training.pairs import offset_from_log
-from alpasim_plugin.types import F64, U8, Degradation, Frame, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
 
 KINDS = {

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.fit import SplatRecipe, Start, held_out, logged_views, start_from_depth
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary
 from alpasim_plugin.gaussians.fit.similarity import SsimTarget
 from alpasim_plugin.renderers.gaussian import scene_of
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import Scenario
 from scenarios.load import load_scenario
 
 FULL = SplatRecipe.full()

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import scipy
 
-from alpasim_plugin.atomic import write_json
+from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY, write_contents, write_run_json
 from alpasim_plugin.runtime.plan import rollout_folder
 from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet

@@ -17,8 +17,8 @@ from typing import get_args
 import numpy as np
 from scipy import stats
 
-from alpasim_plugin.bench.coverage import write_into
-from alpasim_plugin.bench.decision_study import (
+from alpasim_plugin.lab.bench.coverage import write_into
+from alpasim_plugin.lab.bench.decision_study import (
     ALPHA,
     GAP,
     NEVER,
@@ -36,7 +36,7 @@ from alpasim_plugin.bench.decision_study import (
     spread_of,
     suite_ends,
 )
-from alpasim_plugin.bench.interval_study import CORRELATIONS, RATES
+from alpasim_plugin.lab.bench.interval_study import CORRELATIONS, RATES
 
 PAGE = Path(__file__).resolve().parents[1] / "experiments" / "sequential.md"
 POWERS = (0.8, 0.9, 0.95)

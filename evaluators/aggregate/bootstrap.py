@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.types import F64, I64
 from evaluators.aggregate.intervals import TAIL, Interval, cluster_means
 
 DRAWS = 2000

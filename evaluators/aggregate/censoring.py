@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 from evaluators.aggregate.rows import RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
 from evaluators.metrics import info
 

@@ -20,9 +20,9 @@ import pyarrow as pa
 import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 
-from alpasim_plugin.reading import parsing
-from alpasim_plugin.reading.tables import Kind, check_parquet
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
+from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.reading.tables import Kind, check_parquet
 from evaluators.aggregate.rows import Cell, Side
 
 DOING = "aggregating rollouts"

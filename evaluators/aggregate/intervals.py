@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.types import F64, I64
 
 Z95 = 1.96
 LEVEL = 0.95

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, n_clusters, t_bounds, t_interval, within
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
 from evaluators.aggregate.rows import Cell, Row, Side, by_renderer, metric_names

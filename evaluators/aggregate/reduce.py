@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.types import F64, I64, Aggregation, Bool, Direction, MetricSeries
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.types import F64, I64, Aggregation, Bool, Direction, MetricSeries
 from evaluators.metrics import info
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 
 Row = Mapping[str, Any]
 Cell = tuple[str, str, int]  # policy, scene, seed: what two renderers share

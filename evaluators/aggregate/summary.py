@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64, I64
 from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, n_clusters, normal_half_width, wilson_rate, within
 from evaluators.aggregate.rows import Row, Side, by_renderer, metric_names

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
-from alpasim_plugin.types import F64, Direction
+from alpasim_plugin.core.types import F64, Direction
 from evaluators.metrics import info
 
 Verdict = Literal["non-inferior", "worse", "undecided"]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.types import MetricSeries
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.types import MetricSeries
 from evaluators.aggregate.reduce import Reduction, RolloutValue, reduce_rollout
 from evaluators.base import series
 from evaluators.presets import Preset

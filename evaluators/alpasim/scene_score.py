@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.core.errors import EvaluatorError
 from evaluators.alpasim.settings import SceneScoreSettings
 
 FAULTS = ("collision_at_fault", "offroad")

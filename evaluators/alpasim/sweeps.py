@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
 from evaluators.alpasim.reduction import ReducedRollout
 
 INCIDENTS = {

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.paired import LISTED, compare
 from evaluators.aggregate.verdict import default_margin

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
 from evaluators.aggregate.paired import compare

@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from alpasim_plugin.config import load_yaml, validate
-from alpasim_plugin.errors import EvaluatorError, InputError
-from alpasim_plugin.yaml_marks import Document
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.io.config import load_yaml, validate
+from alpasim_plugin.io.yaml_positions import Document
 from evaluators.metrics import info
 from evaluators.presets import PRESETS
 

@@ -6,8 +6,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import digest
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.plugins.parts import digest
 from evaluators.aggregate.rows import Row, is_ok
 from evaluators.gate.rows import of_policy, policies_of
 

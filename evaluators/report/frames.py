@@ -9,10 +9,10 @@ from pathlib import Path
 
 import cv2
 
-from alpasim_plugin.bounds import SOURCE_BYTES
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading import read_bytes
-from alpasim_plugin.reading.images import decode_image
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.limits import SOURCE_BYTES
+from alpasim_plugin.io.reading import read_bytes
+from alpasim_plugin.io.reading.images import decode_image
 from evaluators.report.numbers import fixed
 from evaluators.report.run_folder import Rollout, Run
 

@@ -6,9 +6,9 @@ import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from alpasim_plugin.atomic import write_text
-from alpasim_plugin.escape import markdown as escape
-from alpasim_plugin.escape import xml as clean
+from alpasim_plugin.core.escape import markdown as escape
+from alpasim_plugin.core.escape import xml as clean
+from alpasim_plugin.io.atomic import write_text
 from evaluators.gate.judge import Check, GateVerdict
 from evaluators.report.junit import junit
 from evaluators.report.run_folder import Run

@@ -13,8 +13,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from alpasim_plugin.atomic import write_text
-from alpasim_plugin.reading import parsing
+from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.io.reading import parsing
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.certificate import certificate

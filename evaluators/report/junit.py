@@ -8,8 +8,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from alpasim_plugin.atomic import write_text
-from alpasim_plugin.escape import xml as clean
+from alpasim_plugin.core.escape import xml as clean
+from alpasim_plugin.io.atomic import write_text
 from evaluators.report.run_folder import Rollout, Run, read_run, reporting
 
 MAX_WITH_VALUES = 2000  # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes

@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
 
-from alpasim_plugin.reading import parsing, read_json_as, read_json_object
-from alpasim_plugin.reading.tables import Kind, check_parquet, read_parquet
+from alpasim_plugin.io.reading import parsing, read_json_as, read_json_object
+from alpasim_plugin.io.reading.tables import Kind, check_parquet, read_parquet
 from evaluators.metrics import declare_from
 from evaluators.report.shapes import RunInfo, SceneFile, Summary
 

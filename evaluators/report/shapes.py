@@ -1,6 +1,6 @@
 """Shapes of the JSON files of a run folder, as far as reports and gates rely on them; members that are not named may be anything.
 
-`alpasim_plugin.reading.read_json_as` compares a file with one of these before any of it is used.
+`alpasim_plugin.io.reading.read_json_as` compares a file with one of these before any of it is used.
 """
 
 from __future__ import annotations

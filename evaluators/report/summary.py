@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from alpasim_plugin.atomic import write_text
-from alpasim_plugin.escape import markdown as escape
-from alpasim_plugin.escape import terminal
+from alpasim_plugin.core.escape import markdown as escape
+from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.io.atomic import write_text
 from evaluators.report import tables
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows

@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from alpasim_plugin.escape import terminal as escape
+from alpasim_plugin.core.escape import terminal as escape
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.tables import metric_rows
 

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.runs.entry import DOING, RunEntry, State
 
 LEAST_DIGITS = 4  # of a commit or a digest: fewer name anything

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.runs.entry import CONTENTS, DOING, LOCK, RUN_INFO, RunEntry, read_entry
 
 MARKS = frozenset((RUN_INFO, CONTENTS, LOCK))  # the first file of a run folder is its lock

@@ -13,7 +13,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from alpasim_plugin.atomic import write_text
+from alpasim_plugin.io.atomic import write_text
 from evaluators.report.charts import Chart
 from evaluators.report.html import asset
 from evaluators.report.metric_info import meaning

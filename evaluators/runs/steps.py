@@ -11,7 +11,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from alpasim_plugin.escape import terminal as escape
+from alpasim_plugin.core.escape import terminal as escape
 from evaluators.report.numbers import DASH, plural
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.runs.choose import shown_folder

@@ -9,8 +9,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from alpasim_plugin.escape import shorten
-from alpasim_plugin.escape import terminal as escape
+from alpasim_plugin.core.escape import shorten
+from alpasim_plugin.core.escape import terminal as escape
 from evaluators.report.metric_info import in_percent
 from evaluators.report.numbers import DASH, decimals, finite, fixed, interval
 from evaluators.runs.choose import shown_folder

@@ -8,8 +8,8 @@ from datetime import datetime
 from itertools import pairwise
 from typing import Any
 
-from alpasim_plugin.errors import EvaluatorError, InputError
-from alpasim_plugin.reading.tables import Kind, read_parquet
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.io.reading.tables import Kind, read_parquet
 from evaluators.aggregate.paired import compare
 from evaluators.aggregate.rows import RendererRows, Row
 from evaluators.aggregate.verdict import default_margin

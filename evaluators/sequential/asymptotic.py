@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.types import F64, Bool
+from alpasim_plugin.core.types import F64, Bool
 from evaluators.sequential import line
 from evaluators.sequential.draws import Draws
 from evaluators.sequential.plan import Plan

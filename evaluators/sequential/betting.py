@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 from evaluators.sequential.draws import Draws
 from evaluators.sequential.line import relative_slope
 from evaluators.sequential.plan import Plan

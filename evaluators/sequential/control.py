@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import digest
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.plugins.parts import digest
 from evaluators.aggregate.rows import Row, by_renderer
 from evaluators.sequential.draws import Draws, without_replacement
 from evaluators.sequential.question import MetricQuestion

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.aggregate.outcome import Cause, Outcome
 from evaluators.sequential import asymptotic, betting
 from evaluators.sequential.draws import Draws, independent

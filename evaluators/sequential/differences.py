@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.types import F64, Bool
+from alpasim_plugin.core.types import F64, Bool
 from evaluators.aggregate.rows import Side
 from evaluators.metrics import info
 

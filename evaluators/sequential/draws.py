@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from alpasim_plugin.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from functools import cache
 import numpy as np
 import scipy  # its submodules load on first use
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 NEWTON_STEPS = 12
 LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)

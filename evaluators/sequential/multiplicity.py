@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 
 def closed(log_e: F64) -> F64:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 # Half of the distance that is bet on, in standard deviations of the sum over all scenes up to the ceiling. A test with a ceiling that is
 # just large enough for 80 % power has 1.4; smaller bets gain nothing, whatever the plan.

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Direction
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Direction
 from evaluators.aggregate.verdict import default_margin
 from evaluators.metrics import difference_range, info
 from evaluators.sequential.asymptotic import FIRST_LOOK

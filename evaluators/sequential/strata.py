@@ -33,8 +33,8 @@ from pathlib import PurePath
 
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64, I64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, I64
 from evaluators.sequential.draws import Draws, without_replacement
 
 SHRINKAGE = 1.0  # scenes' worth

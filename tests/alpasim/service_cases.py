@@ -11,19 +11,19 @@ import cv2
 import grpc
 import numpy as np
 
+from alpasim_plugin.alpasim.client.served_drives import CAMERA as CAMERA
+from alpasim_plugin.alpasim.client.served_drives import HEIGHT, WIDTH
+from alpasim_plugin.alpasim.client.served_drives import START_US as START_US
+from alpasim_plugin.alpasim.client.served_drives import STEP_US as STEP_US
+from alpasim_plugin.alpasim.client.served_drives import PaintedRenderer as StandInRenderer
+from alpasim_plugin.alpasim.client.served_drives import drive as drive
+from alpasim_plugin.alpasim.client.served_drives import picture as picture
+from alpasim_plugin.alpasim.client.served_drives import pinhole as pinhole
+from alpasim_plugin.alpasim.client.served_drives import request as request
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, Security
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
-from alpasim_plugin.alpasim.wire.services import OPTIONS, Stub
-from alpasim_plugin.bench.served_drives import CAMERA as CAMERA
-from alpasim_plugin.bench.served_drives import HEIGHT, WIDTH
-from alpasim_plugin.bench.served_drives import START_US as START_US
-from alpasim_plugin.bench.served_drives import STEP_US as STEP_US
-from alpasim_plugin.bench.served_drives import PaintedRenderer as StandInRenderer
-from alpasim_plugin.bench.served_drives import drive as drive
-from alpasim_plugin.bench.served_drives import picture as picture
-from alpasim_plugin.bench.served_drives import pinhole as pinhole
-from alpasim_plugin.bench.served_drives import request as request
+from alpasim_plugin.wire import sensorsim_pb2
+from alpasim_plugin.wire.services import OPTIONS, Stub
 
 __all__ = ["StandInRenderer"]
 

@@ -18,17 +18,17 @@ from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.server.assembly import Settings, assemble
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.alpasim.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
-from alpasim_plugin.alpasim.wire.services import Stub, handlers
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.errors import InfrastructureError, InputError, PolicyError, RendererError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, PolicyError, RendererError
+from alpasim_plugin.core.types import RolloutLog, Scenario
 from alpasim_plugin.log import decode_image
-from alpasim_plugin.parts import build, resolve
+from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.known_scenes import scenario_finder
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.types import RolloutLog, Scenario
+from alpasim_plugin.wire import FRONT_WIDE, SERVICE_PATHS, common_pb2, egodriver_pb2, sensorsim_pb2
+from alpasim_plugin.wire.services import Stub, handlers
 from scenarios.library import shipped_names
 from scenarios.load import load_scenario
 

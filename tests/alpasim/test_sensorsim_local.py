@@ -13,13 +13,13 @@ import pytest
 
 from alpasim_plugin.alpasim.server.assembly import Assembled, Settings, assemble
 from alpasim_plugin.alpasim.server.views import read_view
-from alpasim_plugin.alpasim.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
-from alpasim_plugin.alpasim.wire.services import Stub
-from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.types import F64, RenderRequest
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import wire_pose
 from alpasim_plugin.renderers.gaussian import CleanRenderer
-from alpasim_plugin.types import F64, RenderRequest
+from alpasim_plugin.wire import FRONT_WIDE, common_pb2, sensorsim_pb2
+from alpasim_plugin.wire.services import Stub
 from scenarios.load import load_scenario
 from tests.alpasim.service_cases import answers, channel_to, hosted, in_front_of, pinhole
 

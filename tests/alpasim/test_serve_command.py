@@ -15,9 +15,9 @@ import pytest
 import typer.main
 
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.alpasim.wire import common_pb2
-from alpasim_plugin.alpasim.wire.services import Stub, methods
 from alpasim_plugin.cli.main import make_app
+from alpasim_plugin.wire import common_pb2
+from alpasim_plugin.wire.services import Stub, methods
 from tests.alpasim.service_cases import answers, drive
 
 

@@ -11,9 +11,9 @@ import pytest
 from alpasim_plugin.alpasim.server.history import HistoryTree
 from alpasim_plugin.alpasim.server.motion import apart, on_line
 from alpasim_plugin.alpasim.server.views import View, read_view
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import se2
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.wire import sensorsim_pb2
 from tests.alpasim.service_cases import START_US, STEP_US, drive, request
 
 Tree = HistoryTree[tuple[bytes, ...]]

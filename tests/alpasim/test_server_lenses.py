@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
+from alpasim_plugin.wire import sensorsim_pb2
 from tests.alpasim.service_cases import pinhole
 
 Spec = sensorsim_pb2.CameraSpec

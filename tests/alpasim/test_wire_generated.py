@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.alpasim.wire.protos import compile as compiling
+from alpasim_plugin.wire.protos import compile as compiling
 
 PROTOS = Path(compiling.__file__).parent
 WIRE = PROTOS.parent

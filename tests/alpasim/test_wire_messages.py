@@ -8,8 +8,8 @@ from pathlib import Path
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from alpasim_plugin.alpasim import wire
-from alpasim_plugin.alpasim.asl import AslReader
+from alpasim_plugin import wire
+from alpasim_plugin.log.asl import AslReader
 
 GRPC = ("health_pb2", "reflection_pb2")  # gRPC's own services
 MODULES = [getattr(wire, name) for name in wire.__all__ if name.endswith("_pb2") and name not in GRPC]

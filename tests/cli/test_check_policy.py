@@ -11,7 +11,7 @@ from alpasim_plugin.cli.main import run_command
 
 TALKS = """
 import numpy as np
-from alpasim_plugin.types import Plan
+from alpasim_plugin.core.types import Plan
 
 class Talks:
     sensors = ()

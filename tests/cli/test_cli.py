@@ -10,7 +10,7 @@ import pytest
 
 from alpasim_plugin.cli.main import main, run_command
 from alpasim_plugin.cli.run import parse_seeds
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 GOOD = ["--renderer", "clean", "--policy", "log-replay"]
 

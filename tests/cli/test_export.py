@@ -9,9 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from alpasim_plugin.alpasim.asl import AslReader
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.runtime.contents import read_run_json
 from evaluators.alpasim import load_settings
 

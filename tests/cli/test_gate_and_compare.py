@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from tests.io.checksum_files import vouch_for
 from tests.report.make_run import Plan, make_run
-from tests.vouching import vouch_for
 
 SCENES = tuple(f"scene-{i:02d}" for i in range(8))
 EASY = """version: 1

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Vehicle
 from tests.examples import examples
 
 VEHICLE = Vehicle()

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.types import Frame, Renderer, RenderRequest, Scenario
 from scenarios.load import load_scenario
 
 pytest.importorskip("cantools", reason="cantools is not installed: pip install 'alpasim-onefixer[can]'")
@@ -25,7 +25,7 @@ from alpasim_plugin.control.can_ecu import LaneKeeper, serve  # noqa: E402
 from alpasim_plugin.control.can_map import load_map  # noqa: E402
 from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities  # noqa: E402
 from alpasim_plugin.control.can_replay import decode, read_recording, replay  # noqa: E402
-from alpasim_plugin.types import Vehicle  # noqa: E402
+from alpasim_plugin.core.types import Vehicle  # noqa: E402
 
 
 class NoCamera(Renderer):

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.control.tracker import MAX_LATERAL_MPS2
-from alpasim_plugin.errors import InputError, PolicyError
-from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_of
-from alpasim_plugin.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.geometry import quat_from_yaw, se2, yaw_of
+from alpasim_plugin.core.types import EgoState, Trajectory, Vehicle
 from tests.examples import examples, first_of, first_rows_of
 
 VEHICLE = Vehicle()

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from alpasim_plugin.geometry import inverse, offset_trajectory, quat_from_yaw
-from alpasim_plugin.types import Actor, Box, Lane, LaneMap, LoggedImage, LoggedPlan, RolloutLog, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
+from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, LoggedImage, LoggedPlan, RolloutLog, Scene, Trajectory, Vehicle
 
 DT_US = 100_000
 CAR = Box(4.5, 1.8, 1.5)

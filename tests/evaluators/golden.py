@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
+from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scene
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import MetricSeries, RolloutLog, Scene
 from evaluators import score
 from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, scene_score
 from evaluators.presets import Preset

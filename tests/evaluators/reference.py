@@ -8,11 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from alpasim_plugin.bench.evaluators_reference import actor_corners, exact, point_to_segment, sides_of, touch
-from alpasim_plugin.geometry import interpolate, rectangle_corners, yaw_of
-from alpasim_plugin.types import F64, RolloutLog
+from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_of
+from alpasim_plugin.core.types import F64, RolloutLog
 from evaluators.footprint import origin_of
 from evaluators.presets import PRESETS, Preset
+from evaluators.reference import actor_corners, exact, point_to_segment, sides_of, touch
 from evaluators.route import recorded_path
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.errors import EvaluatorError, InputError
+from alpasim_plugin.core.errors import EvaluatorError, InputError
 from evaluators import PRESETS
 from evaluators.alpasim import (
     ScoredRollout,

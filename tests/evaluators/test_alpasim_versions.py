@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.types import LaneMap, RolloutLog, Trajectory
+from alpasim_plugin.core.types import LaneMap, RolloutLog, Trajectory
 from evaluators import PRESETS, preset, reduce_rollout, rollout_values, score
 from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, results_summary, scene_score
 from evaluators.alpasim.settings import Modifiers, SceneScoreSettings

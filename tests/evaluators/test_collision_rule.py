@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.bench.evaluators_reference import contacts_by_step
-from alpasim_plugin.geometry import rectangle_corners
-from alpasim_plugin.types import Box
+from alpasim_plugin.core.geometry import rectangle_corners
+from alpasim_plugin.core.types import Box
 from evaluators import PRESETS, score
 from evaluators.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.reference import contacts_by_step
 from evaluators.step_contact import FRONT, LATERAL, REAR, find_contacts
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track
 from tests.examples import examples

@@ -12,7 +12,7 @@ import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators import aggregate, paired
 from evaluators.aggregate import columns
 from evaluators.aggregate.columns import RolloutTable

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.sequential.control import adjusted_draws
 from evaluators.sequential.decision import outcome_of, state_after
 from evaluators.sequential.question import Question, metric_question

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.aggregate.outcome import EXIT_CODES, SEVERITY, Outcome, outcome_of_failures, worst
 from evaluators.gate import GateSpec, MetricRule, judge, load_gate
 from evaluators.gate.spec import shipped_gates

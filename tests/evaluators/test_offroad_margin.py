@@ -10,10 +10,10 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.geometry import rectangle_corners
-from alpasim_plugin.geometry_lanes import lane_polygon
-from alpasim_plugin.types import Lane, LaneMap
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.geometry import rectangle_corners
+from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.types import Lane, LaneMap
 from evaluators import PRESETS, reduce_rollout, score, surface
 from evaluators.surface import MARGIN_M, Region, Surface, closed_union
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track

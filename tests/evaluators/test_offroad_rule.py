@@ -10,11 +10,11 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.bench.evaluators_reference import ego_corners, road_by_step
-from alpasim_plugin.types import Lane
+from alpasim_plugin.core.types import Lane
 from evaluators import PRESETS, rollout_values, score
 from evaluators.footprint import ego_footprints, origin_of
 from evaluators.offroad import containment
+from evaluators.reference import ego_corners, road_by_step
 from evaluators.road import road_of
 from tests.evaluators.eval_build import TWO_LANES, by_name, lane, road_map, rollout, scene, track
 from tests.evaluators.reference import convex_contains

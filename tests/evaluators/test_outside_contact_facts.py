@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import Actor, Box, RolloutLog, Trajectory
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import Actor, Box, RolloutLog, Trajectory
 from evaluators import Preset
 from evaluators.footprint import ActorTable, ego_footprints
 from evaluators.step_contact import find_contacts

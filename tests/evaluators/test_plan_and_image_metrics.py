@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import inverse, offset_trajectory
-from alpasim_plugin.types import LoggedImage, LoggedPlan, Trajectory
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.types import LoggedImage, LoggedPlan, Trajectory
 from evaluators import PRESETS, rollout_values, score
 from tests.evaluators.eval_build import DT_US, T_RIG_BOX, TWO_LANES, by_name, car, rollout, scene, track
 from tests.evaluators.reference import open_loop_by_plan

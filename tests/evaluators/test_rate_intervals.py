@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.seeding import stream
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.seeding import stream
 from evaluators import aggregate
 from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, rate_interval, wilson_rate

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import interpolate, inverse, offset_trajectory, se3, trajectory_from_poses
-from alpasim_plugin.types import LaneMap, RolloutLog, Scene
+from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, se3, trajectory_from_poses
+from alpasim_plugin.core.types import LaneMap, RolloutLog, Scene
 from evaluators import PRESETS, rollout_values, score
 from evaluators.footprint import ActorTable, ego_footprints
 from evaluators.step_contact import find_contacts

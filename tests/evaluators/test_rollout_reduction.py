@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import EvaluatorError
+from alpasim_plugin.core.errors import EvaluatorError
 from evaluators import PRESETS, reduce_rollout, rollout_values
 from evaluators.base import series
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.bench.evaluators_reference import point_to_segment
 from evaluators import rollout_values, score
+from evaluators.reference import point_to_segment
 from evaluators.route import beside, progress_so_far, to_path
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 from tests.evaluators.reference import route_by_step

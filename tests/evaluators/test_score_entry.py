@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import EvaluatorError, InputError
-from alpasim_plugin.types import Box, LoggedPlan, Trajectory
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.types import Box, LoggedPlan, Trajectory
 from evaluators import METRICS, MetricInfo, resolve_evaluators, score
 from evaluators.base import run_evaluator, series
 from evaluators.metrics import declare, info

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import optimize
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.sequential import asymptotic, betting, line
 from evaluators.sequential.control import RIDGE, Control, adjusted_draws, of_families, of_rows, predictions
 from evaluators.sequential.draws import Draws, independent, without_replacement

@@ -10,7 +10,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators.sequential import asymptotic, betting
 from evaluators.sequential.control import Control, adjusted_draws, predictions
 from evaluators.sequential.draws import Draws

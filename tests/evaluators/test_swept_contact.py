@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.bench.evaluators_reference import contacts_by_step
-from alpasim_plugin.errors import EvaluatorError, InputError
-from alpasim_plugin.geometry import wrap_angle, yaw_from_quat
-from alpasim_plugin.types import Box
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.geometry import wrap_angle, yaw_from_quat
+from alpasim_plugin.core.types import Box
 from evaluators import PRESETS, reduce_rollout, score
 from evaluators.collision import SIDES, contact_events
 from evaluators.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.reference import contacts_by_step
 from evaluators.step_contact import find_contacts
 from evaluators.swept_contact import PLACE_M, find_swept
 from tests.evaluators.eval_build import CAR, TWO_LANES, by_name, car, rollout, scene, track

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from evaluators import aggregate, censoring, paired
 from evaluators.aggregate.intervals import clustered, exact_rate, normal_half_width, t_interval, wilson_rate
 from evaluators.aggregate.paired import base_pairs

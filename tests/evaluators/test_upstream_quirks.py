@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.asl import AslFile, AslReader
-from alpasim_plugin.errors import EvaluatorError
-from alpasim_plugin.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.types import LaneMap, LoggedImage, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import LaneMap, LoggedImage, LoggedPlan, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.log.asl import AslFile, AslReader
 from evaluators import PRESETS, aggregate, reduce_rollout, resolve_evaluators, rollout_values, score
 from evaluators.alpasim import EvalSettings, ScoredRollout, metrics_unprocessed_table, over_sweeps, reduce_run, scene_score
 from evaluators.alpasim.settings import PlanDeviation, SceneScoreSettings, Scorers

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.types import U8, BlockRule, Frame
+from alpasim_plugin.core.types import U8, BlockRule, Frame
 
 
 class Blend:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle, save_bundle
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.settings import OneFixerSettings

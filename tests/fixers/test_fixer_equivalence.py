@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.bench.whole_clip import refine_clip, whole_clip
+from alpasim_plugin.block_fixers.whole_clip import refine_clip, whole_clip
 from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.noise import latent_noise
 from alpasim_plugin.fixers.views import group_views, to_clip

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.refine import Difference, StreamStats, refine_frames
-from alpasim_plugin.types import Frame
 
 
 def test_difference_over_several_images_equals_the_textbook_formula_over_all_of_them() -> None:

@@ -19,9 +19,9 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+from tests.io.checksum_files import vouch_for
 from tests.report.make_run import Plan, make_run
 from tests.scenarios import make_argoverse, make_commonroad, make_usdz
-from tests.vouching import vouch_for
 
 LIMIT_S, LIMIT_BYTES = 60.0, 6 << 30
 DRY = ["--dry-run", "--renderer", "clean", "--policy", "log-replay"]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from alpasim_plugin.errors import SimrunError
+from alpasim_plugin.core.errors import SimrunError
 from tests.fuzz.mutate import mutate
 from tests.fuzz.uses import (
     Refused,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.vouching import vouch_for
+from tests.io.checksum_files import vouch_for
 
 
 class Refused(Exception):
@@ -20,8 +20,8 @@ class Refused(Exception):
 
 def drive(path: Path, *overrides: str) -> None:
     """Load a scenario and drive three steps of it."""
+    from alpasim_plugin.core.types import Renderer
     from alpasim_plugin.runtime.rollout import run_rollout
-    from alpasim_plugin.types import Renderer
     from policies import make_policy
     from scenarios.load import load_scenario
 
@@ -112,7 +112,7 @@ def toy_training(folder: Path) -> Any:
     """Return a trainer of one small layer, four updates long, that continues what the folder holds."""
     import torch
 
-    from alpasim_plugin.training.trainer import Schedule, Trainer
+    from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 
     torch.manual_seed(0)
     net = torch.nn.Linear(2, 2)
@@ -137,7 +137,7 @@ def use_picture(path: Path) -> None:
 
 
 def use_pairs(folder: Path) -> None:
-    from alpasim_plugin.training.pair_store import PairDataset
+    from alpasim_plugin.lab.training.pair_store import PairDataset
 
     for sequence in PairDataset(folder, "train").sequences:
         clip = sequence.clip
@@ -145,7 +145,7 @@ def use_pairs(folder: Path) -> None:
 
 
 def use_poses(path: Path) -> None:
-    from alpasim_plugin.training.pair_import import read_poses
+    from alpasim_plugin.lab.training.pair_import import read_poses
 
     read_poses(path, 10.0)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from alpasim_plugin.config import load_yaml
+from alpasim_plugin.io.config import load_yaml
 from tests.fuzz.seen import compressed_ply, xodr
-from tests.vouching import vouch_for
+from tests.io.checksum_files import vouch_for
 
 REPO = Path(__file__).resolve().parents[2]
 
@@ -172,7 +172,7 @@ def make_baseline(folder: Path) -> None:
 
 
 def make_pairs(folder: Path) -> None:
-    from tests.training.pair_files import make
+    from tests.lab.training.pair_files import make
 
     make(folder, frames=2, height=8, width=8)
 

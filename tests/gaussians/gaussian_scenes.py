@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, RasterOutput
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.seeding import stream
 
 LSB = 1.0 / 255.0
 

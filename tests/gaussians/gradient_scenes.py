@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.arrays import logit, sigmoid
 from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
@@ -16,7 +17,6 @@ from alpasim_plugin.gaussians.raster.project import project_gaussians
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_reference import composite_reference
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
-from alpasim_plugin.seeding import stream
 
 
 def cloud_of(splats: Splats) -> GaussianCloud:

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import (
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import (
     F64,
     Actor,
     Box,

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Scenario
 from alpasim_plugin.gaussians.scene.paint import GAP_M, LINE_M, WHITE, YELLOW, Strokes, paint_strokes
 from alpasim_plugin.gaussians.scene.site import make_site
-from alpasim_plugin.types import F64, Lane, LaneMap, Marking, Scenario
 from tests.gaussians.scene_maps import LANE_M, line, make_scenario, road_lanes
 
 PATH = line((0, -1.8), (60, -1.8))

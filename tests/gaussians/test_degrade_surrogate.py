@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import Degradation, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.degrade import (
@@ -26,8 +28,6 @@ from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
 from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
 from alpasim_plugin.gaussians.scene.surfels import cloud_of, with_sheen
 from alpasim_plugin.gaussians.sh import dc_from_rgb, sh_colours
-from alpasim_plugin.geometry import se2
-from alpasim_plugin.types import Degradation, Scenario
 from tests.examples import examples
 from tests.gaussians.scene_maps import camera_spec, curve, parked, straight
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians import PinholeCamera
 from alpasim_plugin.gaussians.raster import rasterize_gsplat
 from alpasim_plugin.gaussians.raster.gradient_gsplat import rasterize_gradient_gsplat

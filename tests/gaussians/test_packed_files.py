@@ -12,7 +12,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply
 from alpasim_plugin.gaussians.arrays import SH_C0
 from alpasim_plugin.gaussians.files.compressed_ply import read_compressed_ply, unpack_rotation

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
 from alpasim_plugin.gaussians.files.formats import read_gaussians
 from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays

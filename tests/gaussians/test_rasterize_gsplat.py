@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.raster import rasterize_gsplat
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference

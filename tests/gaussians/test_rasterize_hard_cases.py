@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.cloud import quat_multiply
 from alpasim_plugin.gaussians.constants import ALPHA_MAX

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from tests.examples import examples

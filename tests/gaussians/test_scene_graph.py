@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import RendererError
+from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.geometry import quat_from_yaw, se2, se3
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
@@ -13,8 +15,6 @@ from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, split_by_tile
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, in_view
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.geometry import quat_from_yaw, se2, se3
-from alpasim_plugin.seeding import stream
 from tests.examples import examples
 from tests.gaussians.scene_maps import camera_spec, straight
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Observation, Plan, Policy
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.types import Observation, Plan, Policy
 from evaluators import score
 from policies import make_policy
 

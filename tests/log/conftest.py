@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import RolloutLog
 from tests.log.make_rollout import write_rollout
 
 

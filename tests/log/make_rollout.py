@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.geometry import quat_from_yaw, se2, se3
+from alpasim_plugin.core.geometry import quat_from_yaw, se2, se3
+from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, RenderRequest, Trajectory, Vehicle
 from alpasim_plugin.log import AslWriter, RolloutHeader
-from alpasim_plugin.types import Actor, Box, CameraSpec, EgoState, Frame, RenderRequest, Trajectory, Vehicle
 
 T0_US = 1_689_697_803_493_732  # a Unix-epoch time: too large for any float
 STEP_US = 100_000

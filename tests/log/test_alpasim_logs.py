@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import matrix_from_quat
+from alpasim_plugin.core.geometry import matrix_from_quat
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.log import decode_image, read_asl
-from alpasim_plugin.types import Box
 
 read_log = lru_cache(maxsize=64)(read_asl)  # several tests look at the same logs
 

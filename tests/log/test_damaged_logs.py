@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.asl import AslFile, AslReader
-from alpasim_plugin.alpasim.wire import logging_pb2
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import RolloutLog
+from alpasim_plugin.log.asl import AslFile, AslReader
+from alpasim_plugin.wire import logging_pb2
 from tests.log.make_rollout import T0_US
 
 

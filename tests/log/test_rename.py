@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alpasim_plugin.alpasim.asl import AslReader
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.log.asl import AslReader
 from alpasim_plugin.log.rename import Renaming, copy_log
 from alpasim_plugin.log.session import session_uuid
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.asl import AslReader
-from alpasim_plugin.geometry import yaw_from_quat
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
-from alpasim_plugin.types import RolloutLog
+from alpasim_plugin.log.asl import AslReader
 from tests.log.make_rollout import ACTORS, CAMERA, HEADER, STEP_US, T0_US, ego_at, picture, plan_at, present, write_rollout
 
 

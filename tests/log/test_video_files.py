@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.log import read_mp4, write_mp4
 
 

@@ -9,10 +9,10 @@ import av
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.video_reader import VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
-from alpasim_plugin.types import U8
 
 
 def picture(value: int = 120, height: int = 32, width: int = 48) -> U8:

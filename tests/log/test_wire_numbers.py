@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.alpasim.wire import common_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import quat_from_yaw, se2, yaw_from_quat
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import quat_from_yaw, se2, yaw_from_quat
+from alpasim_plugin.core.types import Actor, Box, Trajectory
 from alpasim_plugin.log import AslWriter
 from alpasim_plugin.log.schema import read_poses, wire_poses, wire_trajectory
-from alpasim_plugin.types import Actor, Box, Trajectory
+from alpasim_plugin.wire import common_pb2
 from tests.examples import examples
 from tests.log.make_rollout import ACTORS, HEADER, T0_US, straight
 

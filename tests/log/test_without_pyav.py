@@ -9,8 +9,8 @@ from pathlib import Path
 CODE = """
 import sys
 sys.modules["av"] = None
-import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runtime.refine, alpasim_plugin.training.pair_import
-from alpasim_plugin.errors import InfrastructureError
+import alpasim_plugin.cli.main, alpasim_plugin.cli.run, alpasim_plugin.runtime.refine, alpasim_plugin.lab.training.pair_import
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.log.video_reader import VideoReader
 try:
     VideoReader(sys.argv[1])

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from alpasim_plugin import seeding
+from alpasim_plugin.core import seeding
 from alpasim_plugin.nets.wan_vae_layout import WanLayout
 
 SMALL = WanLayout.of_base(8)

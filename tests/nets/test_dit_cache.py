@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
 
 

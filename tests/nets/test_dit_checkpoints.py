@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from alpasim_plugin.atomic import write_safetensors
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
 from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
 from tests.nets.dit_cases import SMALL, clip, furthest

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
 from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.layers import Float32Linear

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
 from alpasim_plugin.nets.graphs import CudaRecorder, GraphedFunction
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin import measured
-from alpasim_plugin.measured import share_measurements
+from alpasim_plugin.io import measured
+from alpasim_plugin.io.measured import share_measurements
 from alpasim_plugin.nets import machine_probe, precision
 from alpasim_plugin.nets.machine_probe import Probe, choose_threads, probe_precision
 from alpasim_plugin.nets.precision import choose_precision

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes, PixelState
 from alpasim_plugin.nets.pixel_layers import Upsample, cells, pixels
 from alpasim_plugin.nets.pixel_source import hole_mask, pixel_source, sparse_source

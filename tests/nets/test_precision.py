@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyDecoder, TinyVAE, WanVAE
 from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision, weight_bytes
 from tests.nets.codec_cases import SMALL as SMALL_WAN

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, opacity_values, sample_block, sources_needed
 from alpasim_plugin.nets.schedule import context_level, from_names, named, shifted, steps
 from tests.nets.cache_history import history

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.latent_stats import LatentStats
 from alpasim_plugin.nets.taehv import TinyDecoder
 from tests.nets.codec_cases import noise

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.clips import crop_clip, pad_clip
 from alpasim_plugin.nets.tiny_vae import TinyVAE

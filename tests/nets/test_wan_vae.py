@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.clips import crop_clip, pad_clip
 from alpasim_plugin.nets.wan_vae import WanVAE
 from alpasim_plugin.nets.wan_vae_blocks import causal_conv, causal_conv3d

@@ -13,7 +13,7 @@ import pytest
 
 from alpasim_plugin import open_run
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.notebook.opening import OpenRollout, OpenRun
 
 pytest.importorskip("pandas")

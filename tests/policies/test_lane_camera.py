@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError, PolicyError
-from alpasim_plugin.geometry import trajectory_from_poses
-from alpasim_plugin.types import EgoState, Route
+from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.geometry import trajectory_from_poses
+from alpasim_plugin.core.types import EgoState, Route
 from policies.lane_camera import LaneCamera
 from policies.painted_road import Block, Line, PaintedRoad, Patch, pinhole_camera
 from tests.examples import first_of, first_rows_of

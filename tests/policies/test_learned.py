@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.errors import InputError, PolicyError
-from alpasim_plugin.geometry import inverse, se2, transform_points
-from alpasim_plugin.types import EgoState, Observation
+from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.geometry import inverse, se2, transform_points
+from alpasim_plugin.core.types import EgoState, Observation
 from policies import check_policy, make_policy
 from policies.conformance import STRAIGHT, observations
 from policies.learned import WEIGHTS, Learned

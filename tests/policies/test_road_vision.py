@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.geometry import inverse
+from alpasim_plugin.core.geometry import inverse
 from policies.ground_grid import make_grid
 from policies.lane_filter import LaneState, predict, search, shift, start, update
 from policies.lane_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint

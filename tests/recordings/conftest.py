@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.types import RolloutLog
 from evaluators.report.run_folder import Run, read_run, series_by_cell
+from tests.io.checksum_files import vouch_for
 from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched
-from tests.vouching import vouch_for
 
 SMALL = Plan(
     renderers=("clean", "3dgs"), scenes=("urban-left_turn",), seeds=(0, 1), steps=8, pictures=False, fail=[("3dgs", "urban-left_turn", 1)]

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.asl import AslReader
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.log.asl import AslReader
+from tests.io.checksum_files import vouch_for
 from tests.recordings.conftest import Watched
-from tests.vouching import vouch_for
 
 mcap_reader = pytest.importorskip("mcap.reader", reason="mcap is not installed: pip install mcap")
 CELL = ("--scene", "urban-left_turn", "--policy", "lane-camera", "--seed", "0")

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import se3
-from alpasim_plugin.parts import names as known
+from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.types import Renderer, RenderRequest, Scenario
+from alpasim_plugin.plugins.parts import names as known
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.broken import LATE_US, SHIFT_M
 from alpasim_plugin.renderers.gaussian import clear_cache
-from alpasim_plugin.types import Renderer, RenderRequest, Scenario
 from tests.gaussians.scene_maps import straight
 
 

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import BackgroundFile, Behaviour, Degradation, Environment, Latency, Scenario
 from alpasim_plugin.gaussians.fit.views import logged_views
-from alpasim_plugin.geometry import inverse
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, clear_cache, scene_of
 from alpasim_plugin.renderers.reconstruction import KIND, ReconstructionRenderer, ensure
@@ -20,7 +21,6 @@ from alpasim_plugin.renderers.reconstruction_files import HASHES, read_model
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
 from alpasim_plugin.renderers.reconstruction_start import misplaced
-from alpasim_plugin.types import BackgroundFile, Behaviour, Degradation, Environment, Latency, Scenario
 from tests.gaussians.scene_maps import line, parked, road_lanes, straight, with_camera
 from tests.renderers.test_gaussian_renderers import psnr, request
 

@@ -13,7 +13,7 @@ import matplotlib as mpl
 import pytest
 
 import evaluators.report.html as html
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from evaluators.report import write_report
 from evaluators.report.charts import Curve, line_chart
 from evaluators.report.run_folder import read_run

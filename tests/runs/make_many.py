@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.atomic import write_json
+from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.runtime.contents import write_contents, write_run_json
 from alpasim_plugin.runtime.store import rollouts_schema, write_table
 from evaluators import aggregate

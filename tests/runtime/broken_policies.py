@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 
-from alpasim_plugin.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 
 
 class Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from alpasim_plugin.bench.executors import LIGHT, LIGHT_HEAD, patiently
+from alpasim_plugin.lab.bench.executors import LIGHT, LIGHT_HEAD, patiently
 from alpasim_plugin.runtime.executors.choice import Executor
 
 # Set before Ray is imported. Otherwise a driver that finds a cluster by itself asks it for the token of an earlier one (~/.ray/auth_token).

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import quat_from_yaw
-from alpasim_plugin.types import (
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import (
     Actor,
     Box,
     CameraSpec,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.types import Observation, Plan, Route, SensorSpec
+from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 
 BY_GREY = "tests.runtime.grey_policy:DrivesByGrey"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.types import Frame, RenderRequest
+from alpasim_plugin.core.types import Frame, RenderRequest
 
 GREY = "tests.runtime.grey_renderer:Grey"
 

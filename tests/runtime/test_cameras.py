@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.clock import Clock
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Rates, Scenario, SensorSpec
 from alpasim_plugin.runtime.cameras import CameraRig
 from alpasim_plugin.runtime.loop_state import LoopState
-from alpasim_plugin.types import Rates, Scenario, SensorSpec
 
 
 def rendered_steps(scenario: Scenario, rates: Rates, sensors: list[SensorSpec]) -> list[int]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
@@ -15,7 +16,6 @@ from alpasim_plugin.runtime.execute import HowToRun, Threads, execute
 from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.types import Frame, RenderRequest, Scenario, SensorSpec
 from policies import ConstantVelocity
 from scenarios.suite import expand
 from tests.runtime.test_runs import Heard

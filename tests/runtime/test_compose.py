@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin import make_renderer
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.nets.checkpoints import file_sha256
-from alpasim_plugin.parts import resolve, resolve_renderer, spec
+from alpasim_plugin.plugins.parts import resolve, resolve_renderer, spec
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
-from alpasim_plugin.types import Scenario
 from scenarios.suite import expand
 
 
@@ -66,7 +66,7 @@ def test_the_mode_decides_the_kind_of_session(straight_road: Scenario) -> None:
 
 def test_resolving_a_renderer_or_a_fixer_does_not_load_torch() -> None:
     code = (
-        "import sys; from alpasim_plugin.parts import resolve_renderer;"
+        "import sys; from alpasim_plugin.plugins.parts import resolve_renderer;"
         "resolve_renderer('3dgs'); resolve_renderer('onefixer'); print('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "False"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.contents import CONTENTS
 from alpasim_plugin.runtime.decide import Decided, Design, drawing_order, execute_decision, key_of
 from alpasim_plugin.runtime.manifests import MANIFEST

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.runtime.dependent import Say, run_dependent
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.executors.base import Faulty
 from alpasim_plugin.runtime.executors.choice import LOCAL, parse_executor
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place, dispatch

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from alpasim_plugin import make_policy, run_rollout
-from alpasim_plugin.errors import FixerError, InputError, RendererError
+from alpasim_plugin.core.errors import FixerError, InputError, RendererError
+from alpasim_plugin.core.types import CameraSpec, Frame, Latency, Observation, Plan, Rates, RenderRequest, Route, Scenario, SensorSpec
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
-from alpasim_plugin.types import CameraSpec, Frame, Latency, Observation, Plan, Rates, RenderRequest, Route, Scenario, SensorSpec
 from policies.log_replay import LogReplay
 from tests.examples import first_of
 from tests.fixers.block_fixers import Blend, GivesFloats, GuardSteps, LosesAFrame, Raises, ShiftsTime, fixed_offline

@@ -10,9 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import SensorSpec
+from alpasim_plugin.io.checksums import SEAL
 from alpasim_plugin.log import read_asl, read_facts, write_facts
-from alpasim_plugin.parts import resolve
+from alpasim_plugin.plugins.parts import resolve
 from alpasim_plugin.runtime.certificate import rollout_trace
 from alpasim_plugin.runtime.contents import write_run_json
 from alpasim_plugin.runtime.flips import write_flips
@@ -24,8 +26,6 @@ from alpasim_plugin.runtime.probe_write import write_probe
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.switch import merge_sensors
-from alpasim_plugin.types import SensorSpec
-from alpasim_plugin.vouched import SEAL
 from scenarios.suite import expand
 from tests.examples import first_of
 from tests.runtime.test_certificate import BARE

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.types import Latency, Trajectory
 from alpasim_plugin.runtime.latency import PlanQueue
-from alpasim_plugin.types import Latency, Trajectory
 
 
 def plan(t_us: int) -> Trajectory:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 
-from alpasim_plugin import measured
+from alpasim_plugin.io import measured
 from alpasim_plugin.runtime.executors.base import Node
 from alpasim_plugin.runtime.executors.mission import mission_of
 from alpasim_plugin.runtime.executors.parcel import Parcel

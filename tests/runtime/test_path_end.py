@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError
-from alpasim_plugin.geometry import quat_from_yaw
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.geometry import quat_from_yaw
+from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from alpasim_plugin.runtime.cell import find_rollout_state
 from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.score_logs import check_complete
-from alpasim_plugin.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 from tests.runtime.grey_renderer import GREY, Grey

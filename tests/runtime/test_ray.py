@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.runtime.executors.base import Resources
 from alpasim_plugin.runtime.executors.choice import Executor
 from alpasim_plugin.runtime.executors.dispatch import dispatch

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8, BlockRule, Frame
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.log.video_reader import VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
 from alpasim_plugin.runtime.refine import RefineFiles, refine_video
-from alpasim_plugin.types import U8, BlockRule, Frame
 
 RATE = Fraction(10)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.base import fixer_settings
 from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.runtime.plan import RunOptions, make_plan

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.atomic import temporary_path
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io.atomic import temporary_path
 from alpasim_plugin.runtime.check import inspect_run
 from alpasim_plugin.runtime.logged_rollout import find_rollout
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan

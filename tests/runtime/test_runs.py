@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.cell import MANIFEST
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug

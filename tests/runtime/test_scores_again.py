@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.io.checksums import SEAL
 from alpasim_plugin.runtime import plan
 from alpasim_plugin.runtime.manifests import MANIFEST, write_manifest
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.store import read_json
-from alpasim_plugin.vouched import SEAL
 from scenarios.suite import expand
 from tests.runtime.test_runs import Heard
 

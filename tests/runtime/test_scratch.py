@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.atomic import temporary_path
+from alpasim_plugin.io.atomic import temporary_path
 from alpasim_plugin.runtime.executors.scratch import scratch_root, sweep
 
 NO_PROCESS = 2**22 + 1  # above the most that Linux gives

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.store import read_json
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.runtime.executors.base import Node
 from alpasim_plugin.runtime.executors.parcel import Parcel
 from alpasim_plugin.runtime.run import execute_run

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from alpasim_plugin.geometry import interpolate, inverse
+from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.world.lane_map import LaneIndex
 
 

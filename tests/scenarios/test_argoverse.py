@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.geometry import yaw_from_quat
+from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios.argoverse import LABELS, read_argoverse
 from scenarios.argoverse_map import PAINTS
 from tests.scenarios.make_argoverse import (

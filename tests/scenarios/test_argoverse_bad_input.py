@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from scenarios.argoverse import read_argoverse, read_calibration
 from tests.scenarios.make_argoverse import (
     STEP_NS,

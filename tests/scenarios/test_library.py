@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import shapely
 
-from alpasim_plugin.geometry import interpolate, yaw_from_quat, yaw_of
-from alpasim_plugin.types import F64, Box, Scenario
+from alpasim_plugin.core.geometry import interpolate, yaw_from_quat, yaw_of
+from alpasim_plugin.core.types import F64, Box, Scenario
 from alpasim_plugin.world.actors import make_actors
 from alpasim_plugin.world.ego import ego_state_from_log
 from scenarios.library import LIBRARY, shipped, shipped_names, suites

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Scenario
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario
 from scenarios.load import load_scenario
 
 BASE = """

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import yaw_from_quat
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios import usdz_archive
 from scenarios.load import load_scenario
 from scenarios.usdz import read_usdz, read_usdz_scene, usdz_scene_id

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry_lanes import lane_polygon
-from alpasim_plugin.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
 from scenarios.alpasim_map import alpasim_view, rails
 from scenarios.load import load_scenario
 from scenarios.usdz import read_usdz

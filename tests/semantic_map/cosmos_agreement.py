@@ -25,13 +25,13 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from alpasim_plugin.geometry import se2, se3
+from alpasim_plugin.core.geometry import se2, se3
+from alpasim_plugin.core.types import F64, U8, Bool, Box, LaneMap
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import ActorBox, Area, MapExtras
 from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.semantic_map.projection import FThetaCamera
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL, MapStyle
-from alpasim_plugin.types import F64, U8, Bool, Box, LaneMap
 from scenarios.cosmos import read_cosmos
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
 from scenarios.cosmos_layers import read_layer

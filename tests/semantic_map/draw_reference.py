@@ -15,7 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alpasim_plugin.geometry import transform_points
+from alpasim_plugin.core.geometry import transform_points
+from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
 from alpasim_plugin.semantic_map.draw import actor_geometry, samples_of, stretch_of, view_of
 from alpasim_plugin.semantic_map.kernels import (
     BACK,
@@ -34,7 +35,6 @@ from alpasim_plugin.semantic_map.layers import ActorBox
 from alpasim_plugin.semantic_map.prepare import PreparedMap, Segments, Triangles
 from alpasim_plugin.semantic_map.projection import MapCamera, radius_of
 from alpasim_plugin.semantic_map.style import WIDTH_DEFINED_AT_PX, MapStyle
-from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec
 
 
 def draw_map_reference(

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import se2
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import ActorBox
 from alpasim_plugin.semantic_map.prepare import prepare_map
 from alpasim_plugin.semantic_map.projection import kernel_camera
 from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
-from alpasim_plugin.types import Box
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
 from scenarios.reading import SourceFiles
 from tests.examples import first_of

@@ -8,10 +8,10 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alpasim_plugin.core.types import Lane, LaneMap, Marking
 from alpasim_plugin.semantic_map.layers import LaneLine, MapExtras, lane_lines
 from alpasim_plugin.semantic_map.prepare import cut_dashes, prepare_map, triangulate
 from alpasim_plugin.semantic_map.style import LUDUS, OPENGL, STYLES, box_class
-from alpasim_plugin.types import Lane, LaneMap, Marking
 from tests.examples import examples
 
 

@@ -14,11 +14,11 @@ import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from alpasim_plugin.geometry import quat_from_yaw, se3
+from alpasim_plugin.core.geometry import quat_from_yaw, se3
+from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, Trajectory, Vehicle
 from alpasim_plugin.log import AslWriter, RolloutHeader, write_facts
 from alpasim_plugin.runtime.contents import write_run_json
 from alpasim_plugin.runtime.manifests import write_manifest
-from alpasim_plugin.types import Actor, Box, CameraSpec, EgoState, Frame, Trajectory, Vehicle
 from evaluators.report.run_folder import Rollout, read_run
 from tests.report.make_run import DT_US, Plan, make_run
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log import read_asl, write_mp4
 from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted, shown_by_default
 from alpasim_plugin.viewer.page import Options, make_page

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.runtime.unfinished import read_so_far
 from alpasim_plugin.viewer import serve
 from alpasim_plugin.viewer.cells import Wanted

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.geometry_lanes import centre_line
-from alpasim_plugin.types import Lane, LaneMap
+from alpasim_plugin.core.geometry_lanes import centre_line
+from alpasim_plugin.core.types import Lane, LaneMap
 
 FAR = np.array([512_345.0, 5_412_678.0, 640.0])  # UTM-sized
 

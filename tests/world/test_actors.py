@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate, quat_from_yaw, se2
-from alpasim_plugin.types import Actor, Behaviour, Box, EgoState, Lane, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate, quat_from_yaw, se2
+from alpasim_plugin.core.types import Actor, Behaviour, Box, EgoState, Lane, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.actors import Actors
 from alpasim_plugin.world.ground import flat
 

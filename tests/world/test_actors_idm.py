@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import Box
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, nearest_ahead, spans
 from alpasim_plugin.world.path import polyline_path
 from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from alpasim_plugin.geometry import yaw_from_quat
-from alpasim_plugin.types import Box
+from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.world.path import polyline_path
 from alpasim_plugin.world.scripted import (
     brake_rows,

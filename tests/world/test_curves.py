@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import fresnel
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.world.curves import connect, offset_line, sample_clothoid, smoothstep
 from alpasim_plugin.world.path import polyline_path, smooth_path
 from tests.examples import examples

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import se2, yaw_of
-from alpasim_plugin.types import HeightField
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se2, yaw_of
+from alpasim_plugin.core.types import HeightField
 from alpasim_plugin.world.ground import flat, from_points, ground_pose, height_at
 from tests.examples import examples
 

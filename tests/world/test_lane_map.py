@@ -6,10 +6,10 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.geometry_lanes import centre_line, densify, lane_polygon
-from alpasim_plugin.types import Lane, LaneMap
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.geometry_lanes import centre_line, densify, lane_polygon
+from alpasim_plugin.core.types import Lane, LaneMap
 from alpasim_plugin.world.lane_map import LaneIndex
 from tests.examples import examples
 from tests.world.small_maps import FAR, arc, make, straight

@@ -14,7 +14,7 @@ from pathlib import Path
 from alpasim_plugin import __version__
 
 HERE = Path(__file__).resolve().parent
-WIRE = HERE.parent / "wire"
+WIRE = HERE.parents[1] / "wire"
 PACKAGE = "alpasim_onefixer_bridge"
 SUFFIXES = (".py", ".pyi", ".proto", ".yaml", ".json")
 INIT = '"""What AlpaSim needs of OneFixer in its own environment: wire messages, presets, a client."""\n'
@@ -51,8 +51,9 @@ def stage(target: Path) -> None:
         for path in sorted(source.rglob("*")):
             if path.suffix in SUFFIXES and path.name != "compile.py":
                 copy(path, package / name / path.relative_to(source))
-    copy(HERE / "client.py", package / "client" / "client.py")
+    client = (HERE / "client.py").read_text().replace("from ...wire", "from ..wire")  # there the messages lie one folder nearer
     copy(HERE / "check.py", package / "client" / "check.py")
+    (package / "client" / "client.py").write_text(client)
     (package / "client" / "__init__.py").write_text('"""A client of the renderer service, and a check of one."""\n')
     (package / "__init__.py").write_text(INIT)
     (target / "pyproject.toml").write_text(PROJECT)

@@ -21,10 +21,10 @@ from urllib.parse import parse_qs
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
 from alpasim_plugin.alpasim.client.listening import LoopbackPort, SocketFile
-from alpasim_plugin.child import Child, fate
-from alpasim_plugin.errors import InputError, PolicyError, SimrunError
-from alpasim_plugin.stdout import say
-from alpasim_plugin.types import Scenario
+from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.process.stdout import say
+from alpasim_plugin.process.subprocesses import Child, fate
 
 DOING = "starting a policy's command"
 DRIVING = "driving by a policy's command"

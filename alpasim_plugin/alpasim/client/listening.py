@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"

@@ -12,11 +12,11 @@ import uuid
 from collections.abc import Mapping
 
 from alpasim_plugin.alpasim.client.channel import Address, Service
-from alpasim_plugin.alpasim.wire import common_pb2, traffic_pb2
-from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.geometry import trajectory_from_poses
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.geometry import trajectory_from_poses
+from alpasim_plugin.core.types import F64, EgoState, Scenario
 from alpasim_plugin.log.schema import EGO, T_rig_box, header_from_scenario, read_transform, wire_traffic_session, wire_trajectory
-from alpasim_plugin.types import F64, EgoState, Scenario
+from alpasim_plugin.wire import common_pb2, traffic_pb2
 from alpasim_plugin.world.actors import Actors
 
 DOING = "asking an AlpaSim traffic service"

@@ -21,10 +21,10 @@ from alpasim_plugin.alpasim.server.sensorsim import Sensorsim
 from alpasim_plugin.alpasim.server.sources import FrameSource, LocalSource, UpstreamSource
 from alpasim_plugin.alpasim.server.version import version_of
 from alpasim_plugin.alpasim.server.world_model import WorldModel
-from alpasim_plugin.alpasim.wire.services import OPTIONS, Stub
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.parts import RendererSpec
-from alpasim_plugin.parts.spec import file_digest
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.plugins.parts import RendererSpec
+from alpasim_plugin.plugins.parts.spec import file_digest
+from alpasim_plugin.wire.services import OPTIONS, Stub
 
 DOING = "setting up a renderer service"
 RECONNECT = (("grpc.min_reconnect_backoff_ms", 200), ("grpc.initial_reconnect_backoff_ms", 200), ("grpc.max_reconnect_backoff_ms", 2000))

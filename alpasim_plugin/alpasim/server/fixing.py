@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.interfaces import BlockRule
-from alpasim_plugin.parts import RendererSpec, build, resolve_renderer
-from alpasim_plugin.types import U8, Frame
+from alpasim_plugin.plugins.interfaces import BlockRule
+from alpasim_plugin.plugins.parts import RendererSpec, build, resolve_renderer
 
 DOING = "choosing a renderer to serve"
 

@@ -13,10 +13,10 @@ from alpasim_plugin.alpasim.server.history import HistoryTree, Node
 from alpasim_plugin.alpasim.server.sources import FrameSource, Rendered, Request
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, read_view
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import U8
 from alpasim_plugin.log.images import ImageEncoding, encode_image
-from alpasim_plugin.types import U8
+from alpasim_plugin.wire import sensorsim_pb2
 
 DOING = "answering a render request"
 ENCODINGS: dict[int, ImageEncoding] = {sensorsim_pb2.PNG: "png", sensorsim_pb2.JPEG: "jpeg"}

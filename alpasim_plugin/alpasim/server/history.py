@@ -28,7 +28,7 @@ from typing import Generic, TypeVar
 
 from alpasim_plugin.alpasim.server.motion import distance
 from alpasim_plugin.alpasim.server.views import View
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 S = TypeVar("S")
 GAP_US = 2_000_000  # longest time between two frames of a drive

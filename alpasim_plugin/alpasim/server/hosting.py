@@ -12,10 +12,10 @@ from typing import Any
 
 import grpc
 
-from alpasim_plugin.alpasim.wire import SERVICE_PATHS, health_pb2
-from alpasim_plugin.alpasim.wire.reflection import Reflection
-from alpasim_plugin.alpasim.wire.services import OPTIONS, handlers
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.wire import SERVICE_PATHS, health_pb2
+from alpasim_plugin.wire.reflection import Reflection
+from alpasim_plugin.wire.services import OPTIONS, handlers
 
 DOING = "opening a port"
 OPEN_CALLS = (SERVICE_PATHS["Health"],)  # a load balancer has no token

@@ -14,9 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.types import F32, F64, U8, Bool, CameraSpec, Frame
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame
+from alpasim_plugin.wire import sensorsim_pb2
 
 DOING = "reading a camera's intrinsics"
 WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cannot carry the picture

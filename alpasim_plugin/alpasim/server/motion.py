@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.alpasim.server.views import View
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 SLACK_M = 0.1  # error of a predicted pose that is always allowed ...
 ACCEL_MPS2 = 10.0  # ... plus this times dt^2: twice the error of a constant speed under hard braking

@@ -17,11 +17,11 @@ import numpy as np
 
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.blank import blank_scenario
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.interfaces import Policy
-from alpasim_plugin.members import complete
-from alpasim_plugin.types import Scenario, Trajectory
+from alpasim_plugin.core.blank import blank_scenario
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Scenario, Trajectory
+from alpasim_plugin.plugins.interfaces import Policy
+from alpasim_plugin.plugins.members import complete
 
 ADDRESS = "SIMRUN_POLICY_ADDRESS"
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import project
-from alpasim_plugin.reading.images import read_image
-from alpasim_plugin.types import F32, F64, U8
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import project
+from alpasim_plugin.core.types import F32, F64, U8
+from alpasim_plugin.io.reading.images import read_image
 
 NEAR_M, FAR_M = 0.25, 3.0  # distance from the recorded path where trust begins to fall, and where it has fallen
 FAR = 0.6  # above 0.5: a hole is never invented

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from alpasim_plugin.alpasim.server.status import UnknownScene
-from alpasim_plugin.alpasim.wire import FRONT_WIDE, sensorsim_pb2
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Renderer, Scenario
 from alpasim_plugin.log.schema import wire_camera
-from alpasim_plugin.parts import RendererSpec, build, complete
+from alpasim_plugin.plugins.parts import RendererSpec, build, complete
 from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
-from alpasim_plugin.types import Renderer, Scenario
+from alpasim_plugin.wire import FRONT_WIDE, sensorsim_pb2
 from scenarios.load import load_scenario
 from scenarios.usdz import usdz_scene_id
 

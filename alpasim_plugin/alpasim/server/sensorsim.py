@@ -11,9 +11,9 @@ from alpasim_plugin.alpasim.server.failures import Failures
 from alpasim_plugin.alpasim.server.frames import FrameServer
 from alpasim_plugin.alpasim.server.scenes import SceneShelf, advertised
 from alpasim_plugin.alpasim.server.status import CallTime, answering
-from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.schema import wire_trajectory
+from alpasim_plugin.wire import common_pb2, sensorsim_pb2
 
 DOING = "serving AlpaSim's renderer service"
 T = TypeVar("T")

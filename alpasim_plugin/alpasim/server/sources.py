@@ -15,15 +15,15 @@ from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
 from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View
-from alpasim_plugin.alpasim.wire import sensorsim_pb2
-from alpasim_plugin.errors import InputError, SimrunError
-from alpasim_plugin.geometry import interpolate, inverse
+from alpasim_plugin.core.errors import InputError, SimrunError
+from alpasim_plugin.core.geometry import interpolate, inverse
+from alpasim_plugin.core.types import F64, U8, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
-from alpasim_plugin.types import F64, U8, CameraSpec, Frame, RenderRequest
+from alpasim_plugin.wire import sensorsim_pb2
 
 DOING = "rendering a requested frame"
 Request = sensorsim_pb2.RGBRenderRequest

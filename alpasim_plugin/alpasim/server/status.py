@@ -15,7 +15,7 @@ from typing import Any
 
 import grpc
 
-from alpasim_plugin.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 
 Code = grpc.StatusCode
 BACKEND = "Stopped waiting for backend"

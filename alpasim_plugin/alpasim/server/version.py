@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from alpasim_plugin import __version__
-from alpasim_plugin.alpasim.wire import api_version, common_pb2
-from alpasim_plugin.parts import RendererSpec
-from alpasim_plugin.parts.spec import digest
+from alpasim_plugin.plugins.parts import RendererSpec
+from alpasim_plugin.plugins.parts.spec import digest
+from alpasim_plugin.wire import api_version, common_pb2
 
 
 def version_of(spec: RendererSpec, settings: dict[str, Any], upstream: common_pb2.VersionId | None = None) -> common_pb2.VersionId:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.alpasim.wire import common_pb2, sensorsim_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import se3
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.types import F64
+from alpasim_plugin.wire import common_pb2, sensorsim_pb2
 
 DOING = "reading a render request"
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it

@@ -27,17 +27,17 @@ from alpasim_plugin.alpasim.server.lenses import Lens, read_lens
 from alpasim_plugin.alpasim.server.scenes import SceneEntry, SceneShelf
 from alpasim_plugin.alpasim.server.status import CallTime, UnknownScene, answering
 from alpasim_plugin.alpasim.server.views import read_pose
-from alpasim_plugin.alpasim.wire import common_pb2, video_model_pb2
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.geometry import interpolate
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
+from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.reading.images import check_image
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.reading import parsing
-from alpasim_plugin.reading.images import check_image
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
 from alpasim_plugin.semantic_map.layers import actor_boxes
 from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.types import F64, U8, Actor, CameraSpec, RenderRequest
+from alpasim_plugin.wire import common_pb2, video_model_pb2
 
 DOING = "serving AlpaSim's video-model service"
 FLU_FROM_CAMERA = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

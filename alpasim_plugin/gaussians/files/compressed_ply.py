@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.arrays import SH_C0, GaussianArrays
 from alpasim_plugin.gaussians.files.ply_header import PlyHeader, read_ply_element, read_ply_header
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.arrays import GaussianArrays, build_cloud
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud
 from alpasim_plugin.gaussians.files.compressed_ply import is_compressed_ply, read_compressed_ply
@@ -12,7 +12,7 @@ from alpasim_plugin.gaussians.files.ply import read_ply_arrays
 from alpasim_plugin.gaussians.files.ply_header import read_ply_header
 from alpasim_plugin.gaussians.files.splat import read_splat
 from alpasim_plugin.gaussians.files.spz import read_spz
-from alpasim_plugin.reading.files import open_regular, parsing
+from alpasim_plugin.io.reading.files import open_regular, parsing
 
 DOING = "reading a Gaussian model"
 SUPPORTED = (".ply", ".compressed.ply", ".splat", ".spz")

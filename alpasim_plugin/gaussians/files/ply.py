@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alpasim_plugin.atomic import atomic_file
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.arrays import GaussianArrays, build_cloud, logit, sigmoid
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply_header import PlyElement, PlyHeader, read_ply_element, read_ply_header
+from alpasim_plugin.io.atomic import atomic_file
 
 _REQUIRED = (
     "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alpasim_plugin.bounds import GAUSSIANS
-from alpasim_plugin.errors import InputError
-from alpasim_plugin.reading.files import open_regular
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.limits import GAUSSIANS
+from alpasim_plugin.io.reading.files import open_regular
 
 _MAX_HEADER_BYTES = 1 << 20
 MAX_PROPERTIES = 512  # the highest degree of colour takes 62

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.atomic import atomic_file
-from alpasim_plugin.bounds import GAUSSIANS
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.arrays import SH_C0, GaussianArrays
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.reading import read_bytes
+from alpasim_plugin.io.atomic import atomic_file
+from alpasim_plugin.io.limits import GAUSSIANS
+from alpasim_plugin.io.reading import read_bytes
 
 _ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)],

@@ -15,11 +15,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from alpasim_plugin.bounds import GAUSSIANS
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.arrays import GaussianArrays
-from alpasim_plugin.reading import read_bytes
-from alpasim_plugin.reading.packed import unzstd
+from alpasim_plugin.io.limits import GAUSSIANS
+from alpasim_plugin.io.reading import read_bytes
+from alpasim_plugin.io.reading.packed import unzstd
 
 MAGIC = 0x5053474E  # "NGSP" in file order
 _GZIP = b"\x1f\x8b"

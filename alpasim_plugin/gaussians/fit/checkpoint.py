@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from alpasim_plugin.atomic import write_safetensors
 from alpasim_plugin.gaussians.fit.adam import RowAdam
 from alpasim_plugin.gaussians.fit.density import ScreenGradients
 from alpasim_plugin.gaussians.fit.model import NAMES, SplatModel
-from alpasim_plugin.reading import parsing
-from alpasim_plugin.reading.checkpoints import START_ANEW, read_checkpoint
+from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.reading.checkpoints import START_ANEW, read_checkpoint
 
 STATE_FILE = "state.safetensors"
 

@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.image_metrics import psnr_db
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.adam import RowAdam
@@ -28,8 +30,6 @@ from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
-from alpasim_plugin.image_metrics import psnr_db
-from alpasim_plugin.seeding import stream
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
 SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves

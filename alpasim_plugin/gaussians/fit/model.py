@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.geometry import quat_from_matrix
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.arrays import logit
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.raster.gradient_types import Splats
 from alpasim_plugin.gaussians.sh import SH_SIZES, sh_rotation
-from alpasim_plugin.geometry import quat_from_matrix
-from alpasim_plugin.types import F64
 
 NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh_dc", "sh_rest")
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.types import F32, F64
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, HIGH_RAD, LOW_RAD, WIDTH, Sky
-from alpasim_plugin.types import F32, F64
 
 
 def sky_of(views: Sequence[PosedView]) -> Sky | None:

@@ -14,18 +14,18 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from alpasim_plugin.bounds import SOURCE_BYTES
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.view_files import AXES, FILE
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.geometry import inverse
-from alpasim_plugin.reading import read_bytes, read_json_object
-from alpasim_plugin.reading.images import decode_image
-from alpasim_plugin.reading.json_files import as_shape
-from alpasim_plugin.types import F64, U8
+from alpasim_plugin.io.limits import SOURCE_BYTES
+from alpasim_plugin.io.reading import read_bytes, read_json_object
+from alpasim_plugin.io.reading.images import decode_image
+from alpasim_plugin.io.reading.json_files import as_shape
 
 DOING = "reading photographs"
 MODEL = ("k1", "k2", "p1", "p2", "k3")  # the order of OpenCV's coefficients
@@ -72,7 +72,7 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
         InputError: No such file, a key is missing, another lens model than OpenCV's, or fewer than two images exist.
     """
     path = folder / FILE
-    document = read_json_object(path, DOING, do_this=f"give a folder with images and their {FILE} (docs/pairs.md)")
+    document = read_json_object(path, DOING, do_this=f"give a folder with images and their {FILE} (docs/lab/pairs.md)")
     if width < SIDE_PX or width % SIDE_PX:
         raise InputError(DOING, f"width {width}", f"not a multiple of {SIDE_PX}", f"choose for example {16 * SIDE_PX}")
     odd = sorted({str(document["camera_model"])} if document.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE") else set())

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.image_metrics import psnr_db, ssim
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.image_metrics import psnr_db, ssim
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 
 @dataclass(frozen=True)

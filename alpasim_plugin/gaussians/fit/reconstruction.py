@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 from typing_extensions import TypedDict
 
-from alpasim_plugin.atomic import write_json
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import read_ply, write_ply
 from alpasim_plugin.gaussians.scene.builder import with_background
 from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
-from alpasim_plugin.reading import read_json_as
-from alpasim_plugin.reading.images import read_image
+from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.io.reading import read_json_as
+from alpasim_plugin.io.reading.images import read_image
 
 DOING = "reading a reconstruction"
 INDEX_FILE, BACKGROUND_FILE, SKY_FILE = "reconstruction.json", "background.ply", "sky.png"

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from alpasim_plugin.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, gaussian_blur
+from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, gaussian_blur
 
 
 class SsimTarget:
-    """The image that others are compared with; the value is that of `alpasim_plugin.image_metrics.ssim`.
+    """The image that others are compared with; the value is that of `alpasim_plugin.core.image_metrics.ssim`.
 
     Args:
         target: ``(H, W, 3)`` float32, 0..1.

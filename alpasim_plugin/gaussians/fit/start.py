@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse, transform_points
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64, Bool, Box
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.geometry import inverse, transform_points
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, Bool, Box
 
 RANGE_ERROR_M, RANGE_ERROR_SHARE = 0.03, 0.004  # spread of a point along its ray: fixed, and by distance
 BOX_MARGIN_M = 0.1  # points this far outside an actor's sides still belong to it; below, its box ends this far above the ground

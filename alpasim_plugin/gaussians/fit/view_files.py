@@ -23,19 +23,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.atomic import write_json
-from alpasim_plugin.bounds import SOURCE_BYTES
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply_header import read_ply_element, read_ply_header
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.geometry import inverse
-from alpasim_plugin.reading import read_bytes, read_json_object
-from alpasim_plugin.reading.images import decode_image
-from alpasim_plugin.reading.json_files import as_shape
-from alpasim_plugin.types import F64, Bool
+from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.io.limits import SOURCE_BYTES
+from alpasim_plugin.io.reading import read_bytes, read_json_object
+from alpasim_plugin.io.reading.images import decode_image
+from alpasim_plugin.io.reading.json_files import as_shape
 
 FILE = "transforms.json"
 DOING = "reading posed views"

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.types import F32, F64, Bool, CameraSpec, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.geometry import interpolate
-from alpasim_plugin.types import F32, F64, Bool, CameraSpec, Scenario
 
 
 @dataclass(frozen=True, eq=False)

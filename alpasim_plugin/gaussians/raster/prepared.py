@@ -8,11 +8,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MIN, EXTENT_MAX_SIGMA
 from alpasim_plugin.gaussians.raster.layout import BUNDLE, GEO_EXTENT, GEO_FACTOR, GEO_PEAK, GEO_REACH, GEO_SIZE, SPHERE_SIZE
 from alpasim_plugin.gaussians.raster.project_kernels import colours_in_lanes
-from alpasim_plugin.types import F64
 
 ShFrame = Literal["object", "world"]
 Node = tuple["PreparedCloud", npt.NDArray[np.floating] | None]

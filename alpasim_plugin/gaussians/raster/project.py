@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA, FAR_M, NEAR_M
 from alpasim_plugin.gaussians.sh import sh_colours
-from alpasim_plugin.types import F64
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
 from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
@@ -30,7 +31,6 @@ from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepar
 from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
 from alpasim_plugin.gaussians.raster.workers import run_on_threads, thread_count
-from alpasim_plugin.types import F64
 
 
 class Buffers(threading.local):

@@ -14,7 +14,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.constants import NEAR_M
 from alpasim_plugin.gaussians.raster.gradient_colour import colour_splats
@@ -25,7 +26,6 @@ from alpasim_plugin.gaussians.raster.layout import BUNDLE, GEO_SIZE, POSE_CENTRE
 from alpasim_plugin.gaussians.raster.project_kernels import project_node
 from alpasim_plugin.gaussians.raster.rasterize_cpu import WORTH_THREADS, Buffers, TileLists, camera_numbers, list_per_tile, node_poses
 from alpasim_plugin.gaussians.raster.workers import run_on_threads, thread_count
-from alpasim_plugin.types import F64
 
 _DOING = "rendering splats for training"
 _LANES = 16

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from alpasim_plugin.errors import InputError, RendererError
+from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, FAR_M, NEAR_M

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, NEAR_M, TRANSMITTANCE_STOP
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.project import Projection, project_gaussians
-from alpasim_plugin.types import F64
 
 
 def rasterize_reference(

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()

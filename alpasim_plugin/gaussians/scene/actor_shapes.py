@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.types import F64
+from alpasim_plugin.core.types import F64
 
 Top = Literal["body", "glass", "bed"]
 

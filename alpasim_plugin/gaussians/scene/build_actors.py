@@ -12,13 +12,13 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F32, F64, Actor, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.actor_shapes import STATIONS, Loft
 from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
 from alpasim_plugin.gaussians.scene.surfels import cloud_of, quad_surfels, rods, with_sheen
 from alpasim_plugin.gaussians.sh import C0
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F32, F64, Actor, Box, Scenario
 
 CELLS_M = (0.09, 0.22, 0.6)
 BODY_RGB = np.array(

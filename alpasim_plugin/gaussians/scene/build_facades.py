@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.contours import contours
 from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, to_pixels
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quats_along
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64, I64, U8, Bool
 
 SETBACK_M = {False: 5.5, True: 24.0}  # by highway or not
 WITHIN_M = 75.0

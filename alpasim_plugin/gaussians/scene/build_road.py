@@ -13,13 +13,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.ground_texture import KERB_M, GroundTexture, paint_ground
 from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.scene.site import Site
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, THICKNESS, cloud_of, grid_cells, quats_along, upright_quats
-from alpasim_plugin.types import F32, F64, I64, Bool
 
 FINE_M, COARSE_M = 0.125, 0.5
 TILE_M, FAR_TILE_M = 16.0, 32.0

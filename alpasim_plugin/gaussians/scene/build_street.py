@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
 from alpasim_plugin.gaussians.scene.contours import contours, places
@@ -13,8 +15,6 @@ from alpasim_plugin.gaussians.scene.ground_texture import KERB_M
 from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64, I64, Bool
 
 KERB_RGB = (0.66, 0.65, 0.62)
 RAIL_RGB = (0.62, 0.64, 0.66)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades, place_houses
@@ -15,8 +17,6 @@ from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.site import HeightAt, make_site
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F64, Scenario
 
 FILE_TILE_M = 16.0
 LIGHT = {"clear": (1.0, 1.0, 1.0), "overcast": (0.86, 0.88, 0.91), "dusk": (0.74, 0.63, 0.62)}  # on everything but the sky, by sky

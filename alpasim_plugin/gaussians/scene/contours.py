@@ -7,9 +7,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64, Bool
 
 SMOOTH = 9  # points of the moving average that takes the raster's steps out of a contour
 

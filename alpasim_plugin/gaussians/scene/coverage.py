@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.geometry import arc_lengths
-from alpasim_plugin.types import F64
 
 NEAR_M, BELOW_M, ABOVE_M = 10.0, 5.0, 15.0  # a Gaussian is near a point of the path: in plan view, and in height
 FEWEST = 20  # Gaussians near a point of the path for it to count as covered

@@ -22,13 +22,13 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from alpasim_plugin.core.geometry import arc_lengths, interpolate, project, resample, se3
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F32, F64, Degradation, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
 from alpasim_plugin.gaussians.scene.nodes import SceneNode
 from alpasim_plugin.gaussians.sh import C0, C1
-from alpasim_plugin.geometry import arc_lengths, interpolate, project, resample, se3
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F32, F64, Degradation, Scenario
 
 STEPS = 8
 BEHIND_M = 6.0  # a Gaussian's log camera is the one this far before it

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.types import F32, F64, I64, U8
 from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
 from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, to_pixels
-from alpasim_plugin.types import F32, F64, I64, U8
 
 PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
 ASPHALT = (0.335, 0.335, 0.345)

@@ -8,8 +8,8 @@ import cv2
 import numba
 import numpy as np
 
+from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.types import F32, F64, I64, Bool
 
 TOLERANCE, MARGIN_M = 0.06, 0.3  # a point this share of depth, plus this, behind the surface that was seen still counts as seen
 EDGE_SHARE = 0.05  # a Gaussian just outside the image still shows in it

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.types import F64, I64
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import scipy
 
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.types import F64, I64, Paint
 from alpasim_plugin.gaussians.scene.site import CELL_M, Site
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.types import F64, I64, Paint
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern
 LINE_WIDTH_M = 0.14

@@ -16,7 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.errors import RendererError
+from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.output import RasterOutput
@@ -25,7 +26,6 @@ from alpasim_plugin.gaussians.raster.rasterize import Backend, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.nodes import SceneNode
 from alpasim_plugin.gaussians.scene.sky import Sky
-from alpasim_plugin.types import F64, Bool
 
 CELL_PX = 3.5
 Change = Callable[[SceneNode, int], GaussianCloud]  # (node, level index) -> the cloud to draw in its place

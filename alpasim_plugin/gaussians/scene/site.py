@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from alpasim_plugin.geometry import arc_lengths, resample
-from alpasim_plugin.geometry_lanes import lane_polygon
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import F32, F64, Bool, Lane, Scenario
+from alpasim_plugin.core.geometry import arc_lengths, resample
+from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F32, F64, Bool, Lane, Scenario
 
 HeightAt = Callable[[F64], F64]  # (N, 2+) world xy -> (N,) metres
 

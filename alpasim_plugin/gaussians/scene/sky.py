@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.types import F32
 
 Kind = Literal["clear", "overcast", "dusk"]
 WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD

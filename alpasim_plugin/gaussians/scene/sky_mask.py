@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F32
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import LogView
-from alpasim_plugin.geometry import inverse
-from alpasim_plugin.types import F32
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw
+from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.gaussians.cloud import GaussianCloud, quat_multiply
 from alpasim_plugin.gaussians.sh import C1, dc_from_rgb
-from alpasim_plugin.geometry import quat_from_matrix, quat_from_yaw
-from alpasim_plugin.types import F64, I64
 
 SPREAD = 0.64  # standard deviation per cell size
 THICKNESS = 0.08  # standard deviation across the surface, per cell size

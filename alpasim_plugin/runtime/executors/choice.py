@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.base import Resources
 from alpasim_plugin.runtime.executors.dispatch import Pool

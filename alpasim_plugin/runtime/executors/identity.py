@@ -12,8 +12,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from alpasim_plugin import OWN_PACKAGES
-from alpasim_plugin.parts import PartSpec
-from alpasim_plugin.parts.source import OWN_ROOT, code_digest
+from alpasim_plugin.plugins.parts import PartSpec
+from alpasim_plugin.plugins.parts.source import OWN_ROOT, code_digest
 from alpasim_plugin.runtime.provenance import versions
 
 CODE = "code of simrun"

@@ -9,10 +9,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from alpasim_plugin.atomic import disk_error, scratch_folder
-from alpasim_plugin.errors import InfrastructureError, SimrunError
-from alpasim_plugin.measured import share_measurements
-from alpasim_plugin.parts import PartSpec
+from alpasim_plugin.core.errors import InfrastructureError, SimrunError
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.io.atomic import disk_error, scratch_folder
+from alpasim_plugin.io.measured import share_measurements
+from alpasim_plugin.plugins.parts import PartSpec
 from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction import KIND as MODELS
 from alpasim_plugin.renderers.reconstruction_key import model_key
@@ -23,7 +24,6 @@ from alpasim_plugin.runtime.executors.placing import Contents, is_here, paths_in
 from alpasim_plugin.runtime.executors.scratch import measured_folder, scratch_root
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.stores.stored import commit_key, run_stored_cell
-from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
 
 HELD_SCENES = 4  # by each worker

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.atomic import disk_error
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.io.atomic import disk_error
 from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, read_manifest, write_manifest
 from alpasim_plugin.runtime.recorder import OUTPUT_NAME
 

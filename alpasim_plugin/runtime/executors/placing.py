@@ -12,12 +12,12 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
-from alpasim_plugin.atomic import write_bytes
-from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.parts.source import OWN_ROOT
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.io.checksums import sha256_of
+from alpasim_plugin.plugins.parts.source import OWN_ROOT
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.vouched import sha256_of
 
 KIND = "placed"
 M = TypeVar("M", bound=BaseModel)

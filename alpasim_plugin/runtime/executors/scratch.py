@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from alpasim_plugin.processes import is_running
+from alpasim_plugin.process.processes import is_running
 from alpasim_plugin.runtime.writing import remove_left_overs
 
 GONE_S = 5.0  # within which a killed process must be gone
@@ -24,7 +24,7 @@ def scratch_root() -> Path:
 
 
 def measured_folder(run: str) -> Path:
-    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.measured`)."""
+    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.measured`)."""
     return scratch_root() / "measured" / run
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.runtime.executors.base import Node
 from alpasim_plugin.runtime.workers import THREAD_VARIABLES
 

@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from alpasim_plugin.atomic import write_bytes
-from alpasim_plugin.errors import InfrastructureError
-from alpasim_plugin.optional import require_library
-from alpasim_plugin.processes import is_running, started_of
+from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.plugins.extras import require_library
+from alpasim_plugin.process.processes import is_running, started_of
 from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.base import Faulty
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.errors import InfrastructureError
+from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.runtime.executors.parcel import Parcel
 from alpasim_plugin.runtime.stores.objects import Objects, open_objects
 

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from alpasim_plugin.atomic import disk_error, temporary_path, write_bytes
-from alpasim_plugin.errors import InfrastructureError, InputError
-from alpasim_plugin.optional import require_library
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io.atomic import disk_error, temporary_path, write_bytes
+from alpasim_plugin.plugins.extras import require_library
 
 T = TypeVar("T")
 

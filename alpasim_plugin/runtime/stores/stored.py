@@ -8,12 +8,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.parts import digest
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.parts import digest
 from alpasim_plugin.runtime.cell import run_cell
 from alpasim_plugin.runtime.executors.parcel import pack, unpack
 from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.stores.commits import Commits
-from alpasim_plugin.types import Scenario
 from scenarios.suite import ScenarioRef
 
 

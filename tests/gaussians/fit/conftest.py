@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.geometry import se3
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import Box
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.fit import PosedView, Start, start_from_depth
 from alpasim_plugin.gaussians.fit.views import seen_from
@@ -14,9 +17,6 @@ from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.geometry import se3
-from alpasim_plugin.seeding import stream
-from alpasim_plugin.types import Box
 
 WIDTH, HEIGHT = 48, 32
 FAR = np.array([4.0e5, -2.0e5, 100.0])  # a scene that lies where float32 has steps of 3 cm

@@ -9,7 +9,9 @@ import pytest
 import torch
 from torch.nn.functional import conv2d
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_db, ssim
+from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit import SplatRecipe, Start, cloud_from_points, held_out, start_from_depth
 from alpasim_plugin.gaussians.fit.adam import RowAdam
@@ -19,8 +21,6 @@ from alpasim_plugin.gaussians.fit.panorama import sky_of
 from alpasim_plugin.gaussians.fit.similarity import SsimTarget
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.sh import dc_from_rgb
-from alpasim_plugin.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_db, ssim
-from alpasim_plugin.seeding import stream
 from tests.gaussians.fit.conftest import BOX, FAR, HEIGHT, WIDTH, Posed, actor_pose
 from tests.gaussians.gaussian_scenes import random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import cloud_of

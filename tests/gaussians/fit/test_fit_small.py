@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, loop
 from alpasim_plugin.gaussians.fit.checkpoint import STATE_FILE

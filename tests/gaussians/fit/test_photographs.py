@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.photographs import Match, read_photographs, triangulated
 from alpasim_plugin.gaussians.fit.views import PosedView

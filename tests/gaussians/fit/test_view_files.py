@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.errors import InputError
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.gaussians.fit.view_files import FILE, read_points, read_views, write_views
-from alpasim_plugin.geometry import inverse
 from tests.gaussians.fit.conftest import Posed
 
 

@@ -1,0 +1,106 @@
+"""Reference implementation of the streaming fixer: a whole clip at once in float32, nothing streamed, cached, folded or reused.
+
+Every block sees all blocks before it in one forward pass under the block-causal mask, so the cost grows with the square of the clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.types import U8, BlockRule
+from alpasim_plugin.fixers.networks import LATENT, Networks, decode, load_networks
+from alpasim_plugin.fixers.noise import latent_noise
+from alpasim_plugin.fixers.pipeline import condition_of, map_video, opacity_input
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers.views import group_views, to_clip, to_images
+from alpasim_plugin.lab.bench.fixer_speed import Clip
+from alpasim_plugin.nets.clips import on_grid
+from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sources_needed
+from alpasim_plugin.nets.schedule import context_level, from_names
+
+
+def refine_latents(
+    networks: Networks, settings: OneFixerSettings, z_render: Tensor, mask: Tensor, condition: Tensor, noise: Sequence[Tensor]
+) -> Tensor:
+    """Fix the latents of a whole clip.
+
+    Args:
+        networks: In float32, not folded.
+        settings: Steps, history, window, block length.
+        z_render: ``(B, 16, T, h, w)``.
+        condition: ``(B, channels, T, h, w)``, from `condition_of`.
+        mask: ``(B, 1, T, h, w)``, ``m`` of Eq. 1.
+        noise: Draws like ``z_render``.
+
+    Returns:
+        ``(B, 16, T, h, w)`` clean latents.
+    """
+    schedule, n = from_names(settings.steps), settings.block_latents
+    clean, past, past_t = z_render[:, :, :0], z_render[:, :, :0], torch.zeros(1, 0)
+    for start in range(0, z_render.shape[2], n):
+        own = slice(start, start + n)
+        sources = [mixed_source(z_render[:, :, own], mask[:, :, own], eps[:, :, own]) for eps in noise]  # Eq. 1
+        x = sources[0]
+        for i, level in enumerate(schedule):
+            given = torch.cat([past, x], dim=2)
+            t = torch.cat([past_t, torch.full((1, x.shape[2]), level.t)], dim=1)
+            v = networks.dit(
+                given, t, networks.text, condition[:, :, : start + n], block_latents=n, window=settings.window, sink=settings.sink
+            )
+            z_0 = flow_step(x, v[:, :, start:], level.sigma)  # Eq. 2
+            if i + 1 < len(schedule):
+                x = interpolant(z_0, sources[i + 1], schedule[i + 1].sigma)
+        if settings.history == "finalise":
+            level = context_level()
+            x = interpolant(z_0, noise[-1][:, :, own], level.sigma)
+        clean, past = torch.cat([clean, z_0], dim=2), torch.cat([past, x], dim=2)
+        past_t = torch.cat([past_t, torch.full((1, x.shape[2]), level.t)], dim=1)
+    return clean
+
+
+@torch.inference_mode()
+def refine_clip(
+    networks: Networks, settings: OneFixerSettings, rgb: Tensor, alpha: Tensor | None, sdmap: Tensor | None, noise: Sequence[Tensor]
+) -> Tensor:
+    """Fix a whole clip; arguments as `BlockPipeline.run`, for all frames.
+
+    Returns:
+        ``(B, 3, T, H, W)``, not clipped to [-1, 1].
+    """
+    z_render = networks.vae.encode(rgb)
+    shown = map_video(settings, rgb, sdmap)
+    z_map = torch.zeros_like(z_render) if shown is None else networks.vae.encode(shown)
+    mask = torch.ones_like(z_render[:, :1]) if alpha is None or settings.holes == "render" else opacity_mask(alpha, first=True)
+    mask = torch.zeros_like(mask) if settings.holes == "everywhere" else mask
+    condition = condition_of(settings, z_map, z_render, opacity_input(settings, rgb, alpha, first=True))
+    clean = refine_latents(networks, settings, z_render, mask, condition, noise)
+    return decode(networks, settings, clean, rgb, alpha)[0]
+
+
+def whole_clip(settings: OneFixerSettings, clip: Clip, scene_id: str, seed: int) -> U8:
+    """Fix a clip as a streaming fixer with these settings and this key would in exact arithmetic.
+
+    Args:
+        settings: Their precision is set to float32.
+        clip: Any number of frames of one camera; the last block is padded.
+        scene_id, seed: Key of the noise.
+
+    Returns:
+        ``(T, H, W, 3)`` uint8.
+    """
+    exact = settings.model_copy(update={"precision": "fp32", "codec_precision": "fp32", "fold": False})
+    networks = load_networks(exact)
+    rule, frames = BlockRule.of_latents(settings.block_latents), clip.frames()
+    due = rule.first + -(-max(0, len(frames) - rule.first) // rule.then) * rule.then
+    (views,) = group_views(frames, list(clip.maps) if settings.uses_map else (), due)
+    video = to_clip(views, due)
+    latents = (on_grid(due) - 1) // 4 + 1
+    draws = sources_needed(from_names(settings.steps), settings.history)
+    shape = (LATENT, video.rgb.shape[3] // 8, video.rgb.shape[4] // 8)
+    noise = latent_noise(scene_id, seed, views.cameras, draws, range(latents), shape)
+    fixed = refine_clip(networks, settings, video.rgb, video.alpha, video.maps, noise)
+    images: U8 = to_images(fixed, views.size)[0]
+    return images

@@ -1,0 +1,199 @@
+"""Rigid motion and polylines: the small maths every stage shares.
+
+Quaternions are ``wxyz``; ``T_a_b`` maps coordinates in b to coordinates in a; angles are radians, lengths metres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F64, Trajectory
+
+
+def wrap_angle(angle_rad: npt.ArrayLike) -> F64:
+    """Wrap angles to [-pi, pi).
+
+    Example:
+        >>> float(wrap_angle(3 * np.pi / 2)) == -np.pi / 2
+        True
+    """
+    return np.asarray((np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def quat_from_yaw(yaw_rad: npt.ArrayLike) -> F64:
+    """Return ``(..., 4)`` unit quaternions of rotations about z by ``(...)`` angles."""
+    yaw = np.asarray(yaw_rad, dtype=np.float64)
+    zero = np.zeros_like(yaw)
+    return np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=-1)
+
+
+def yaw_from_quat(quat: npt.ArrayLike) -> F64:
+    """Return the heading ``(...)`` of ``(..., 4)`` quaternions: the angle of body x in the world's xy plane."""
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def matrix_from_quat(quat: npt.ArrayLike) -> F64:
+    """Return rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
+    """Return the unit quaternions ``(..., 4)`` with w >= 0 of rotation matrices ``(..., 3, 3)``.
+
+    Takes the largest of the four candidate components, so it is stable at 180 degrees (Shepperd 1978).
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    batch = r.shape[:-2]
+    m = r.reshape(-1, 3, 3)
+    trace = np.trace(m, axis1=1, axis2=2)
+    candidates = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
+    largest = np.argmax(candidates, axis=1)
+    d = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1)
+    s = m + np.swapaxes(m, 1, 2)
+    options = np.empty((len(m), 4, 4))
+    options[:, 0] = np.stack([1 + trace, d[:, 0], d[:, 1], d[:, 2]], axis=1)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        row = options[:, i + 1]
+        row[:, 0] = d[:, i]
+        row[:, 1 + i] = 1 + m[:, i, i] - m[:, j, j] - m[:, k, k]
+        row[:, 1 + j], row[:, 1 + k] = s[:, i, j], s[:, i, k]
+    quat = options[np.arange(len(m)), largest]
+    quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    quat = np.where(quat[:, :1] < 0, -quat, quat)
+    return np.asarray(quat.reshape(*batch, 4), dtype=np.float64)
+
+
+def se3(xyz: npt.ArrayLike, quat: npt.ArrayLike) -> F64:
+    """Return ``(..., 4, 4)`` transforms from positions ``(..., 3)`` and quaternions ``(..., 4)``."""
+    xyz_ = np.asarray(xyz, dtype=np.float64)
+    out = np.zeros((*xyz_.shape[:-1], 4, 4))
+    out[..., :3, :3] = matrix_from_quat(quat)
+    out[..., :3, 3] = xyz_
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def se2(x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> F64:
+    """Return the ``(4, 4)`` transform of a planar pose."""
+    return se3([x_m, y_m, z_m], quat_from_yaw(yaw_rad))
+
+
+def inverse(transform: F64) -> F64:
+    """Invert rigid ``(..., 4, 4)`` transforms by transposition, exact to rounding."""
+    rotation_t = np.swapaxes(transform[..., :3, :3], -1, -2)
+    out = np.zeros_like(transform)
+    out[..., :3, :3] = rotation_t
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation_t, transform[..., :3, 3])
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def transform_points(transform: F64, points: F64) -> F64:
+    """Map ``(N, 3)`` points by a ``(4, 4)`` transform."""
+    return np.asarray(points @ transform[:3, :3].T + transform[:3, 3])
+
+
+def yaw_of(transform: F64) -> float:
+    """Return the heading of a ``(4, 4)`` transform."""
+    return float(np.arctan2(transform[1, 0], transform[0, 0]))
+
+
+def slerp(q0: F64, q1: F64, fraction: F64) -> F64:
+    """Interpolate unit quaternions ``(N, 4)`` on the shorter arc; falls back to normalised lerp below 1e-8 rad, where it is exact."""
+    dot = np.sum(q0 * q1, axis=-1, keepdims=True)
+    q1 = np.where(dot < 0, -q1, q1)
+    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+    s = np.sin(angle)
+    f = np.asarray(fraction)[..., None]
+    small = s < 1e-8
+    safe = np.where(small, 1.0, s)
+    w0 = np.where(small, 1 - f, np.sin((1 - f) * angle) / safe)
+    w1 = np.where(small, f, np.sin(f * angle) / safe)
+    out = w0 * q0 + w1 * q1
+    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+
+
+def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
+    """Return poses ``(..., 4, 4)`` at times inside the trajectory: linear in position, slerp in rotation.
+
+    Raises:
+        InputError: A time lies outside ``[t_us[0], t_us[-1]]``; poses are never extrapolated.
+    """
+    t = np.asarray(t_us, dtype=np.int64)
+    first, last = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    if t.size and (int(t.min()) < first or int(t.max()) > last):
+        raise InputError(
+            "interpolating a trajectory",
+            f"times {int(t.min())}..{int(t.max())} us",
+            f"the trajectory covers {first}..{last} us",
+            "ask only for times inside it",
+        )
+    if len(trajectory) == 1:
+        return np.broadcast_to(se3(trajectory.xyz[0], trajectory.quat[0]), (*t.shape, 4, 4)).copy()
+    i = np.clip(np.searchsorted(trajectory.t_us, t, side="right") - 1, 0, len(trajectory) - 2)
+    # Differences in integers first: epoch microseconds do not fit a float's mantissa once squared or scaled.
+    span = (trajectory.t_us[i + 1] - trajectory.t_us[i]).astype(np.float64)
+    f = (t - trajectory.t_us[i]).astype(np.float64) / span
+    xyz = trajectory.xyz[i] * (1 - f)[..., None] + trajectory.xyz[i + 1] * f[..., None]
+    quat = slerp(trajectory.quat[i].reshape(-1, 4), trajectory.quat[i + 1].reshape(-1, 4), f.reshape(-1))
+    return se3(xyz, quat.reshape(*t.shape, 4))
+
+
+def trajectory_from_poses(t_us: npt.ArrayLike, poses: npt.ArrayLike) -> Trajectory:
+    """Build a trajectory from times ``(T,)`` and transforms ``(T, 4, 4)``."""
+    matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    return Trajectory(np.asarray(t_us, dtype=np.int64), matrices[:, :3, 3].copy(), quat_from_matrix(matrices[:, :3, :3]))
+
+
+def offset_trajectory(trajectory: Trajectory, T_body_other: F64) -> Trajectory:
+    """Return the trajectory of a frame fixed to the body: ``T_world_other = T_world_body @ T_body_other``."""
+    return trajectory_from_poses(trajectory.t_us, se3(trajectory.xyz, trajectory.quat) @ T_body_other)
+
+
+def arc_lengths(line: F64) -> F64:
+    """Return the cumulative length ``(N,)`` along the xy projection of a polyline ``(N, 2+)``."""
+    steps = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def resample(line: F64, s_m: npt.ArrayLike) -> F64:
+    """Return points ``(M, D)`` of a polyline ``(N, D)`` at arc lengths ``(M,)``, clamped to its ends."""
+    s = arc_lengths(line)
+    keep = np.concatenate([[True], np.diff(s) > 0])
+    at = np.asarray(s_m, dtype=np.float64)
+    return np.stack([np.interp(at, s[keep], line[keep, d]) for d in range(line.shape[1])], axis=-1)
+
+
+def project(line: F64, xy: F64) -> tuple[float, float]:
+    """Return (arc length, signed distance; left positive) of the point of a polyline ``(N, 2+)`` nearest to ``xy``."""
+    a, b = line[:-1, :2], line[1:, :2]
+    d = b - a
+    length2 = np.maximum(np.sum(d * d, axis=1), 1e-300)
+    f = np.clip(np.sum((xy[:2] - a) * d, axis=1) / length2, 0.0, 1.0)
+    offset = xy[:2] - (a + f[:, None] * d)
+    distance2 = np.sum(offset * offset, axis=1)
+    i = int(np.argmin(distance2))
+    side = d[i, 0] * offset[i, 1] - d[i, 1] * offset[i, 0]
+    s = arc_lengths(line)
+    return float(s[i] + f[i] * np.sqrt(length2[i])), float(np.copysign(np.sqrt(distance2[i]), side))
+
+
+UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])  # front-left, front-right, rear-right, rear-left
+
+
+def rectangle_corners(xy: F64, yaw: F64, size: F64) -> F64:
+    """Return the corners ``(N, 4, 2)`` of boxes with centres ``(N, 2)``, headings ``(N,)`` and (length, width) ``(N, 2)``."""
+    local = UNIT_CORNERS * size[:, None, :]  # (N, 4, 2)
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = local[..., 0], local[..., 1]
+    return np.stack([xy[:, None, 0] + c * x - s * y, xy[:, None, 1] + s * x + c * y], axis=-1)

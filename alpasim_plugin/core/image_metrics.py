@@ -1,0 +1,97 @@
+"""PSNR and SSIM of images: one definition of each for every table, report and training log.
+
+SSIM follows Wang et al., IEEE TIP 2004, Eq. 13, in the convention of the 3DGS papers: Gaussian window 11x11 with sigma 1.5, biased moments,
+zeros beyond the border, per channel, then the mean over pixels and channels. Other conventions differ by up to 0.005 on one pair of images.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.core.types import F32
+
+CAP_DB = 100.0  # of identical images, whose ratio is infinite
+WINDOW_PX, SIGMA_PX = 11, 1.5
+C1, C2 = 0.01**2, 0.03**2  # for values in 0 to 1
+_KERNEL = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX, cv2.CV_32F)
+
+Image = npt.NDArray[Any]
+
+
+def psnr_db(image: Image, truth: Image, peak: float = 255.0) -> float:
+    """Return ``10 log10(peak^2 / MSE)``, MSE over all values; at most 100 dB.
+
+    Args:
+        image, truth: Arrays of one shape.
+        peak: Width of the range of values: 255 for 8 bits, 1 for 0 to 1, 2 for -1 to 1.
+
+    Example:
+        >>> black = np.zeros((8, 8, 3), np.uint8)
+        >>> round(psnr_db(black + np.uint8(51), black), 4), psnr_db(black, black)
+        (13.9794, 100.0)
+    """
+    mse = float(np.mean(np.square(np.subtract(image, truth, dtype=np.float64))))
+    return CAP_DB if mse == 0 else min(CAP_DB, decibels(mse, peak))
+
+
+def decibels(mse: float, peak: float = 255.0) -> float:
+    """Return the PSNR of a mean squared error above 0, without a cap."""
+    return 10 * float(np.log10(peak**2 / mse))
+
+
+def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
+    """Return the mean structural similarity of images ``(H, W, 3)``, 1 for equal ones.
+
+    Example:
+        >>> ramp = np.tile(np.arange(0, 240, 10, dtype=np.uint8)[:, None, None], (1, 24, 3))
+        >>> round(ssim(ramp, ramp), 6)
+        1.0
+    """
+    a, b = (np.ascontiguousarray(x, dtype=np.float32) / np.float32(peak) for x in (image, truth))
+    mu_a, mu_b = gaussian_blur(a), gaussian_blur(b)
+    both, square_a, square_b = mu_a * mu_b, mu_a * mu_a, mu_b * mu_b
+    var_a, var_b, cov = gaussian_blur(a * a) - square_a, gaussian_blur(b * b) - square_b, gaussian_blur(a * b) - both
+    value = (2 * both + C1) * (2 * cov + C2) / ((square_a + square_b + C1) * (var_a + var_b + C2))
+    return float(value.mean(dtype=np.float64))
+
+
+def gaussian_blur(image: F32) -> F32:
+    """Return local means ``(H, W, C)`` under SSIM's window."""
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, _KERNEL, _KERNEL, borderType=cv2.BORDER_CONSTANT))
+
+
+def grid_ratio(images: Image, truths: Image, side: int = 4, flat_levels: float = 3.0) -> float | None:
+    """Return how much stronger a picture's steps are across the borders of a grid than elsewhere, on surfaces that are flat in the truth.
+
+    A network that makes cells of pixels at a time may leave their grid in the picture; 1 is none. Both axes count alike.
+
+    Args:
+        images: ``(..., H, W, 3)`` what a network made, 8 bits.
+        truths: Like ``images``; they say which surfaces are flat.
+        side: Pixels of a cell.
+        flat_levels: A step between neighbouring pixels of the truth up to which it counts as flat.
+
+    Returns:
+        Mean step at borders over mean step elsewhere; None where nothing is flat, or the image does not change there.
+
+    Example:
+        >>> column = np.arange(64)
+        >>> cells = np.tile((column % 2 + 2 * (column // 4 % 2)).astype(np.uint8)[None, :, None], (64, 1, 3))
+        >>> round(grid_ratio(cells, np.zeros_like(cells)), 2), round(grid_ratio(cells, np.zeros_like(cells), side=3), 2)
+        (1.93, 0.96)
+    """
+    border, elsewhere = np.zeros(2), np.zeros(2)  # sum of steps, their number
+    for axis in (-3, -2):
+        step, flat = (np.abs(np.diff(x.astype(np.int16), axis=axis)).mean(axis=-1) for x in (images, truths))
+        at = np.arange(1, step.shape[axis + 1] + 1) % side == 0  # the step from pixel k to k + 1 crosses a border where side divides k + 1
+        at = at[:, None] if axis == -3 else at
+        for total, chosen in ((border, at), (elsewhere, ~at)):
+            counted = step[(flat <= flat_levels) & chosen]
+            total += (counted.sum(), counted.size)
+    if not border[1] or not elsewhere[0]:
+        return None
+    return float(border[0] / border[1] / (elsewhere[0] / elsewhere[1]))

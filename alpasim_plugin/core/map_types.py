@@ -1,0 +1,81 @@
+"""The vector map of a scene; see `alpasim_plugin.core.types` for the conventions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+F64 = npt.NDArray[np.float64]
+
+Paint = Literal["none", "solid_white", "dashed_white", "solid_yellow", "dashed_yellow", "double_yellow", "unknown"]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Full sizes of a cuboid in its own frame (x length, y width, z height)."""
+
+    length_m: float
+    width_m: float
+    height_m: float
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One lane; edges are seen in driving direction."""
+
+    lane_id: str
+    centre: F64  # (N, 3) metres, world
+    left: F64 | None  # (L, 3) or None where the map has no edge
+    right: F64 | None  # (R, 3) or None
+    kind: str = "vehicle"  # vehicle | bike | bus | shoulder | parking
+    successors: tuple[str, ...] = ()
+    left_neighbour: str | None = None
+    right_neighbour: str | None = None
+    left_paint: Paint = "unknown"
+    right_paint: Paint = "unknown"
+    is_intersection: bool = False
+    speed_limit_mps: float | None = None
+
+
+@dataclass(frozen=True)
+class Marking:
+    """Paint that the map gives as a line of its own, not as a lane's edge."""
+
+    xyz: F64  # (N, 3) metres, world
+    paint: Paint
+
+
+@dataclass(frozen=True)
+class LaneMap:
+    """Vector map of one scene."""
+
+    lanes: Mapping[str, Lane]
+    road_edges: tuple[F64, ...] = ()  # each (N, 3): the border of the drivable surface
+    drivable_areas: tuple[F64, ...] = ()  # each (N, 3) ring
+    crosswalks: tuple[F64, ...] = ()  # each (N, 3) ring
+    stop_lines: tuple[F64, ...] = ()  # each (N, 3)
+    markings: tuple[Marking, ...] = ()
+    poles: tuple[F64, ...] = ()  # each (N, 3) polyline
+    signs: tuple[tuple[F64, Box], ...] = ()  # (T_world_sign (4, 4), size)
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where the ego should go: a polyline in the world, without time."""
+
+    xyz: F64  # (N, 3) metres, world
+    lane_ids: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class HeightField:
+    """Ground height on a regular grid, bilinear in between, constant beyond its border."""
+
+    x0_m: float
+    y0_m: float
+    cell_m: float
+    z: F64  # (Ny, Nx) metres, world

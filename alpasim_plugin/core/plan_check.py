@@ -1,0 +1,87 @@
+"""What is wrong with a plan or with sensors, in a sentence. A policy may return anything; nothing here assumes more than an object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from alpasim_plugin.core.types import SensorSpec
+
+ARRAYS = ("times_us", "xy", "yaw")
+UNITS = ((100.0, "centimetres"), (1000.0, "millimetres"), (0.001, "kilometres"), (3.28, "feet"), (3.6, "km/h taken for m/s"))
+
+
+def unit_guess(ratio: float) -> str:
+    """Name the unit in which lengths come out ``ratio`` times as large as in metres; empty where none fits.
+
+    Example:
+        >>> unit_guess(97.0), unit_guess(1.1)
+        ('centimetres', '')
+    """
+    fits = [(abs(ratio / factor - 1.0), unit) for factor, unit in UNITS if 0.7 <= ratio / factor <= 1.3]
+    return min(fits)[1] if fits else ""
+
+
+def sensors_problem(sensors: Any) -> str:
+    """Say why ``sensors`` of a policy is not a sequence of `SensorSpec`; empty if it is one."""
+    if isinstance(sensors, Sequence) and all(isinstance(sensor, SensorSpec) for sensor in sensors):
+        return ""
+    return f"sensors is {sensors!r:.80}, not a tuple of SensorSpec (alpasim_plugin.core.types)"
+
+
+def shape_problem(plan: Any, min_rows: int = 1) -> str:
+    """Say what keeps a plan from being read: another type, arrays of other shapes, values that are not finite; empty if nothing.
+
+    Args:
+        plan: What a policy's ``act`` returned.
+        min_rows: Least number of poses.
+    """
+    absent = [name for name in ARRAYS if not hasattr(plan, name)]
+    if absent:
+        size = f" of shape {plan.shape}" if isinstance(plan, np.ndarray) else ""
+        return f"act returned {_a(plan)}{size}, not a Plan (alpasim_plugin.core.types.Plan): it has no {', '.join(absent)}"
+    for name in ARRAYS:
+        value = getattr(plan, name)
+        if not isinstance(value, np.ndarray):
+            return f"{name} is {_a(value)}, not a numpy array"
+        if value.dtype.kind not in "iuf":
+            return f"{name} holds {value.dtype}, not numbers"
+    n = len(plan.times_us) if plan.times_us.ndim == 1 else -1
+    if n < min_rows or plan.xy.shape != (n, 2) or plan.yaw.shape != (n,):
+        shapes = f"times_us {plan.times_us.shape}, xy {plan.xy.shape}, yaw {plan.yaw.shape}"
+        guess = "; xy looks transposed" if plan.xy.shape == (2, n) else ""
+        return f"the plan has {shapes}; needed are (T,), (T, 2), (T,) with T >= {min_rows}{guess}"
+    bad = ~(np.isfinite(plan.xy).all(axis=1) & np.isfinite(plan.yaw))
+    if bad.any():
+        return f"the plan is not finite in {int(bad.sum())} of {n} rows, first in row {int(np.argmax(bad))}"
+    return _samples_problem(getattr(plan, "samples", ()), n)
+
+
+def plan_problem(plan: Any, now_us: int) -> str:
+    """Say what keeps a plan made at ``now_us`` from being followed; empty if nothing."""
+    found = shape_problem(plan)
+    if found:
+        return found
+    if plan.times_us.dtype.kind not in "iu":
+        return f"times_us is {plan.times_us.dtype}, not integer microseconds"
+    if int(plan.times_us[0]) != now_us:
+        return f"times_us starts at {int(plan.times_us[0])} us, the observation is at {now_us} us"
+    steps = np.diff(plan.times_us.astype(np.int64))
+    return f"times_us does not increase strictly after row {int(np.argmax(steps <= 0))}" if (steps <= 0).any() else ""
+
+
+def _samples_problem(samples: Any, n: int) -> str:
+    if not isinstance(samples, list | tuple):
+        return f"samples is {_a(samples)}, not a tuple of arrays"
+    for sample in samples:
+        if not isinstance(sample, np.ndarray) or sample.dtype.kind not in "iuf":
+            return f"a sampled alternative is {_a(sample)}, not an array of numbers"
+        if sample.shape != (n, 3) or not np.isfinite(sample).all():
+            return f"a sampled alternative is not finite or has shape {sample.shape}, not ({n}, 3)"
+    return ""
+
+
+def _a(value: Any) -> str:
+    return "nothing" if value is None else f"a {type(value).__name__}"

@@ -1,0 +1,353 @@
+"""The only data that crosses from one stage to the next: frozen dataclasses with shapes, units and frames.
+
+Conventions (docs/architecture.md): time is integer microseconds; world is ENU metres in float64 around a local origin; rig is x forward,
+y left, z up with its origin on the ground under the rear axle; cameras are OpenCV (x right, y down, z forward); a matrix ``T_a_b`` maps
+coordinates in b to coordinates in a; quaternions are ``wxyz``; images are HWC uint8 sRGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from alpasim_plugin.core.map_types import F64 as F64
+from alpasim_plugin.core.map_types import Box as Box
+from alpasim_plugin.core.map_types import HeightField as HeightField
+from alpasim_plugin.core.map_types import Lane as Lane
+from alpasim_plugin.core.map_types import LaneMap as LaneMap
+from alpasim_plugin.core.map_types import Marking as Marking
+from alpasim_plugin.core.map_types import Paint as Paint
+from alpasim_plugin.core.map_types import Route as Route
+from alpasim_plugin.plugins.interfaces import Aggregation as Aggregation
+from alpasim_plugin.plugins.interfaces import BlockRule as BlockRule
+from alpasim_plugin.plugins.interfaces import Controller as Controller
+from alpasim_plugin.plugins.interfaces import Direction as Direction
+from alpasim_plugin.plugins.interfaces import Evaluator as Evaluator
+from alpasim_plugin.plugins.interfaces import Fixer as Fixer
+from alpasim_plugin.plugins.interfaces import MetricInfo as MetricInfo
+from alpasim_plugin.plugins.interfaces import Policy as Policy
+from alpasim_plugin.plugins.interfaces import Renderer as Renderer
+from alpasim_plugin.plugins.interfaces import Source as Source
+
+F32 = npt.NDArray[np.float32]
+I64 = npt.NDArray[np.int64]
+U8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of one body over time; the frame of the poses is said where a trajectory is used."""
+
+    t_us: I64  # (T,) int64 microseconds, strictly increasing
+    xyz: F64  # (T, 3) metres, world
+    quat: F64  # (T, 4) wxyz, unit, body to world
+
+    def __len__(self) -> int:
+        return int(self.t_us.shape[0])
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """The ego's body and chassis. The box centre lies at ``(rear_axle_to_centre_m, 0, box.height_m / 2)`` in the rig frame."""
+
+    box: Box = Box(4.855, 1.88, 1.6)
+    rear_axle_to_centre_m: float = 1.4
+    wheelbase_m: float = 2.85
+    max_steer_rad: float = 0.6
+    max_steer_rate_radps: float = 0.8
+    max_accel_mps2: float = 3.5
+    max_brake_mps2: float = 8.0
+
+
+@dataclass(frozen=True)
+class EgoState:
+    """True state of the ego at one instant."""
+
+    t_us: int
+    T_world_rig: F64  # (4, 4)
+    speed_mps: float  # along rig x; negative in reverse
+    accel_mps2: float = 0.0
+    yaw_rate_radps: float = 0.0
+    steer_rad: float = 0.0  # road-wheel angle, left positive
+
+
+# --- actors ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """How an actor moves once the loop is closed."""
+
+    kind: Literal["replay", "idm"] = "replay"
+    params: Mapping[str, float] = field(default_factory=dict)  # idm: desired_speed_mps, headway_s, min_gap_m, accel_mps2, brake_mps2
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A road user or obstacle with its recorded or scripted track (pose of the box centre in the world)."""
+
+    actor_id: str
+    label: str  # car | truck | bus | pedestrian | cyclist | motorcycle | other
+    box: Box
+    track: Trajectory
+    is_static: bool = False
+    behaviour: Behaviour = Behaviour()
+
+
+# --- sensors --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FTheta:
+    """Polynomials of an f-theta lens: theta = sum b_k r^k and r = sum a_k theta^k, pixels and radians."""
+
+    pixel_to_angle: tuple[float, ...]
+    angle_to_pixel: tuple[float, ...]
+    max_angle_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A camera on the rig. With ``ftheta`` set, ``K`` is the pinhole that is really rendered and ``ftheta`` the recorded lens."""
+
+    name: str
+    width: int
+    height: int
+    K: F64  # (3, 3) pixels
+    T_rig_camera: F64  # (4, 4)
+    shutter_us: int = 0
+    ftheta: FTheta | None = None
+
+
+@dataclass(frozen=True)
+class SensorSpec:
+    """What a policy asks for: a camera by name, every ``interval_us`` (0: the scenario's camera rate)."""
+
+    camera: str
+    interval_us: int = 0
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """One frame to render."""
+
+    t_us: int  # shutter end
+    camera: CameraSpec
+    T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
+    actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
+    ahead: Sequence[RenderRequest] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One camera frame. ``alpha`` and ``depth`` are None where a renderer cannot give them (remote, video)."""
+
+    t_us: int
+    camera: str
+    rgb: U8  # (H, W, 3) sRGB
+    alpha: F32 | None = None  # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
+    depth: F32 | None = None  # (H, W) metres along the optical axis, alpha-weighted mean; 0 where alpha is 0
+    events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
+    facts: Mapping[str, float] = field(default_factory=dict)  # numbers about this frame for the log, such as "pose_error_m"
+
+
+# --- policy ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a policy may know at ``t_us``: frames, its own motion so far, and the route ahead."""
+
+    t_us: int
+    frames: Mapping[str, Frame]  # newest frame per camera it asked for
+    cameras: Mapping[str, CameraSpec]
+    ego: EgoState
+    history: Trajectory  # rig poses in the world up to t_us
+    route_rig: F64  # (20, 3) metres, rig frame now; rows of NaN where the route ends
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Future rig poses in the rig frame at ``t_us``; the first row is the pose at ``t_us`` itself."""
+
+    t_us: int
+    times_us: I64  # (T,) absolute, strictly increasing, times_us[0] == t_us
+    xy: F64  # (T, 2) metres
+    yaw: F64  # (T,) radians
+    samples: tuple[F64, ...] = ()  # alternatives, each (T, 3): x, y, yaw at times_us
+    debug: Mapping[str, Any] = field(default_factory=dict)
+
+
+# --- scene ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Integer periods; camera and policy periods are multiples of the control period."""
+
+    control_us: int = 100_000
+    camera_us: int = 100_000
+    policy_us: int = 100_000
+
+
+@dataclass(frozen=True)
+class Environment:
+    """What is built around the road when a scene is dressed in Gaussians."""
+
+    buildings: float = 0.7  # share of free roadside frontage covered by facades, 0..1
+    building_height_m: tuple[float, float] = (6.0, 18.0)
+    trees_per_100m: float = 4.0  # per road side
+    poles_spacing_m: float = 30.0  # 0: none
+    sky: Literal["clear", "overcast", "dusk"] = "clear"
+    texture: float = 1.0  # contrast of ground and facade texture, 0..1
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """How the renderer ``3dgs`` differs from the scene as built.
+
+    ``reconstruction``: an under-trained model fitted to the frames of the logged drive. ``cycle``: a model fitted to frames seen from
+    aside, rendered on the path (OneFixer, App. A). ``surrogate``: seeded stand-ins, nothing is fitted. ``none``: the scene as built.
+    """
+
+    kind: Literal["reconstruction", "cycle", "surrogate", "none"] = "reconstruction"
+    share: float = 0.15  # of the fit's schedule, 0..1; reconstruction and cycle
+    shift_m: float = 1.0  # sideways, left positive, of the views that the cycle's model is fitted to
+    severity: float = 1.5  # scales all terms of the surrogate; 0 leaves the scene as built
+    onset_m: float = 0.1  # lateral distance from the logged path where the surrogate's error starts to grow
+    full_m: float = 2.0  # lateral distance where it is full
+    views_per_s: float = 6.0  # of the log, that the model is fitted to; reconstruction and cycle, as are the next two
+    depth_error: float = 0.1  # spread of the distance of the points it starts from, as a share
+    pose_error_m: float = 0.0  # spread of the poses that the views are believed to have
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Delay from observation to the plan taking effect: none, a fixed time, or the measured one, of the fixer too if ``fixer``."""
+
+    kind: Literal["none", "fixed", "measured"] = "none"
+    fixed_us: int = 0
+    fixer: bool = False
+
+
+@dataclass(frozen=True)
+class BackgroundFile:
+    """A Gaussian file used as background, placed by ``T_world_file``."""
+
+    path: str
+    T_world_file: F64  # (4, 4), may scale
+    keep_road: bool = False  # whether the built road is drawn with it
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What evaluators may see of a scenario: the map and the human drive, never pixels."""
+
+    scene_id: str
+    lane_map: LaneMap
+    ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
+    vehicle: Vehicle
+    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A complete test case, the same type for every source."""
+
+    scene_id: str
+    source: str  # yaml | argoverse | commonroad | cosmos | usdz
+    seed: int  # scene seed: geometry, textures, scripted actors
+    lane_map: LaneMap
+    ground: HeightField
+    ego_log: Trajectory  # rig poses, world
+    vehicle: Vehicle
+    route: Route
+    actors: tuple[Actor, ...]
+    cameras: tuple[CameraSpec, ...]
+    rates: Rates
+    start_us: int  # first frame; the log before it is context
+    end_us: int
+    warmup_us: int  # the log is forced until start_us + warmup_us
+    latency: Latency
+    environment: Environment
+    degradation: Degradation
+    background: BackgroundFile | None = None
+    world_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what was subtracted from the source's coordinates, metres
+    content_hash: str = ""
+    notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
+    alpasim_map: LaneMap | None = None  # the same road as AlpaSim's own loader reads it, where that differs
+    source_part: str | None = None  # the source that read the log, as named; None: a built road
+    varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # key of the scenario file -> (as written, as drawn by the seed)
+    stop_at_path_end: bool = True  # a rollout ends where the recorded path does, unless the recorded car stands there
+
+    @property
+    def scene(self) -> Scene:
+        """Give the part that evaluators may see."""
+        return Scene(self.scene_id, self.lane_map, self.ego_log, self.vehicle, self.alpasim_map)
+
+
+# --- log and scores -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LoggedPlan:
+    """A plan as it stands in a log: absolute poses."""
+
+    now_us: int
+    query_us: int
+    trajectory: Trajectory  # rig poses, world, the first at now_us
+    samples: tuple[Trajectory, ...] = ()
+
+
+@dataclass(frozen=True)
+class LoggedImage:
+    """An encoded camera image in a log."""
+
+    camera: str
+    start_us: int
+    end_us: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class RolloutLog:
+    """One rollout as evaluators see it, whoever wrote the log."""
+
+    scene_id: str
+    session_uuid: str
+    ego_box: Box
+    T_rig_box: F64  # (4, 4) pose of the box centre in the rig frame
+    ego: Trajectory  # box centre, world
+    actors: Mapping[str, Actor]  # ego excluded; track = logged poses of the box centre
+    plans: tuple[LoggedPlan, ...]
+    images: tuple[LoggedImage, ...]
+    ego_log: Trajectory  # recorded rig poses, world
+    start_us: int  # first recorded rig pose
+    render_start_us: int
+    force_gt_us: int
+    control_us: int
+    seed: int = 0
+    info: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MetricSeries:
+    """Values of one metric over a rollout; a value is never bare: it has validity and, where invalid, a reason."""
+
+    name: str
+    t_us: I64  # (T,)
+    value: F64  # (T,); NaN where invalid
+    valid: Bool  # (T,)
+    aggregation: Aggregation
+    unit: str  # "" for rates and flags
+    direction: Direction
+    reason: str = ""  # why values are invalid, if any is

@@ -1,0 +1,1 @@
+"""Reading with limits, atomic writes, checksums, locks, configuration with positions."""

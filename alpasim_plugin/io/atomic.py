@@ -1,0 +1,160 @@
+"""Write files atomically: under a temporary name in the same folder, then renamed, so that a reader never sees an incomplete file.
+
+A process that is killed leaves at most a hidden ``.NAME.PID.RANDOM.tmp`` behind; what stood at the path before is untouched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from alpasim_plugin.core.errors import InfrastructureError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+    from torch import Tensor
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+DOING = "writing a result"
+
+
+def disk_error(path: Path, error: OSError, doing: str = DOING, do_this: str | None = None) -> InfrastructureError:
+    """Return a failed write as an error with four parts; the advice follows from the cause unless ``do_this`` is given."""
+    if do_this is None:
+        full = "free disk space and run the same command again"
+        missing = "check that the folder exists, or name another one"
+        other = "make the folder writable, or name another one"
+        do_this = full if error.errno in DISK_FULL else missing if error.errno == errno.ENOENT else other
+    return InfrastructureError(doing, str(path), error.strerror or str(error), do_this)
+
+
+def temporary_path(path: Path) -> Path:
+    """Return a hidden name in the same folder, different in every process and for every call."""
+    return path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp")
+
+
+@contextmanager
+def atomic_file(path: Path | str, doing: str = DOING, do_this: str | None = None) -> Iterator[Path]:
+    """Yield a temporary path to write; it is renamed to ``path`` when the block ends, and removed if the block raises.
+
+    The folder must exist. The data are on the disk (fsync) before the rename.
+
+    Raises:
+        InfrastructureError: The disk refuses; ``doing`` and ``do_this`` are the first and last part of the error.
+
+    Example:
+        >>> with atomic_file("scene.png") as partial:     # doctest: +SKIP
+        ...     cv2.imwrite(str(partial), image)
+    """
+    path = Path(path)
+    partial = temporary_path(path)
+    try:
+        yield partial
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise disk_error(path, error, doing, do_this) from error
+    finally:
+        # A read-only folder refuses this as well, even for a file that is not there; the write's own error says so.
+        with contextlib.suppress(OSError):
+            partial.unlink()
+
+
+@contextmanager
+def atomic_folder(folder: Path, doing: str = DOING, do_this: str | None = None) -> Iterator[Path]:
+    """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the block raises.
+
+    Raises:
+        InfrastructureError: The disk refuses.
+    """
+    partial, old = temporary_path(folder), temporary_path(folder)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if folder.exists():
+            folder.replace(old)
+        partial.replace(folder)
+    except OSError as error:
+        if old.exists() and not folder.exists():
+            old.replace(folder)
+        raise disk_error(folder, error, doing, do_this) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def scratch_folder(path: Path, doing: str = DOING) -> Iterator[Path]:
+    """Yield a new empty folder with a temporary name beside ``path``; it is removed when the block ends.
+
+    Raises:
+        InfrastructureError: The disk refuses to make it.
+    """
+    scratch = temporary_path(path)
+    try:
+        scratch.mkdir(parents=True)
+    except OSError as error:
+        raise disk_error(scratch, error, doing) from error
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def write_bytes(path: Path, data: bytes, doing: str = DOING) -> None:
+    """Write a file atomically; its folder is made if it does not exist.
+
+    Raises:
+        InfrastructureError: The disk refuses (full, read-only, quota).
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(path.parent, error, doing) from error
+    with atomic_file(path, doing) as partial:
+        partial.write_bytes(data)
+
+
+def write_text(path: Path, text: str, doing: str = DOING) -> None:
+    """Write UTF-8 text atomically; see `write_bytes`."""
+    write_bytes(path, text.encode(), doing)
+
+
+def write_json(path: Path, value: Any, doing: str = DOING) -> None:
+    """Write JSON atomically; see `write_bytes`.
+
+    Raises:
+        ValueError: NaN or infinity, which JSON does not have.
+    """
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n", doing)
+
+
+def write_array(path: Path, array: npt.NDArray[Any], doing: str = DOING) -> None:
+    """Write a ``.npy`` file atomically; see `atomic_file`."""
+    import numpy as np
+
+    with atomic_file(path, doing) as partial, partial.open("wb") as file:
+        np.save(file, array)
+
+
+def write_safetensors(path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write tensors as safetensors atomically; see `atomic_file`."""
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    with atomic_file(path, "writing network weights") as partial:
+        try:
+            save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, partial, dict(metadata or {}))
+        except SafetensorError as error:  # the library reports a refused write as its own error, with the number in the text
+            found = re.search(r"os error (\d+)", str(error))
+            code = int(found[1]) if found else errno.EIO
+            raise OSError(code, os.strerror(code)) from error

@@ -1,0 +1,131 @@
+"""Markdown of the comparison: the paper's value above ours for every arm, paired differences, and the verdict of every claim."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from alpasim_plugin.lab.paper.measured import Difference, Measured
+from alpasim_plugin.lab.paper.published import PaperMetric, Published
+from alpasim_plugin.lab.paper.verdict import Judged, Result
+from alpasim_plugin.lab.video_metrics.table import DIGITS, SCALE
+from evaluators.metrics import info
+
+NOT_RUN = "not run"
+NO_COUNTERPART = "no counterpart here"
+SET_DIGITS = {"fd_syn_clip": 2, "fd_syn_16": 2, "fvmd_lk": 0}
+ARROWS = {"higher": "↑", "lower": "↓"}
+
+
+def paper_against_ours(published: Published, table: str, measured: Measured) -> str:
+    """Return one table of the paper: for every arm a line of the paper's numbers and a line of ours; the first line names our metrics.
+
+    Arms that the paper does not have (``3dgs``, the per-frame ``onefixer``, variants of another table) follow, with our line alone.
+    """
+    printed = published.tables[table]
+    head = ["arm", "", *(f"{published.metrics[m].heading} {ARROWS[published.metrics[m].better]}" for m in printed.metrics)]
+    rows = [["", "*ours*", *(f"`{ours}`" if (ours := published.ours(m)) else "-" for m in printed.metrics)]]
+    for arm, cells in printed.rows.items():
+        rows.append([f"**{arm}**", "paper", *(cells[m].text if m in cells else "not reported" for m in printed.metrics)])
+        missing = NO_COUNTERPART if arm in printed.no_counterpart else NOT_RUN
+        rows.append(["", "ours", *_line_of(published, printed.metrics, arm, measured, missing)])
+    others = [arm for arm in measured.arms if arm not in printed.rows]
+    rows += [[f"**{arm}**", "ours", *_line_of(published, printed.metrics, arm, measured)] for arm in others]
+    title = f"{printed.title} ({printed.protocol}; {published.source})"
+    return f"**{title}**\n\n" + markdown_table(head, rows)
+
+
+def _line_of(published: Published, metrics: Sequence[str], arm: str, measured: Measured, missing: str = NOT_RUN) -> list[str]:
+    if arm not in measured.values:
+        return [missing, *[""] * (len(metrics) - 1)]
+    return [_ours(published.metrics[metric], arm, measured) for metric in metrics]
+
+
+def _ours(metric: PaperMetric, arm: str, measured: Measured) -> str:
+    return "-" if metric.ours is None else interval_text(measured, arm, metric.ours, metric.scale)
+
+
+def interval_text(measured: Measured, arm: str, metric: str, scale: float = 1.0) -> str:
+    """Return an arm's mean with the half-width of its interval, ``null`` where it was not measured on two clips."""
+    if not measured.has(arm, metric):
+        return "null"
+    found = measured.mean(arm, metric)
+    digits = 1 if scale > 1 else 4 if metric in SCALE else (DIGITS | SET_DIGITS).get(metric, 3)
+    text = f"{found.centre * scale:.{digits}f}"
+    if found.low is None or found.high is None:
+        return text
+    return f"{text}±{(found.high - found.low) / 2 * scale:.{digits}f}"
+
+
+def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Sequence[str]) -> str:
+    """Return the paired differences ``arm - rival``; those that are shown are bold."""
+    rows = []
+    for rival in rivals:
+        cells = []
+        for metric in metrics:
+            there = measured.has(arm, metric) and measured.has(rival, metric)
+            cells.append(difference_text(measured.difference(metric, arm, rival)) if there else NOT_RUN)
+        rows.append([rival, *cells])
+    return markdown_table([f"{arm} minus", *(f"{m} {ARROWS.get(info(m).direction, '')}" for m in metrics)], rows)
+
+
+def difference_text(found: Difference) -> str:
+    """Return a difference with its half-width, its bounds where they lie unevenly, or its p-value for a whole set; bold where shown."""
+    digits, scale = (DIGITS | SET_DIGITS).get(found.metric, 4), SCALE.get(found.metric, 1.0)
+    text = f"{found.difference * scale:+.{digits}f}"
+    if found.low is not None and found.high is not None:
+        half = (found.high - found.low) / 2
+        lopsided = abs((found.high + found.low) / 2 - found.difference) > 1e-6 * half
+        bounds = f" [{found.low * scale:+.{digits}f}, {found.high * scale:+.{digits}f}]"
+        text += bounds if lopsided else f" ± {half * scale:.{digits}f}"
+    elif found.p_value is not None:
+        text += f" (p {found.p_value:.2g})"
+    return f"**{text}**" if found.favours else text
+
+
+def verdicts(judged: Sequence[Judged], reasons: Mapping[int, str]) -> str:
+    """Return a line for every claim, and below it a paragraph for each that does not hold: which contests, and why.
+
+    Args:
+        judged: All claims.
+        reasons: Number of a claim -> why it comes out as it does here, written by whoever looked; nothing is made up for the others.
+    """
+    rows = [[str(one.claim.number), one.claim.text, one.claim.where, f"**{one.verdict}**", _tally(one)] for one in judged]
+    out = [markdown_table(["", "claim", "where", "verdict", "contests"], rows)]
+    for one in judged:
+        if one.verdict == "not measured":
+            missing = sorted({result.missing for result in one.results if result.missing})
+            out.append(
+                f"**Claim {one.claim.number}** was not measured: {'; '.join(missing[:6])}{' and others' if len(missing) > 6 else ''}.\n"
+            )
+            continue
+        telling = [
+            r for r in one.results if r.outcome == ("for" if one.verdict == "holds" else "against" if one.count("against") else "open")
+        ]
+        telling.sort(key=_refuting)
+        lines = "".join(f"- {_sentence(result)}\n" for result in telling[:8])
+        more = f"- and {len(telling) - 8} more\n" if len(telling) > 8 else ""
+        why = f"\n{reasons[one.claim.number]}\n" if one.claim.number in reasons else ""
+        out.append(f"**Claim {one.claim.number}: {one.verdict}.**\n\n{lines}{more}{why}")
+    return "\n".join(out)
+
+
+def _tally(one: Judged) -> str:
+    names = ("for", "against", "open", "not measured")
+    return ", ".join(f"{count} {name}" for name in names if (count := one.count(name)))  # type: ignore[arg-type]
+
+
+def _sentence(result: Result) -> str:
+    contest = result.contest
+    assert result.difference is not None
+    corrected = f", corrected p {result.refutes:.2g}" if result.outcome == "against" and result.refutes is not None else ""
+    return f"{contest.protocol}, `{contest.metric}`: {contest.first} minus {contest.second} {difference_text(result.difference)}{corrected}"
+
+
+def _refuting(result: Result) -> float:
+    return 1.0 if result.refutes is None else result.refutes
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table whose first column is left-aligned and the others right-aligned."""
+    lines = [head, ["---", *(["---:"] * (len(head) - 1))], *rows]
+    return "".join(f"| {' | '.join(cell for cell in line)} |\n" for line in lines)

@@ -1,0 +1,160 @@
+"""Batches of the block generators: clips, crops and noise, drawn by the batch's number; and what the network sees besides its source."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.lab.training.latent_clips import LatentClip, LatentClips
+from alpasim_plugin.lab.training.shared_rollout import Sample
+from alpasim_plugin.nets.clips import GROUP, SIDE
+from alpasim_plugin.nets.sampling import opacity_values
+from alpasim_plugin.nets.tiny_vae import TinyVAE
+
+PATCH = 2  # latents along a side of a token; crops consist of whole tokens
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a network sees: its source and its condition, in training and at deployment.
+
+    Args:
+        map: The semantic map as ``drawn``; the latents of a ``black`` one, which says that there is no road; or ``nothing``, zeros.
+        source: Eq. 1 (``mixed``); or ``noise`` alone, with the render's latents as condition after the map's.
+        opacity: Whether the opacity enters every transformer block (ArtiFixer); it follows the map in the condition.
+    """
+
+    map: Literal["drawn", "black", "nothing"] = "drawn"
+    source: Literal["mixed", "noise"] = "mixed"
+    opacity: bool = False
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of a fixer that sees this."""
+        return {
+            "uses_map": self.map == "drawn",
+            "no_map": "black" if self.map == "black" else "nothing",
+            "holes": "noise" if self.source == "mixed" else "everywhere",
+            "render_input": self.source == "noise",
+            "opacity_input": self.opacity,
+        }
+
+
+@dataclass(frozen=True)
+class BatchForm:
+    """Clips of a batch.
+
+    Args:
+        clips: Their number.
+        latents: Latents from a clip's start; None for the whole clip.
+        columns: Width of the crop in latents, even; None for the whole image.
+        seed: Of sampling and noise.
+    """
+
+    clips: int = 4
+    latents: int | None = None
+    columns: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.columns is not None and self.columns % PATCH:
+            raise InputError("setting up training batches", f"columns {self.columns}", "half a token", "give an even number of latents")
+
+
+class Drawn(NamedTuple):
+    """A batch: its latents and noise, its clips, and the columns of the crop in latents."""
+
+    sample: Sample
+    clips: Sequence[LatentClip]
+    columns: slice
+
+    def frames(self, end: int, begin: int = 0) -> tuple[Tensor, Tensor]:
+        """Return the render ``(B, 3, T, H, W)`` in [-1, 1] and its opacity ``(B, 1, T, H, W)``: the clips' frames ``begin`` to ``end``."""
+        both = [clip.frames(end, begin) for clip in self.clips]
+        return torch.stack([self._cut(render) for render, _ in both]), torch.stack([self._cut(opacity) for _, opacity in both])
+
+    def clean(self, end: int, begin: int = 0) -> Tensor:
+        """Return the clean frames ``(B, 3, T, H, W)`` in [-1, 1] of the clips' frames ``begin`` to ``end``."""
+        return torch.stack([self._cut(clip.clean(end, begin)) for clip in self.clips])
+
+    def _cut(self, frames: Tensor) -> Tensor:
+        return frames[..., self.columns.start * SIDE : self.columns.stop * SIDE]
+
+
+class ClipBatches:
+    """Draws of clips.
+
+    Args:
+        clips: Training latents.
+        vae: Their autoencoder, which encodes the black map.
+        form: Number and crop.
+        seen: What the network sees.
+    """
+
+    def __init__(self, clips: LatentClips, vae: TinyVAE, form: BatchForm, seen: Seen) -> None:
+        self.clips, self.form, self.seen = clips, form, seen
+        self._map = shown_map(seen.map, clips, vae)
+
+    def __getitem__(self, index: int) -> Drawn:
+        """Draw batch ``index``: a function of the index and the seed only.
+
+        Equal clips, crops and noise for every recipe of the same form, so that recipes are compared on the same draws.
+        """
+        form = self.form
+        rng = stream("training", form.seed, "generator.clips", index)
+        clips = [self.clips[int(i)] for i in rng.integers(len(self.clips), size=form.clips)]
+        z_r, z_0, z_map, m = (torch.stack(z) for z in zip(*(clip.latents for clip in clips), strict=True))
+        columns = self._columns(rng, z_0.shape[-1])
+        latents = slice(0, form.latents)
+        w = int(rng.integers(len(range(z_0.shape[2])[latents])))
+        z_r, z_0, z_map, m = (z[:, :, latents, :, columns] for z in (z_r, z_0, z_map, m))
+        b, n = z_0.shape[0], z_0.shape[2]
+
+        def normal(what: str) -> Tensor:
+            noise = stream("training", form.seed, f"generator.{what}", index).standard_normal(z_0.shape, dtype=np.float32)
+            return torch.from_numpy(noise)
+
+        def uniform() -> Tensor:
+            return torch.from_numpy(rng.random((b, n), dtype=np.float32))
+
+        sample = Sample(z_r, z_0, z_map, m, normal("eps"), normal("context"), uniform(), uniform(), w)
+        drawn = Drawn(sample, clips, columns)
+        return drawn._replace(sample=self._as_seen(drawn))
+
+    def _as_seen(self, drawn: Drawn) -> Sample:
+        """Replace map, mask and condition by what the network sees."""
+        s = drawn.sample
+        condition, m = s.condition, s.m
+        if self._map is not None:
+            condition = self._map[:, : s.z_0.shape[2], :, drawn.columns].expand_as(condition)
+        if self.seen.source == "noise":
+            m, condition = torch.zeros_like(m), torch.cat([condition, s.z_r], dim=1)
+        if self.seen.opacity:
+            _, opacity = drawn.frames(1 + GROUP * (s.z_0.shape[2] - 1))
+            condition = torch.cat([condition, opacity_values(opacity)], dim=1)
+        return Sample(s.z_r, s.z_0, condition, m, s.eps, s.eps_context, s.t, s.t_redenoise, s.w)
+
+    def _columns(self, rng: np.random.Generator, width: int) -> slice:
+        wanted = self.form.columns
+        if wanted is None or wanted >= width:
+            return slice(0, width)
+        left = PATCH * int(rng.integers((width - wanted) // PATCH + 1))
+        return slice(left, left + wanted)
+
+
+@torch.no_grad()
+def shown_map(map: Literal["drawn", "black", "nothing"], clips: LatentClips, vae: TinyVAE) -> Tensor | None:
+    """Return the latents ``(16, N, H/8, W/8)`` that all clips have in their maps' place; None where their own are shown."""
+    if map == "drawn":
+        return None
+    like = clips[0].z_map
+    if map == "nothing":
+        return torch.zeros_like(like)
+    _, latents, rows, columns = like.shape
+    return vae.encode(torch.full((1, 3, 1 + GROUP * (latents - 1), rows * SIDE, columns * SIDE), -1.0))[0]

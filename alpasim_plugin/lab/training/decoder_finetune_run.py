@@ -1,0 +1,116 @@
+"""Fine-tune the decoder of a trained bundle on its generator, in one run folder: bundle in, bundle out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of, save_bundle
+from alpasim_plugin.fixers.networks import streaming_dit
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.lab.training.decoder_finetune import DecoderRecipe, DecoderTask, Rollouts
+from alpasim_plugin.lab.training.fixer_run import BUNDLE_FILE, half
+from alpasim_plugin.lab.training.latent_clips import ClipForm, LatentClips
+from alpasim_plugin.lab.training.model_card import ModelCard, curves
+from alpasim_plugin.lab.training.pair_store import PairDataset
+from alpasim_plugin.lab.training.perceptual_term import Distance
+from alpasim_plugin.lab.training.trainer import LOG_FILE, Schedule, Trainer
+from alpasim_plugin.nets import TinyVAE
+from alpasim_plugin.nets.checkpoints import file_sha256, load_weights
+from alpasim_plugin.nets.headers import read_metadata
+
+DOING = "fine-tuning a decoder"
+
+
+def finetune_decoder(
+    bundle: Path,
+    data: Path,
+    out: Path,
+    form: ClipForm,
+    recipe: DecoderRecipe,
+    schedule: Schedule,
+    distance: tuple[str, Distance] | None = None,
+    prepared: Callable[[str, int, int], None] | None = None,
+    report: Callable[[int, Mapping[str, float]], None] | None = None,
+    size: tuple[int, int] | None = None,
+) -> Path:
+    """Train the decoder of a bundle on its generator's rollouts, and write OUT/fixer.safetensors and its card.
+
+    Args:
+        bundle: A trained fixer whose decoder belongs to its autoencoder and is conditioned on the render.
+        data: Folder of pairs; its ``train`` split is used.
+        out: Folder of the run; latents and rollouts of the clips are cached in its parent folder.
+        form, recipe, schedule: Clips, batches, optimisation.
+        distance: Name and function of the perceptual term.
+        prepared: Called with the current item (latents, rollouts), the number done and the total.
+        report: Called after every update with its number and the logged values.
+        size: Width and height of the sequences to train on, pixels; None: all are of one size.
+
+    Raises:
+        InputError: Another kind of bundle, no data, or a crop larger than the clips.
+        InfrastructureError: The loss is not finite.
+    """
+    settings = bundle_settings(bundle)
+    tensors = load_weights(bundle, dtype=torch.float32)
+    parts = parts_of(tensors)
+    vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
+    net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
+
+    def tell(what: str) -> Callable[[int, int], None] | None:
+        return None if prepared is None else lambda done, count: prepared(what, done, count)
+
+    clips = LatentClips(PairDataset(data, "train", size).sequences, vae, form, out.parent / "latents", tell("latents"))
+    shown = "drawn" if settings.uses_map else settings.no_map
+    rollouts = Rollouts(clips, vae, net, settings.block_latents, settings.window, shown, out.parent / "rollouts", tell("rollouts"))
+    task = DecoderTask(vae, rollouts, recipe, distance)
+    facts = {**task.facts, "init": file_sha256(bundle)}
+    trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
+    trainer.run(report)
+    path = out / BUNDLE_FILE
+    made: dict[str, dict[str, Tensor]] = {
+        "dit": {key: half(value) for key, value in parts["dit"].items()},
+        "vae": {key: half(value) for key, value in trainer.averaged().items()},
+    }
+    note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
+    save_bundle(path, made, settings, trained=True, note=note)
+    rows, hours = curves(out / LOG_FILE)
+    about = {"pairs": "rendered scenes, split train", "clips": len(clips), "form": asdict(form)}
+    training = {"what": "decoder only, on the generator's rollouts", "schedule": asdict(schedule), **facts}
+    ModelCard(f"OneFixer weights: {note}", about, training, rows, hours).write(path)
+    return path
+
+
+def bundle_settings(bundle: Path) -> OneFixerSettings:
+    """Return the settings that a bundle was trained for.
+
+    Raises:
+        InputError: A bundle without a generator with history, or without a decoder that is conditioned on the render.
+    """
+    name, overrides = bundle_fixer(bundle)
+    settings = fixer_settings(name, overrides)
+    if not isinstance(settings, OneFixerSettings):
+        raise InputError(DOING, str(bundle), f"it is for {name}, which has no networks", "give a bundle of 'simrun train fixer'")
+    found = [
+        text
+        for text, wrong in (
+            ("its generator has no history", settings.history == "none"),
+            ("its decoder does not see the render", settings.decoder.kind != "render"),
+            (f"its autoencoder is {settings.vae.kind}", settings.vae.kind != "tiny"),
+            # Rollouts take one step from the source of Eq. 1, with a finalised history.
+            (f"its history is {settings.history}", settings.history == "last-forward"),
+            (f"it takes {len(settings.steps)} steps", len(settings.steps) != 1),
+            (f"it keeps a sink of {settings.sink}", settings.sink != 0),
+            ("its source is not that of Eq. 1", settings.holes != "noise"),
+            ("it takes the opacity as an input", settings.opacity_input),
+        )
+        if wrong
+    ]
+    if found:
+        raise InputError(DOING, str(bundle), "; ".join(found), "give a bundle that 'simrun train fixer' made with a history")
+    return settings

@@ -1,0 +1,46 @@
+"""Batches in pixels: consecutive frames of the clips that the latents' batches draw, for objectives that encode them anew."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.lab.training.clip_batches import ClipBatches
+from alpasim_plugin.lab.training.recipes.recipe import StageInputs
+
+
+class Pictures(NamedTuple):
+    """Frames ``(B, 3, T, H, W)`` in [-1, 1]."""
+
+    render: Tensor
+    clean: Tensor
+
+
+class PictureBatches:
+    """Draws of consecutive frames: clips and crops as `ClipBatches` draws them, from a random frame of the clips on.
+
+    Args:
+        inputs: Clips and form of the batches.
+        frames: T.
+
+    Raises:
+        InputError: Clips with fewer frames.
+    """
+
+    def __init__(self, inputs: StageInputs, frames: int) -> None:
+        have = inputs.clips.form.frames
+        if have < frames:
+            do = f"train on clips of at least {1 + -(-(frames - 1) // 4)} latents (--latents)"
+            raise InputError("setting up training batches", f"{frames} frames of a clip", f"clips of {have} frames", do)
+        self.frames, self._latest = frames, have - frames
+        self._clips = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
+        self.seed = inputs.form.seed
+
+    def __getitem__(self, index: int) -> Pictures:
+        """Draw batch ``index``: a function of the index and the seed only."""
+        begin = int(stream("training", self.seed, "pictures.begin", index).integers(self._latest + 1))
+        drawn, end = self._clips[index], begin + self.frames
+        return Pictures(drawn.frames(end, begin)[0], drawn.clean(end, begin))

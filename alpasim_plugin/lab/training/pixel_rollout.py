@@ -1,0 +1,158 @@
+"""The objectives of a generator in pixels on one shared rollout (OneFixer, Sec. 3.2 and 3.3), frame by frame.
+
+    rollout      x^i = G(z^i_1 | state^<i)                        the deployed step, with gradients through the last k frames
+    picture      | x^i - x^i_0 |                                  at every frame
+    perceptual   d(x^w, x^w_0)                                    at sampled frames w
+    temporal     | (x^i - x^i-1) - (x^i_0 - x^i-1_0) |            differences of neighbouring frames
+    grid         evenness of steps over the generator's cells     `training.grid_term`
+    flow         | v(z^i_t, t | sg(state^<i)) - (z^i_1 - x^i_0) | at sampled frames and times, on the history of the rollout
+
+With x_0-prediction, v = (z_t - x_0) / t, so the flow term is the error of x_0 over t. Names as in the paper: ``z_1`` source, ``m`` mask,
+``eps`` noise, ``sg`` stop-gradient. All random numbers are arguments. The state enters from the batch before and leaves to the next one,
+without gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.lab.training.grid_term import grid_term
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
+from alpasim_plugin.nets.pixel_source import pixel_source
+from alpasim_plugin.nets.sampling import interpolant
+
+History = Literal["own", "clean", "redenoised"]
+Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
+EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
+
+
+@dataclass(frozen=True)
+class PixelObjectives:
+    """Weights of the terms, and the axes of the ablation.
+
+    Args:
+        perceptual, temporal, flow, picture, grid: Weights of the terms; 0 switches a term off.
+        horizon: k, frames that gradients pass through; 1 cuts the history at every frame.
+        history: What the state holds of the past: the generator's ``own`` outputs, the truth in their place (``clean``), or the truth that
+            the generator noised and denoised again (``redenoised``; no gradient passes through it).
+        use_map: Whether the map is given; otherwise it is black.
+        mixed: Whether the source is Eq. 1; otherwise it is noise everywhere, with the render as a condition.
+    """
+
+    perceptual: float = 0.1
+    temporal: float = 0.25
+    flow: float = 0.25
+    horizon: int = 4
+    history: History = "own"
+    use_map: bool = True
+    mixed: bool = True
+    picture: float = 1.0
+    grid: float = 0.01
+
+    @property
+    def in_pixels(self) -> bool:
+        """Whether a term is computed on the deployed step, so that gradients pass through the rollout."""
+        return bool(self.picture or self.perceptual or self.temporal or self.grid)
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """Consecutive frames of B clips with the noise of a training step; images are ``(B, T, H, W, C)``.
+
+    Args:
+        render, truth, sdmap: In [-1, 1].
+        opacity: 0 to 1, one channel.
+        eps: Standard normal, like ``render``.
+        eps_flow: Of the flow term, like one frame: ``(B, H, W, 3)``.
+        t: ``(B,)`` uniform in 0..1, times of the flow term.
+        flow_frame: Frame of the flow term.
+        perceptual_frames: Frames of the perceptual term.
+        corner: Row and column from which the perceptual term sees the frames. Its network halves the resolution four times; from a fixed
+            corner its grid would lie on the generator's, which then learns a pattern of period 4 that only this network prefers.
+        t_history: ``(B, T)`` uniform in 0..1, noise levels of a re-denoised history.
+    """
+
+    render: Tensor
+    truth: Tensor
+    sdmap: Tensor
+    opacity: Tensor
+    eps: Tensor
+    eps_flow: Tensor
+    t: Tensor
+    flow_frame: int
+    perceptual_frames: Sequence[int]
+    corner: tuple[int, int]
+    t_history: Tensor
+
+
+@dataclass(frozen=True)
+class PixelLosses:
+    """Terms of one batch; ``predictions`` is ``(B, T, H, W, 3)``, not clipped."""
+
+    total: Tensor
+    picture: Tensor
+    perceptual: Tensor
+    temporal: Tensor
+    flow: Tensor
+    grid: Tensor
+    predictions: Tensor
+    state: PixelState  # after the last frame, detached
+
+
+def pixel_losses(
+    net: PixelGenerator, sample: PixelSample, state: PixelState, objectives: PixelObjectives, distance: Distance | None
+) -> PixelLosses:
+    """Roll the generator out over the sample's frames and return the objectives.
+
+    Args:
+        net: The generator.
+        sample: Frames and noise.
+        state: Before the first frame, without gradients.
+        objectives: Weights.
+        distance: Perceptual distance; None switches its term off.
+    """
+    frames = sample.render.shape[1]
+    zero = sample.render.new_zeros(())
+    outputs, flow = [], zero
+    for i in range(frames):
+        render, opacity, truth = sample.render[:, i], sample.opacity[:, i], sample.truth[:, i]
+        sdmap = sample.sdmap[:, i] if objectives.use_map else torch.full_like(render, -1.0)
+        if objectives.flow and i == sample.flow_frame:
+            source = _source(render, opacity, sample.eps_flow, objectives)
+            t = sample.t[:, None, None, None]
+            guess, _ = net(render, opacity, sdmap, state.detached(), interpolant(truth, source, t), sample.t)
+            flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
+        if i and i % objectives.horizon == 0:
+            state = state.detached()
+        before, source = state, _source(render, opacity, sample.eps[:, i], objectives)
+        with torch.set_grad_enabled(objectives.in_pixels):
+            out, state = net(render, opacity, sdmap, before, source)
+        outputs.append(out)
+        if objectives.history == "clean":
+            state = state._replace(output=truth)
+        elif objectives.history == "redenoised":
+            t = sample.t_history[:, i]
+            with torch.no_grad():
+                _, state = net(render, opacity, sdmap, before, interpolant(truth, source, t[:, None, None, None]), t)
+    made = torch.stack(outputs, dim=1)
+    picture = (made - sample.truth).abs().mean()
+    moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
+    temporal = moved.abs().mean() if objectives.temporal and frames > 1 else zero
+    perceptual = zero
+    if objectives.perceptual and distance is not None:
+        (top, left), chosen = sample.corner, list(sample.perceptual_frames)
+        images = [x[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2) for x in (made, sample.truth)]
+        perceptual = distance(images[0], images[1]).mean()
+    grid = grid_term(made, sample.truth) if objectives.grid else zero
+    total = objectives.picture * picture + objectives.perceptual * perceptual + objectives.temporal * temporal
+    total = total + objectives.grid * grid + objectives.flow * flow
+    return PixelLosses(total, picture, perceptual, temporal, flow, grid, made, state.detached())
+
+
+def _source(render: Tensor, opacity: Tensor, eps: Tensor, objectives: PixelObjectives) -> Tensor:
+    return pixel_source(render, opacity, eps) if objectives.mixed else eps

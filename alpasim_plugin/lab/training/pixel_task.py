@@ -1,0 +1,163 @@
+"""What a `Trainer` needs of the generator in pixels: batches with their noise, the loss, and the state that goes on between updates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.seeding import derive_seed, stream
+from alpasim_plugin.lab.training.pixel_rollout import Distance, PixelSample, pixel_losses
+from alpasim_plugin.lab.training.pixel_variants import PixelVariant
+from alpasim_plugin.lab.training.ranks import ALONE, Ranks
+from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelGenerator, PixelState
+
+SEEN = 2  # frames of the perceptual term in an update
+
+
+class FrameBatch(Protocol):
+    """Consecutive frames of B streams; images ``(B, T, C, H, W)``, as `alpasim_plugin.lab.training.streams.StreamBatch` holds them."""
+
+    @property
+    def render(self) -> Tensor:
+        """Degraded frames, in [-1, 1]."""
+        ...
+
+    @property
+    def opacity(self) -> Tensor:
+        """Theirs, 0 to 1, one channel."""
+        ...
+
+    @property
+    def map(self) -> Tensor:
+        """Semantic maps in [-1, 1]; -1 is black, or no map."""
+        ...
+
+    @property
+    def target(self) -> Tensor:
+        """Clean frames, in [-1, 1]."""
+        ...
+
+    @property
+    def fresh(self) -> Tensor:
+        """``(B,)`` whether a stream starts anew at this update."""
+        ...
+
+
+class FrameStreams(Protocol):
+    """Batches by number of update."""
+
+    def update(self, i: int, slots: slice) -> FrameBatch:
+        """Return the frames of some streams in update ``i``, a function of ``i`` only."""
+        ...
+
+    @property
+    def batch(self) -> int:
+        """Number of streams."""
+        ...
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return what identifies the data."""
+        ...
+
+
+@dataclass(frozen=True)
+class NoisyBatch:
+    """A batch with the noise of its update."""
+
+    sample: PixelSample
+    fresh: Tensor
+
+
+class PixelTask:
+    """Batches and loss of a run.
+
+    Args:
+        net: Trained.
+        streams: Data.
+        variant: Objectives, which may change in the course of the run.
+        steps: Updates of the run, which a variant of several stages divides.
+        distance: Name and function of the perceptual term, or None.
+        seed: Of the noise.
+        ranks: The processes that share the batches, each with some of the streams.
+    """
+
+    def __init__(
+        self,
+        net: PixelGenerator,
+        streams: FrameStreams,
+        variant: PixelVariant,
+        steps: int,
+        distance: tuple[str, Distance] | None,
+        seed: int = 0,
+        ranks: Ranks = ALONE,
+    ) -> None:
+        self.net, self.streams, self.variant, self.steps, self.distance, self.seed = net, streams, variant, steps, distance, seed
+        self.slots = ranks.rows(streams.batch)
+        self._state: PixelState | None = None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What identifies the task."""
+        named = self.distance and self.distance[0]
+        return {
+            "streams": dict(self.streams.facts()), "variant": self.variant.facts(self.steps), "sizes": self.net.facts, "distance": named,
+            "seed": self.seed,
+        }  # fmt: skip
+
+    def batch(self, index: int) -> NoisyBatch:
+        """Return the frames and noise of update ``index``."""
+        got, slots = self.streams.update(index, self.slots), self.slots
+        render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2).contiguous() for x in (got.render, got.target, got.map, got.opacity))
+        source = torch.Generator().manual_seed(derive_seed("training", self.seed, "pixel.noise", index) % 2**63)
+        # Drawn for all streams, so that a stream's noise does not depend on which process has it.
+        whole = (self.streams.batch, *render.shape[1:])
+        eps, eps_flow = (torch.randn(shape, generator=source)[slots] for shape in (whole, (whole[0], *whole[2:])))
+        t = torch.rand(whole[0], generator=source)[slots]
+        rng = stream("training", self.seed, "pixel.frames", index)
+        frames = render.shape[1]
+        seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
+        t_history = torch.rand(whole[0], frames, generator=source)[slots]
+        flow_frame, top, left = int(rng.integers(frames)), *(int(rng.integers(_corners(side))) for side in render.shape[2:4])
+        sample = PixelSample(render, truth, sdmap, opacity, eps, eps_flow, t, flow_frame, seen, (top, left), t_history)
+        return NoisyBatch(sample, got.fresh)
+
+    def loss(self, batch: NoisyBatch, index: int) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of an update and what is logged; the state goes on to the next."""
+        sample = batch.sample
+        start = self.net.start(sample.render[:, 0])
+        state = start if self._state is None else self._state.restarted(batch.fresh, start)
+        distance = None if self.distance is None else self.distance[1]
+        found = pixel_losses(self.net, sample, state, self.variant.objectives(index, self.steps), distance)
+        self._state = found.state
+        made, given = (_psnr_db(x, sample.truth) for x in (found.predictions.detach(), sample.render))
+        degraded = given < 40  # renders that are the truth, or nearly, say nothing about repair
+        gain = float((made - given)[degraded].mean()) if bool(degraded.any()) else 0.0
+        return found.total, {
+            "picture": float(found.picture.detach()), "perceptual": float(found.perceptual.detach()),
+            "temporal": float(found.temporal.detach()), "flow": float(found.flow.detach()),
+            "grid": float(found.grid.detach()),
+            "psnr_db": float(made.mean()), "gain_db": gain,
+        }  # fmt: skip
+
+    def carried(self) -> Mapping[str, Tensor]:
+        """Return the state after the last update."""
+        return {} if self._state is None else self._state._asdict()
+
+    def carry(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take a checkpoint's state."""
+        self._state = PixelState(**tensors) if tensors else None
+
+
+def _corners(side: int) -> int:
+    """Return from how many places along a side the perceptual term may begin, so that at least a cell of its coarsest grid is left."""
+    return max(min(GRID_PX, side - GRID_PX + 1), 1)
+
+
+def _psnr_db(images: Tensor, truth: Tensor) -> Tensor:
+    """Return the PSNR of every stream ``(B,)``, values in [-1, 1]."""
+    mse = (images.clamp(-1, 1) - truth).square().flatten(1).mean(1)
+    return -10 * torch.log10(mse / 4 + 1e-9)

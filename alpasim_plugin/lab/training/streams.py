@@ -1,0 +1,257 @@
+"""Streams of consecutive training frames for a recurrent fixer, as a pure function of the update's number.
+
+A batch has slots. A slot's timeline is cut into episodes of equal length, staggered over the slots; everything of an episode is drawn from
+the stream keyed by (seed, slot, episode). So any update can be made alone, in any order, and a run that resumes needs nothing but its
+number. Within an episode frames follow one another, also from one update to the next; a sequence that ends is played back from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.core.types import F32, I64, U8
+from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
+from alpasim_plugin.lab.training.lost_resolution import LostResolution, draw_lost_resolution
+from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence, pairs_digest
+
+DOING = "making training streams"
+KINDS = ("pairs", "identity", "video", "damaged_video")
+SIDE = 16  # crops are multiples of it
+# Probability of each augmentation of an episode: played backward, every second frame, mirrored, photometric, class colours of the map.
+P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS = 0.25, 0.2, 0.5, 0.7, 0.25
+GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
+P_LOST_RESOLUTION = 0.5  # of an episode of damaged video: `training.lost_resolution` in the place of `training.video_damage`
+# Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening and its noise. Both are to be kept.
+P_DETAIL, SHARPNESS, GRAIN = 0.5, (0.0, 1.5), (0.0, 0.05)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
+
+
+@dataclass(frozen=True)
+class StreamShares:
+    """Chance of each kind of an episode.
+
+    Attributes:
+        pairs: Degraded and clean renders.
+        identity: The clean render in both places, opaque: a perfect render stays as it is.
+        video: Recorded video in both places, opaque, without a map.
+        damaged_video: Recorded video with synthetic damage (`training.video_damage`, `training.lost_resolution`), without a map.
+
+    Raises:
+        InputError: A negative share, or shares that do not add up to one.
+    """
+
+    pairs: float = 0.77
+    identity: float = 0.07
+    video: float = 0.07
+    damaged_video: float = 0.09
+
+    def __post_init__(self) -> None:
+        values = [getattr(self, f.name) for f in fields(self)]
+        if min(values) < 0 or abs(sum(values) - 1) > 1e-9:
+            raise InputError(DOING, f"shares {values}", f"they add up to {sum(values):g}", "give shares of at least 0 that add up to 1")
+
+
+@dataclass(frozen=True)
+class StreamBatch:
+    """The frames of one update: B slots, T frames in order of time, crops of ``h x w`` pixels; float32.
+
+    Attributes:
+        render: ``(B, T, 3, h, w)`` in [-1, 1], degraded.
+        opacity: ``(B, T, 1, h, w)`` in [0, 1], of the render; 1 where there is none to know.
+        map: ``(B, T, 3, h, w)`` in [-1, 1], semantic map; -1 where it is black, or where there is none.
+        target: ``(B, T, 3, h, w)`` in [-1, 1], clean.
+        fresh: ``(B,)`` bool; false where the first frame follows the last one of the update before.
+        kind: ``(B,)`` int64, index into `KINDS`.
+    """
+
+    render: Tensor
+    opacity: Tensor
+    map: Tensor
+    target: Tensor
+    fresh: Tensor
+    kind: Tensor
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What a slot shows during one episode.
+
+    Attributes:
+        kind: Index into `KINDS`.
+        sequence: Which one.
+        start: Its first frame.
+        step: Frames from one to the next, negative backward.
+        top, left: Corner of the crop, pixels.
+        flip: Whether it is mirrored.
+        levels: ``(256, 3)`` float32 in [-1, 1], what an image's levels become, by channel.
+        car_class: Class in whose colours the map's cars are shown; None leaves them.
+        sharpness, grain: Of the detail that undamaged frames get; zero leaves them.
+        key: Of the grain's random stream.
+        lost: In the place of the damage that the sequence was recorded with; None keeps that one.
+    """
+
+    kind: int
+    sequence: PairSequence
+    start: int
+    step: int
+    top: int
+    left: int
+    flip: bool
+    levels: F32
+    car_class: str | None
+    sharpness: float
+    grain: float
+    key: str
+    lost: LostResolution | None
+
+
+class TrainingStreams:
+    """Training batches of consecutive frames.
+
+    Args:
+        pairs: Folder that ``simrun train pairs`` wrote.
+        video: Folder that ``simrun train video`` wrote; None with shares without video.
+        seed: Of all draws.
+        batch: Slots.
+        frames: Frames of each slot in an update.
+        crop: Height and width of the crops, pixels, multiples of 16.
+        episode: Updates of an episode.
+        shares: Chance of each kind.
+        split: Of the pairs and the videos.
+        count: Only the first sequences of pairs, in order of their numbers; None for all that are finished now.
+
+    Raises:
+        InputError: No finished sequence, a frame smaller than the crop, or a number that makes no batch.
+    """
+
+    def __init__(
+        self, pairs: Path | str, video: Path | str | None = None, *, seed: int = 0, batch: int = 6, frames: int = 4,
+        crop: tuple[int, int] = (96, 128), episode: int = 12, shares: StreamShares | None = None, split: str = "train",
+        count: int | None = None,
+    ) -> None:  # fmt: skip
+        self.shares = shares or StreamShares()
+        self.seed, self.batch, self.frames, self.crop, self.episode = seed, batch, frames, crop, episode
+        if min(batch, frames, episode, *crop) < 1 or crop[0] % SIDE or crop[1] % SIDE:
+            asked = f"batch {batch}, frames {frames}, episode {episode}, crop {crop}"
+            raise InputError(DOING, asked, "no batch", f"give at least one of each, and a crop in multiples of {SIDE}")
+        self.pairs = _in_order(PairDataset(pairs, split).sequences)[:count]
+        needs_video = self.shares.video + self.shares.damaged_video > 0
+        if needs_video and video is None:
+            raise InputError(DOING, f"{self.shares}", "no folder of videos", "make one with 'simrun train video', or give them no share")
+        self.videos = PairDataset(video, split).sequences if needs_video and video is not None else ()
+        for sequence in (*self.pairs, *self.videos):
+            size = sequence.clip.rgb_gt.shape[1:3]
+            if size[0] < crop[0] or size[1] < crop[1]:
+                found = f"frames of {size[1]}x{size[0]}, smaller than the crop {crop[1]}x{crop[0]}"
+                raise InputError(DOING, str(sequence.folder), found, "crop less")
+
+    def update(self, i: int, some: slice = slice(None)) -> StreamBatch:
+        """Return the batch of update ``i``, counted from 0, or ``some`` of its slots."""
+        slots = [self.episode_of(slot, i) for slot in range(self.batch)[some]]
+        shown = [self._show(episode, at) for episode, at in slots]
+        render, opacity, sdmap, target = (torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True))
+        fresh = torch.tensor([at == 0 or i == 0 for _, at in slots])
+        return StreamBatch(render, opacity, sdmap, target, fresh, torch.tensor([episode.kind for episode, _ in slots]))
+
+    def episode_of(self, slot: int, i: int) -> tuple[Episode, int]:
+        """Return what a slot shows at update ``i``, and how many updates of the episode came before."""
+        number, at = divmod(i + slot * self.episode // self.batch, self.episode)
+        return self._draw(slot, number), at
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the batches depend on, for a run's card and the refusal of other data."""
+        return {
+            "pairs": len(self.pairs), "pairs_digest": pairs_digest(self.pairs), "videos": len(self.videos),
+            "videos_digest": pairs_digest(self.videos), "shares": asdict(self.shares), "seed": self.seed, "batch": self.batch,
+            "frames": self.frames, "crop": list(self.crop), "episode": self.episode,
+        }  # fmt: skip
+
+    def _draw(self, slot: int, number: int) -> Episode:
+        rng = stream("training", self.seed, f"streams.{slot}", number)
+        kind = int(rng.choice(len(KINDS), p=[getattr(self.shares, name) for name in KINDS]))
+        sequences = self.videos if KINDS[kind] in ("video", "damaged_video") else self.pairs
+        sequence = sequences[int(rng.integers(len(sequences)))]
+        length, height, width = sequence.clip.rgb_gt.shape[:3]
+        start, top, left = (int(rng.integers(n)) for n in (length, height - self.crop[0] + 1, width - self.crop[1] + 1))
+        chances = (P_REVERSE, P_STRIDE_2, P_FLIP, P_PHOTOMETRIC, P_CLASS_COLOURS)
+        reverse, stride_2, flip, photometric, class_colours = (rng.random(5) < chances).tolist()
+        gain, channels, gamma = rng.uniform(*GAIN), rng.uniform(*CHANNEL_GAIN, 3), rng.uniform(*GAMMA)
+        other = OTHERS[int(rng.integers(len(OTHERS)))]
+        grey = np.arange(256)[:, None] / 255
+        shown = np.clip(gain * channels * grey**gamma, 0, 1) if photometric else np.repeat(grey, 3, axis=1)
+        levels: F32 = (shown * 2 - 1).astype(np.float32)
+        step = (-1 if reverse else 1) * (2 if stride_2 else 1)
+        detailed = rng.random() < P_DETAIL
+        sharpness, grain = (float(rng.uniform(*span)) if detailed else 0.0 for span in (SHARPNESS, GRAIN))
+        key = f"streams.{slot}.{number}"
+        loses = KINDS[kind] == "damaged_video" and rng.random() < P_LOST_RESOLUTION
+        lost = draw_lost_resolution(rng, *self.crop) if loses else None
+        return Episode(kind, sequence, start, step, top, left, flip, levels, other if class_colours else None, sharpness, grain, key, lost)
+
+    def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32]:
+        """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map and target of an episode's update."""
+        clip, kind = episode.sequence.clip, KINDS[episode.kind]
+        index = there_and_back(episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip))
+        columns = slice(episode.left, episode.left + self.crop[1])
+        rows = slice(episode.top, episode.top + self.crop[0])
+
+        def cut(channel: U8) -> U8:
+            out = np.stack([channel[t, rows, columns] for t in index])
+            return out[:, :, ::-1] if episode.flip else out
+
+        target = _lit(cut(clip.rgb_gt), episode.levels)
+        damaged = kind in ("pairs", "damaged_video")
+        if not damaged:
+            target = _detailed(target, episode.sharpness, episode.grain, stream("training", self.seed, f"{episode.key}.grain", at))
+        render = _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
+        opacity: F32 = np.ones((len(index), 1, *self.crop), np.float32)
+        if episode.lost:
+            render, opacity = episode.lost.apply(target), opacity * episode.lost.opacity
+        elif damaged:
+            opacity = cut(clip.opacity)[:, None].astype(np.float32) / np.float32(255)
+        return render, opacity, self._map(cut(clip.sdmap), episode), target
+
+    def _map(self, sdmap: U8, episode: Episode) -> F32:
+        shown = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap
+        return np.ascontiguousarray(shown.transpose(0, 3, 1, 2).astype(np.float32) / np.float32(127.5) - 1)
+
+
+def there_and_back(index: I64, length: int) -> I64:
+    """Reflect frame numbers at both ends of a sequence, so that neighbours stay neighbours.
+
+    Example:
+        >>> there_and_back(np.arange(-2, 6), 4).tolist()
+        [2, 1, 0, 1, 2, 3, 2, 1]
+    """
+    period = max(2 * (length - 1), 1)
+    folded = np.abs(index) % period
+    return np.asarray(np.minimum(folded, period - folded) if length > 1 else np.zeros_like(index))
+
+
+def _lit(frames: U8, levels: F32) -> F32:
+    """Map frames ``(T, h, w, 3)`` to ``(T, 3, h, w)`` by a table of levels."""
+    return np.stack([levels[frames[..., c], c] for c in range(3)], axis=1)
+
+
+def _detailed(frames: F32, sharpness: float, grain: float, rng: np.random.Generator) -> F32:
+    """Sharpen frames ``(T, 3, h, w)`` in [-1, 1] and add independent noise to every value."""
+    if not sharpness and not grain:
+        return frames
+    blurred = np.stack([[cv2.GaussianBlur(channel, (0, 0), 1.0) for channel in frame] for frame in frames])
+    noise = np.float32(grain) * rng.standard_normal(frames.shape, np.float32)
+    detailed: F32 = np.clip(frames + np.float32(sharpness) * (frames - blurred) + noise, -1, 1)
+    return detailed
+
+
+def _in_order(sequences: Sequence[PairSequence]) -> tuple[PairSequence, ...]:
+    """Return sequences by their number, the order in which they are made: the first few have every family."""
+    return tuple(sorted(sequences, key=lambda s: (s.name.rsplit("_", 1)[-1], s.name)))

@@ -1,0 +1,38 @@
+"""Metrics of the quality tables; importing this module declares them to `evaluators.metrics`."""
+
+from __future__ import annotations
+
+from alpasim_plugin.lab.learned_metrics.facts import CLIP_FACTS, EXTERNAL_FACTS
+from evaluators.metrics import MetricInfo, declare
+
+PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
+DRIFT = "drift_psnr_db"
+GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
+
+FACTS: dict[str, MetricInfo] = {
+    PSNR: MetricInfo("dB", "higher", "mean", "peak signal-to-noise ratio of frames, identical ones count as 100 dB"),
+    SSIM: MetricInfo("", "higher", "mean", "structural similarity of frames, 11x11 Gaussian, zero padded, per channel"),
+    "perceptual-syn-mid": MetricInfo("", "lower", "mean", "perceptual-syn of the middle tenth of a clip's frames"),
+    "perceptual-syn-last": MetricInfo("", "lower", "mean", "perceptual-syn of the last tenth of a clip's frames"),
+    "perceptual-syn": MetricInfo("", "lower", "mean", "perceptual distance by the feature network that comes with the package; not LPIPS"),
+    "lpips_alex": MetricInfo("", "lower", "mean", "LPIPS v0.1 with AlexNet"),
+    "lpips_vgg": MetricInfo("", "lower", "mean", "LPIPS v0.1 with VGG-16"),
+    "dists": MetricInfo("", "lower", "mean", "DISTS with VGG-16, full resolution"),
+    WARP: MetricInfo("", "lower", "mean", "change from frame to frame beyond the video's own motion"),
+    WARP_LATE: MetricInfo("", "lower", "mean", "the same over the last third of the clip"),
+    DRIFT: MetricInfo("dB", "higher", "mean", "PSNR of the last 50 frames minus that of frames 50 to 100"),
+    **{
+        name: MetricInfo(
+            "", "lower", "mean", f"step across the borders of {side}-pixel cells over other steps, on flat surfaces; 1: no grid"
+        )
+        for side, name in GRID.items()
+    },
+    **CLIP_FACTS,
+    **EXTERNAL_FACTS,
+    MS: MetricInfo("ms", "lower", "median", "time of the fixer per frame"),
+}
+SOMETIMES = frozenset(
+    {*CLIP_FACTS, *EXTERNAL_FACTS}
+)  # undefined on some clips, such as those without a vehicle; these are left out and counted
+for _name, _facts in FACTS.items():
+    declare(_name, _facts)

@@ -1,0 +1,57 @@
+"""PSNR and SSIM of every frame of two stacks of one size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alpasim_plugin.core import image_metrics
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.core.types import F64, U8
+
+
+def psnr_db(made: U8, truth: U8) -> F64:
+    """Return the PSNR of every frame ``(T,)``, dB, at most 100; stacks ``(T, H, W, 3)``.
+
+    Raises:
+        EvaluatorError: Stacks that do not belong together.
+    """
+    check_stacks("computing PSNR", made, truth)
+    return np.array([image_metrics.psnr_db(a, b) for a, b in zip(made, truth, strict=True)])
+
+
+def ssim(made: U8, truth: U8) -> F64:
+    """Return the mean structural similarity of every frame ``(T,)``, 1 for equal ones; stacks ``(T, H, W, 3)``.
+
+    Raises:
+        EvaluatorError: Stacks that do not belong together.
+    """
+    check_stacks("computing SSIM", made, truth)
+    return np.array([image_metrics.ssim(a, b) for a, b in zip(made, truth, strict=True)])
+
+
+def identical_frames(made: U8, truth: U8) -> int:
+    """Return how many frames are equal in every value; their PSNR is the cap, which a mean should not hide."""
+    check_stacks("counting identical frames", made, truth)
+    return int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
+
+
+def check_stacks(doing: str, made: U8, truth: U8) -> None:
+    """Refuse anything but two equal stacks ``(T, H, W, 3)`` uint8 with at least one frame.
+
+    Raises:
+        EvaluatorError: With what was found.
+    """
+    for name, frames in (("made", made), ("truth", truth)):
+        check_stack(doing, name, frames)
+    if made.shape != truth.shape:
+        raise EvaluatorError(doing, "two videos", f"shapes {made.shape} and {truth.shape}", "give videos of the same frames at one size")
+
+
+def check_stack(doing: str, name: str, frames: U8) -> None:
+    """Refuse anything but ``(T, H, W, 3)`` uint8 with at least one frame.
+
+    Raises:
+        EvaluatorError: With what was found.
+    """
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8 or not len(frames):
+        raise EvaluatorError(doing, f"the video {name!r}", f"{frames.dtype} {frames.shape}", "give (T, H, W, 3) uint8, at least one frame")

@@ -1,0 +1,156 @@
+"""`perceptual-syn`: a perceptual distance over a small frozen feature network. It is not LPIPS: it is trained on synthetic scenes.
+
+The definition is that of LPIPS (Zhang et al., CVPR 2018, Eq. 1): features of every stage, scaled to unit length over the channels, squared
+difference, a non-negative weight per channel, mean over the image, sum over the stages. Values cannot be compared with published LPIPS
+numbers. docs/lab/perceptual-syn.md describes training and validation.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.nets.checkpoints import load_weights, weight
+from alpasim_plugin.nets.headers import read_metadata
+
+NAME = "perceptual-syn"
+FORMAT = "simrun-perceptual-1"
+WIDTHS = (16, 32, 64, 96)  # channels of the stages, at 1/2, 1/4, 1/8 and 1/16 of the resolution
+SMALLEST_PX = 16
+HEAD_INIT = -3.0  # before softplus
+LENGTH_EPS = 1e-4  # added to the squared length of a feature, against division by nearly zero in flat dark cells
+DOING = "measuring a perceptual distance"
+
+
+class FeatureNet(nn.Module):
+    """Four convolution stages, each at half the resolution of the previous one.
+
+    Args:
+        widths: Channels of the stages.
+    """
+
+    def __init__(self, widths: tuple[int, int, int, int] = WIDTHS) -> None:
+        super().__init__()
+        one, two, three, four = widths
+        self.widths = widths
+        self.stages = nn.ModuleList(
+            [
+                nn.Sequential(nn.Conv2d(3, one, 4, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(one, two, 3, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(two, three, 3, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(three, four, 3, 2, 1), _activation(), nn.Conv2d(four, four, 3, 1, 1), _activation()),
+            ]
+        )
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Map ``(B, 3, H, W)`` in [-1, 1] to features ``(B, C, H / 2^k, W / 2^k)`` of stages k = 1 to 4."""
+        out = []
+        for stage in self.stages:
+            image = stage(image)
+            out.append(image)
+        return out
+
+
+class PerceptualDistance(nn.Module):
+    """Distance of two images in feature space.
+
+    Args:
+        widths: Channels of the stages.
+
+    Example:
+        >>> net = PerceptualDistance().requires_grad_(False)
+        >>> a = torch.zeros(2, 3, 32, 48)
+        >>> net.distance(a, a)
+        tensor([0., 0.])
+    """
+
+    def __init__(self, widths: tuple[int, int, int, int] = WIDTHS) -> None:
+        super().__init__()
+        self.trunk = FeatureNet(widths)
+        # Before softplus, which keeps the weights positive.
+        self.heads = nn.ParameterList([nn.Parameter(torch.full((c,), HEAD_INIT)) for c in widths])
+
+    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return the distances ``(B,)`` of images ``(B, 3, H, W)`` in [-1, 1]; differentiable in both, zero for equal ones.
+
+        Raises:
+            InputError: Shapes differ, are not ``(B, 3, H, W)``, or a side is below 16 pixels.
+        """
+        check_images(a, b, SMALLEST_PX)
+        return self.feature_distance(self.trunk(a), self.trunk(b))
+
+    forward = distance
+
+    def feature_distance(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
+        """Return the distances ``(B,)`` of features as `FeatureNet` gives them."""
+        parts = [_stage_distance(x, y, F.softplus(head)) for x, y, head in zip(a, b, self.heads, strict=True)]
+        return torch.stack(parts).sum(0)
+
+    def save(self, path: str | Path, metadata: dict[str, str] | None = None, dtype: torch.dtype = torch.float16) -> None:
+        """Write the weights as safetensors."""
+        tensors = {key: value.to(dtype) for key, value in self.state_dict().items()}
+        write_safetensors(path, tensors, {**(metadata or {}), "format": FORMAT, "name": NAME})
+
+
+def load_perceptual(path: str | Path | None = None) -> PerceptualDistance:
+    """Load the distance `perceptual-syn`, frozen, in float32.
+
+    Args:
+        path: Weights that `simrun train perceptual` wrote; None takes those of the package.
+
+    Raises:
+        InputError: No such file, or weights of another network.
+    """
+    source = Path(path) if path is not None else shipped_weights()
+    doing, do = "loading the perceptual network", "give a file that 'simrun train perceptual' wrote"
+    if not source.is_file():
+        raise InputError(doing, str(source), "no such file", do)
+    if read_metadata(source).get("format") != FORMAT:
+        raise InputError(doing, str(source), f"format {read_metadata(source).get('format')!r}, not {FORMAT!r}", do)
+    tensors = {key: weight(key, value, torch.float32, str(source)) for key, value in load_weights(source).items()}
+    heads = [tensors.get(f"heads.{i}") for i in range(len(WIDTHS))]
+    if any(head is None for head in heads):
+        raise InputError(doing, str(source), f"{len(tensors)} tensors without the heads of {len(WIDTHS)} stages", do)
+    one, two, three, four = (head.numel() for head in heads if head is not None)
+    net = PerceptualDistance((one, two, three, four))
+    try:
+        net.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InputError(doing, str(source), str(error).splitlines()[-1].strip(), do) from error
+    return net.requires_grad_(False).eval()
+
+
+def shipped_weights() -> Path:
+    """Return the path of the shipped weights."""
+    return Path(str(resources.files("alpasim_plugin.lab.video_metrics"))) / "weights" / f"{NAME}.safetensors"
+
+
+def check_images(a: Tensor, b: Tensor, smallest_px: int) -> None:
+    """Refuse other tensors than two batches of images ``(B, 3, H, W)`` of equal shape.
+
+    Raises:
+        InputError: Another shape.
+    """
+    if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < smallest_px:
+        do = f"give two tensors (B, 3, H, W) of one shape, sides of at least {smallest_px}"
+        raise InputError(DOING, "two batches of images", f"shapes {tuple(a.shape)} and {tuple(b.shape)}", do)
+
+
+def _stage_distance(a: Tensor, b: Tensor, head: Tensor) -> Tensor:
+    difference = unit(a) - unit(b)  # (B, C, h, w)
+    return torch.einsum("bchw,c->b", difference * difference, head) / (a.shape[2] * a.shape[3])
+
+
+def unit(x: Tensor) -> Tensor:
+    """Scale features ``(B, C, h, w)`` to unit length over the channels."""
+    return x * torch.rsqrt((x * x).sum(1, keepdim=True) + LENGTH_EPS)
+
+
+def _activation() -> nn.Module:
+    return nn.LeakyReLU(0.1, inplace=True)  # leaky, since units die under a plain ReLU

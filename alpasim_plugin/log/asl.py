@@ -1,0 +1,210 @@
+"""Frame ASL logs: a 4-byte big-endian length before each serialised ``LogEntry``, and nothing else.
+
+The format has no header, index or checksum. A log whose writer was killed ends inside an entry: the reader gives everything before it
+and a `TruncatedTail`. Damage anywhere else is an error.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from google.protobuf.message import DecodeError
+
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.io.atomic import disk_error
+from alpasim_plugin.io.limits import ENTRY_BYTES, LOG_BYTES
+from alpasim_plugin.io.reading.files import open_regular
+from alpasim_plugin.wire import logging_pb2
+
+_LENGTH = struct.Struct(">I")
+_COPY_AGAIN = "copy the log again from where it was written; nothing after this point can be trusted"
+
+
+@dataclass(frozen=True)
+class TruncatedTail:
+    """Describe an unfinished last entry, as a killed writer leaves it.
+
+    Attributes:
+        path: The log.
+        entries: Number of whole entries before it.
+        offset: Byte position of its length field.
+        announced: Its length in bytes, or None if even the length field is cut.
+        present: Bytes of it that are there, without the length field.
+    """
+
+    path: Path
+    entries: int
+    offset: int
+    announced: int | None
+    present: int
+
+    def __str__(self) -> str:
+        size = "its length is cut too" if self.announced is None else f"{self.present} of {self.announced} bytes"
+        return f"{self.path}: last entry cut at byte {self.offset} ({size}); {self.entries} whole entries read"
+
+
+class AslReader:
+    """Iterate over the entries of a log, one in memory at a time.
+
+    Attributes:
+        path: The log.
+        truncated: Set once iteration has met an unfinished last entry; None otherwise.
+
+    Example:
+        >>> for entry in AslReader("rollout.asl"):  # doctest: +SKIP
+        ...     print(entry.WhichOneof("log_entry"))
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.truncated: TruncatedTail | None = None
+
+    def __iter__(self) -> Iterator[logging_pb2.LogEntry]:
+        """Yield the entries in file order.
+
+        Raises:
+            InputError: Missing or empty file, or damage before the last entry.
+        """
+        self.truncated = None
+        with open_regular(self.path, "reading a rollout log", LOG_BYTES) as stream:
+            index = 0
+            while (body := self._next(stream, index)) is not None:
+                yield self._parse(body, index, stream.tell() - len(body))
+                index += 1
+        if index == 0 and self.truncated is None:
+            raise InputError("reading a rollout log", str(self.path), "an empty file", "run the rollout again")
+
+    def _next(self, stream: BinaryIO, index: int) -> bytes | None:
+        """Return the bytes of the next entry, or None at the end; notes an unfinished one."""
+        offset = stream.tell()
+        prefix = stream.read(_LENGTH.size)
+        if not prefix:
+            return None
+        if len(prefix) < _LENGTH.size:
+            self.truncated = TruncatedTail(self.path, index, offset, None, 0)
+            return None
+        announced = _LENGTH.unpack(prefix)[0]
+        if announced == 0 or announced > ENTRY_BYTES.high:
+            raise self._damaged(index, offset, f"a length of {announced} bytes")
+        body = stream.read(announced)
+        if len(body) == announced:
+            return body
+        if not _may_begin_entry(body, announced):
+            raise self._damaged(index, offset, f"a length of {announced} bytes that does not fit what follows")
+        self.truncated = TruncatedTail(self.path, index, offset, announced, len(body))
+        return None
+
+    def _parse(self, body: bytes, index: int, offset: int) -> logging_pb2.LogEntry:
+        entry = logging_pb2.LogEntry()
+        try:
+            entry.ParseFromString(body)
+        except DecodeError as error:
+            raise self._damaged(index, offset, f"{len(body)} bytes that are no log entry") from error
+        return entry
+
+    def _damaged(self, index: int, offset: int, found: str) -> InputError:
+        return InputError("reading a rollout log", f"{self.path}, entry {index} at byte {offset}", found, _COPY_AGAIN)
+
+
+class AslFile:
+    """Write entries to ``PATH.part`` and give the file its name only when it is finished.
+
+    As a context manager it finishes on success; on an exception the ``.part`` file stays for inspection, readable up to its last
+    whole entry, and the next attempt replaces it.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.partial = self.path.with_name(self.path.name + ".part")
+        self.entries = 0
+        try:
+            self._stream: BinaryIO | None = self.partial.open("wb")
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def write(self, entry: logging_pb2.LogEntry) -> None:
+        """Append one entry.
+
+        Raises:
+            InfrastructureError: The disk refuses, or the file is already finished.
+        """
+        if self._stream is None:
+            raise InfrastructureError("writing a rollout log", str(self.path), "the log is already finished", "open a new log")
+        body = entry.SerializeToString()
+        try:
+            self._stream.write(_LENGTH.pack(len(body)) + body)
+        except OSError as error:
+            raise self._failure(error) from error
+        self.entries += 1
+
+    def finish(self) -> None:
+        """Flush to the disk and rename; harmless if already finished.
+
+        Raises:
+            InfrastructureError: The disk refuses; the ``.part`` file stays.
+        """
+        if self._stream is None:
+            return
+        try:
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self._stream.close()
+            self._stream = None
+            self.partial.replace(self.path)
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def abandon(self) -> None:
+        """Close without renaming."""
+        if self._stream is not None:
+            # The caller is already dealing with a failure; that the last buffer of a full disk is lost too adds nothing to it.
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            self._stream = None
+
+    def __enter__(self) -> AslFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self.abandon()
+
+    def _failure(self, error: OSError) -> InfrastructureError:
+        return disk_error(self.path, error, "writing a rollout log")
+
+
+def _may_begin_entry(head: bytes, announced: int) -> bool:
+    """Tell whether `head` can be the beginning of an entry of `announced` bytes.
+
+    An entry is one length-delimited field, so its own inner length must reach exactly to its end. This tells a cut file from a length
+    field that was overwritten.
+    """
+    tag, at = _varint(head, 0)
+    if at is None:
+        return True
+    inner, at = _varint(head, at)
+    if at is None:
+        return tag & 7 == 2
+    return tag & 7 == 2 and at + inner == announced
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int | None]:
+    """Return a base-128 number and the position after it; None where the data end first."""
+    value = 0
+    for shift in range(0, 64, 7):
+        if at >= len(data):
+            return value, None
+        value |= (data[at] & 0x7F) << shift
+        at += 1
+        if not data[at - 1] & 0x80:
+            return value, at
+    return value, at

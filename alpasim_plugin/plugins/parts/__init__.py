@@ -1,0 +1,25 @@
+"""Parts by name: what can be named, what a name stands for, and what identifies it.
+
+A name is resolved once, into a `PartSpec` that carries the part's identity; a worker process only builds it. Built-in parts
+(`alpasim_plugin.plugins.parts.builtin`), parts of installed packages (entry points) and ``package.module:Class`` go the same way.
+"""
+
+from alpasim_plugin.plugins.members import complete
+from alpasim_plugin.plugins.parts.build import build
+from alpasim_plugin.plugins.parts.registry import find, names
+from alpasim_plugin.plugins.parts.resolve import RendererSpec, overrides_of, resolve, resolve_renderer, unidentified
+from alpasim_plugin.plugins.parts.spec import PartSpec, digest
+
+__all__ = [
+    "PartSpec",
+    "RendererSpec",
+    "build",
+    "complete",
+    "digest",
+    "find",
+    "names",
+    "overrides_of",
+    "resolve",
+    "resolve_renderer",
+    "unidentified",
+]

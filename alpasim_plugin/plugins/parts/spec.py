@@ -1,0 +1,109 @@
+"""What a run knows of a part: enough to build it anywhere, and to tell whether it is still the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.plugins.interfaces import MetricInfo
+from alpasim_plugin.plugins.parts.kinds import KindName
+from alpasim_plugin.plugins.parts.source import code_digest
+
+
+@dataclass(frozen=True)
+class PartSpec:
+    """A part, resolved.
+
+    Attributes:
+        kind: Its kind.
+        name: As a user named it, with everything that was left out filled in: ``onefixer@2``.
+        target: ``package.module:attribute`` or ``/path/file.py:attribute`` of its factory.
+        settings: Validated settings; None where the part takes none.
+        digest: SHA-256 of its code, settings and files. None: its behaviour is decided elsewhere, so nothing it did may be reused.
+        note: What it is in a few words: "trained", "untrained (identity)".
+        trained: Whether its weights were learned; None where it has none.
+        files: SHA-256 of every file that it declares, by path.
+        metrics: An evaluator's own metrics.
+        controller: A policy's controller.
+        address: What follows ``scheme://`` in the name of a remote part.
+        missing: What must be given before it can be built; empty where nothing is missing.
+    """
+
+    kind: KindName
+    name: str
+    target: str
+    settings: BaseModel | None = None
+    digest: str | None = None
+    note: str = ""
+    trained: bool | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    metrics: Mapping[str, MetricInfo] = field(default_factory=dict)
+    controller: str = ""
+    address: str | None = None
+    missing: str = ""
+
+    @property
+    def label(self) -> str:
+        """Give the part and its weights in a few words: "onefixer, trained"."""
+        own = getattr(self.settings, "name", "") or self.name
+        return f"{own}, {self.note}" if self.note else own
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything for ``run.json``."""
+        return {
+            "name": self.name,
+            "target": self.target,
+            "label": self.label,
+            "digest": self.digest,
+            "trained": self.trained,
+            "files": dict(self.files),
+            "settings": None if self.settings is None else self.settings.model_dump(mode="json"),
+        }
+
+
+def digest(value: object) -> str:
+    """Return a SHA-256 over the canonical JSON of a value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def file_digest(path: Path, what: str) -> str:
+    """Return the SHA-256 of a file that a part names as its own.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        do = "correct the path, or install the part again with its files"
+        raise InputError("reading a file that a part declares", f"{what}: {path}", error.strerror or str(error), do) from error
+
+
+def part_digest(modules: Sequence[Path], attribute: str, settings: BaseModel | None, files: Mapping[str, str]) -> str:
+    """Return the digest of a part.
+
+    Args:
+        modules: Source files of the module that was named and of the one that defines the factory; none for an extension module.
+        attribute: The factory in the module.
+        settings: Its settings.
+        files: SHA-256 by name; a name that is a dotted key of the settings takes the place of the path that stands there.
+    """
+    content = None if settings is None else settings.model_dump(mode="json")
+    for name in files:
+        _blank(content, name.split("."))
+    return digest([[code_digest(module) for module in modules], attribute, content, dict(files)])
+
+
+def _blank(content: Any, keys: list[str]) -> None:
+    for key in keys[:-1]:
+        content = content.get(key) if isinstance(content, dict) else None
+    if isinstance(content, dict) and keys[-1] in content:
+        content[keys[-1]] = None

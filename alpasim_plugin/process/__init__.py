@@ -1,0 +1,1 @@
+"""Subprocesses and their supervisor, signals, standard output."""

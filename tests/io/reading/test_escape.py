@@ -1,0 +1,69 @@
+"""Rule 6: what scenes, logs and parts are called cannot act where it is shown."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.escape import MAX_PART, markdown, shorten, terminal, xml
+from evaluators.report.junit import write_junit
+from evaluators.report.summary import write_summary_md
+from tests.report.make_run import Plan, make_run
+
+HOSTILE = "a|b`c <img src=x>&amp; [l](javascript:1) \x1b[31m\x07 \u202e\u0000 *b* _i_\n# head"
+
+
+def test_a_terminal_sees_no_control_character() -> None:
+    shown = terminal(HOSTILE)
+    assert shown.isprintable()
+    assert "\\x1b[31m" in shown
+    assert "\\u202e" in shown
+    assert terminal("Grüße, 東京 ± 1.5 m") == "Grüße, 東京 ± 1.5 m"
+
+
+def test_markdown_shows_text_as_it_is() -> None:
+    shown = markdown(HOSTILE)
+    assert "\n" not in shown
+    assert not set("<>") & set(shown)
+    for mark in "|`[]*#":
+        assert shown.count(mark) == shown.count(f"\\{mark}"), mark
+    assert "&amp;amp;" in shown
+    assert markdown("collision_at_fault") == "collision_at_fault"
+
+
+def test_xml_holds_any_text() -> None:
+    element = ET.Element("a", {"b": xml("".join(map(chr, range(0x300))) + "\ud800\uffff")})
+    assert ET.fromstring(ET.tostring(element)).get("b") is not None
+
+
+def test_parts_of_errors_are_short_and_cannot_act() -> None:
+    error = InputError("reading", "a" * 10_000, f"found {HOSTILE}" + "b" * 7_500_000, "do")
+    assert all(len(part) <= MAX_PART and part.isprintable() for part in (error.doing, error.with_what, error.found, error.do_this))
+    assert "10000" not in error.with_what
+    assert error.with_what.startswith("aaa")
+    assert "more" in error.with_what
+    assert str(error).count("\n") == 3
+
+
+@pytest.mark.parametrize("length", [299, 300, 301, 5000])
+def test_shortening_keeps_both_ends(length: int) -> None:
+    text = "<" + "x" * (length - 2) + ">"
+    short = shorten(text)
+    assert len(short) <= 300
+    assert (short[0], short[-1]) == ("<", ">")
+
+
+def test_a_run_of_hostile_names_is_reported_in_whole_tables(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", Plan(renderers=("clean", HOSTILE), scenes=(HOSTILE, "plain"), seeds=(0, 1), steps=20, pictures=False,
+                                          clips=False, fail=[("clean", "plain", 0)], failure=HOSTILE))  # fmt: skip
+    text = write_summary_md(run).read_text()
+    assert "\x1b" not in text
+    assert "<img" not in text.partition("### Made with")[0]  # the command stands in a block of code
+    for line in text.splitlines():
+        if line.startswith("|"):
+            cells = line.replace("\\|", "").count("|")
+            assert cells >= 3, line
+    ET.parse(write_junit(run))

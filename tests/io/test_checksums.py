@@ -1,0 +1,93 @@
+"""A file that is not the one that was written is noticed, and a copy of it is not taken for another one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.io import checksums as vouched
+from alpasim_plugin.io.checksums import problem_of, read_sealed, vouch, write_sealed
+
+CONTENT = {"metrics": {"progress": 0.5}, "files": [1, 2], "name": "é"}
+
+
+def read(path: Path) -> object:
+    return read_sealed(path, "reading", "run again")[0]
+
+
+def test_what_is_sealed_is_read_back_without_the_seal(tmp_path: Path) -> None:
+    seal = write_sealed(tmp_path / "a.json", CONTENT, "writing")
+    assert read_sealed(tmp_path / "a.json", "reading", "run again") == (CONTENT, seal)
+
+
+def test_every_cut_and_every_changed_byte_of_a_sealed_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_sealed(path, CONTENT, "writing")
+    whole = path.read_bytes()
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            read(path)
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(InputError):
+            read(path)
+    path.write_bytes(whole)
+    assert read(path) == CONTENT
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "[1]", '{"sha256": "0"}', "5"])
+def test_json_without_a_seal_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match="seal"):
+        read(tmp_path / "a.json")
+
+
+def test_an_object_that_has_no_room_for_a_seal_is_a_mistake_of_the_caller(tmp_path: Path) -> None:
+    for value in ({}, {"sha256": "x"}):
+        with pytest.raises(ValueError, match="sealed object"):
+            write_sealed(tmp_path / "a.json", value, "writing")
+
+
+def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"0123456789")
+    facts = vouch(tmp_path, ["a", "absent"])
+    assert list(facts) == ["a"]
+    assert problem_of(path, facts["a"]) is None
+    path.write_bytes(b"01234")
+    assert problem_of(path, facts["a"]) == "5 bytes, written with 10"
+    path.write_bytes(b"012345678x")
+    os.utime(path, ns=(0, facts["a"]["mtime_ns"] + 10**9))
+    assert problem_of(path, facts["a"]) == "not the content that was written"
+    path.unlink()
+    assert problem_of(path, facts["a"]) == "missing"
+    path.mkdir()
+    assert problem_of(path, facts["a"]) == "not a file"
+
+
+def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"0123456789")
+    facts = vouch(tmp_path, ["a"])["a"]
+    path.write_bytes(b"x123456789")
+    os.utime(path, ns=(0, facts["mtime_ns"]))
+    assert problem_of(path, facts) is None
+    assert problem_of(path, facts, full=True) == "not the content that was written"
+
+
+def test_a_copy_is_read_once_and_then_taken_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_bytes(b"0123456789")
+    facts = vouch(tmp_path, ["a"])["a"]
+    copy = tmp_path / "copy"
+    shutil.copyfile(tmp_path / "a", copy)
+    os.utime(copy, ns=(0, facts["mtime_ns"] + 5 * 10**9))
+    read_in_full: list[Path] = []
+    digest = vouched.sha256_of
+    monkeypatch.setattr(vouched, "sha256_of", lambda path: (read_in_full.append(path), digest(path))[1])
+    assert [problem_of(copy, facts) for _ in range(3)] == [None, None, None]
+    assert read_in_full == [copy]

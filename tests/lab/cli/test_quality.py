@@ -1,0 +1,188 @@
+"""`simrun bench quality`: the raw render, an identity and a small network over made-up pairs, whole and resumed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.lab.bench.quality_run import Work, finish, identity, lose_resolution, shown_frames
+from alpasim_plugin.lab.cli.quality import parse_variants
+from alpasim_plugin.lab.video_metrics import clip_quality
+from alpasim_plugin.lab.video_metrics.sheet import sheet
+from alpasim_plugin.lab.video_metrics.summary import summarise
+from alpasim_plugin.nets import DiTSizes, TinyVAE
+from alpasim_plugin.nets.init import initial_weights
+from tests.fixers.fixer_cases import small_settings
+from tests.lab.training.pair_files import make
+
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bundle") / "small.safetensors"
+    settings: OneFixerSettings = small_settings("holes=noise", "window=3")
+    parts = {"dit": initial_weights(DiTSizes(**settings.dit.model_dump()), 3), "vae": TinyVAE.random(seed=3).state_dict()}
+    prompt = {"text": torch.zeros(1, settings.dit.text_width)}
+    save_bundle(path, {**parts, "prompt": prompt}, settings, trained=True, note="random")
+    return path
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("pairs")
+    for name in ("a", "b"):
+        make(root, "test-known", name, frames=FRAMES)
+    return root
+
+
+def test_a_table_a_document_charts_and_pictures(data: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    command = ["bench", "quality", str(data), "--fixer", f"3dgs,identity,small={bundle}", "--pictures", "1", "--out", str(out)]
+    assert run_command([*command, "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    variants = summary["arms"]
+    assert list(variants) == ["3dgs", "identity", "small", "truth"]
+    assert list(variants["truth"]) == ["warp_l1", "warp_l1_late"]
+    for metric in ("psnr_db", "ssim", "perceptual-syn", "warp_l1"):
+        assert variants["identity"][metric] == variants["3dgs"][metric]
+        assert summary["paired"]["identity"][metric]["diff"] == 0.0
+        difference = variants["small"][metric]["mean"] - variants["3dgs"][metric]["mean"]
+        assert summary["paired"]["small"][metric]["diff"] == pytest.approx(difference)
+    assert "ms_per_frame" in variants["small"]
+    assert "ms_per_frame" not in variants["3dgs"]
+    assert summary["run"]["fixers"]["small"]["settings"]["window"] == 3
+    assert summary["run"]["fixers"]["small"]["trained"] is True
+    unit = {"frames": 8, "network_calls": 1, "latents": 2, "lookahead_frames": 7, "calls_per_frame": 0.125}
+    assert summary["run"]["units"] == {"3dgs": None, "identity": None, "small": unit}
+    for name in ("quality.json", "quality.md", "by-frame.png", "speed.png", "sheets/a.png"):
+        assert (out / name).stat().st_size > 0
+    laid = cv2.imread(str(out / "sheets" / "a.png"))
+    assert laid.shape[1] > 4 * 48
+    stored = json.loads((out / "clips" / "small" / "b.json").read_text())["row"]
+    assert len(stored["series"]["psnr_db"]) == FRAMES
+    assert len(stored["series"]["warp_l1"]) == FRAMES - 1
+
+    table = (out / "quality.md").read_text()
+    assert table.count("| identity |") == 2
+
+
+def test_finished_clips_are_kept_until_something_differs(data: Path, tmp_path: Path) -> None:
+    networks = (("perceptual-syn", identity("perceptual-syn", None)),)
+    variant = parse_variants("identity", [])[0]
+    work = Work(data / "test-known" / "b", "render", variant, FRAMES, 0, "cpu", 1, networks, None, tmp_path, True)
+    row = finish(work)
+    stamp = work.row_file.stat().st_mtime_ns
+    assert finish(work) == row
+    assert work.row_file.stat().st_mtime_ns == stamp
+    picture = work.picture_file(shown_frames(FRAMES)[1])
+    picture.unlink()
+    finish(work)
+    assert picture.is_file()
+    key = json.loads(work.row_file.read_text())["key"]
+    other = parse_variants("identity", ["fixer.block_latents=3"])[0]
+    for changed in (replace(work, seed=1), replace(work, frames=9), replace(work, variant=other), replace(work, given="truth")):
+        assert finish(changed)["frames"] == changed.frames
+        assert json.loads(work.row_file.read_text())["key"] != key
+
+
+@pytest.mark.slow
+def test_the_truth_as_input_is_what_the_fixer_should_leave_alone(data: Path, bundle: Path, tmp_path: Path) -> None:
+    command = ["bench", "quality", str(data), "--input", "truth", "--baseline", "small", "--pictures", "0", "--out", str(tmp_path)]
+    assert run_command([*command, "--fixer", f"identity,small={bundle}"]) == 0
+    rows = {label: json.loads((tmp_path / "clips" / label / "a.json").read_text())["row"] for label in ("identity", "small")}
+    assert rows["identity"]["identical"] == FRAMES
+    assert rows["small"]["values"]["psnr_db"] < rows["identity"]["values"]["psnr_db"]
+    assert json.loads((tmp_path / "quality.json").read_text())["run"]["input"] == "truth"
+
+
+def test_lost_resolution_is_the_same_damage_at_every_frame_and_of_the_clip_alone() -> None:
+    video = np.random.default_rng(0).integers(0, 256, (1, 48, 64, 3), np.uint8).repeat(2, axis=0)
+    damaged, opacity = lose_resolution(video, "a")
+    assert damaged.shape == video.shape
+    assert np.array_equal(damaged[0], damaged[1])
+    assert np.array_equal(opacity[0], opacity[1])
+    steps = [np.abs(np.diff(one.astype(int), axis=2)).mean() for one in (damaged, video)]
+    assert steps[0] < 0.6 * steps[1]
+    assert np.array_equal(lose_resolution(video, "a")[0], damaged)
+    assert not np.array_equal(lose_resolution(video, "b")[0], damaged)
+
+
+def test_labels_overrides_and_bundles_are_told_apart(bundle: Path) -> None:
+    variants = parse_variants(f"3dgs,two=onefixer-dit-tiny@2,small={bundle}", ["fixer.mode=chunk", "small:fixer.window=5"])
+    assert [variant.label for variant in variants] == ["3dgs", "two", "small"]
+    assert variants[0].spec is None
+    two, small = (variant.spec.settings for variant in variants[1:] if variant.spec)
+    assert isinstance(two, OneFixerSettings)
+    assert isinstance(small, OneFixerSettings)
+    assert (two.mode, small.mode) == ("chunk", "chunk")
+    assert (two.window, small.window, len(two.steps)) == (6, 5, 2)
+    assert small.dit.width == 24
+    assert small.weights.bundle == str(bundle)
+    assert bundle_fixer(bundle)[0] == "onefixer-dit-tiny"
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides", "words"),
+    [
+        ("3dgs,3dgs", [], "taken"), ("truth=identity", [], "taken"), ("a/b=identity", [], "taken"), ("nothing", [], "nothing"),
+        ("identity", ["other:fixer.mode=chunk"], "no fixer of this label"), ("identity", ["window=3"], "not a key of the fixer"),
+    ],
+)  # fmt: skip
+def test_variants_that_cannot_be_are_refused(text: str, overrides: list[str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        parse_variants(text, overrides)
+
+
+def test_unknown_baseline_is_refused(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["bench", "quality", str(data), "--fixer", "identity", "--out", str(tmp_path)]) == 2
+    assert "--baseline 3dgs" in capsys.readouterr().err
+
+
+def row(variant: str, clip: str, psnr: float, frames: int = 200) -> dict[str, object]:
+    values, series = {"psnr_db": psnr}, {"psnr_db": [psnr] * frames}
+    return {"arm": variant, "clip": clip, "seed": 0, "frames": frames, "values": values, "series": series, "identical": 0, "events": {}}
+
+
+def test_intervals_are_over_clips_and_pairs_are_sharper() -> None:
+    rows = [row("3dgs", c, p) for c, p in zip("abcd", (20, 22, 24, 30), strict=True)]
+    rows += [row("f", c, p) for c, p in zip("abcd", (21.0, 23.1, 25.0, 31.1), strict=True)]
+    found = summarise(rows, "3dgs")
+    low, high = found["arms"]["3dgs"]["psnr_db"]["ci95"]
+    assert found["arms"]["3dgs"]["psnr_db"]["mean"] == 24.0
+    assert (high - low) / 2 == pytest.approx(3.182446 * np.std([20, 22, 24, 30], ddof=1) / 2)
+    pair = found["paired"]["f"]["psnr_db"]
+    assert pair["diff"] == pytest.approx(1.05)
+    assert pair["difference"] == "better"
+    assert found["by_frame"]["f"]["psnr_db"]["first"][:2] == [0, 10]
+    with pytest.raises(EvaluatorError, match="baseline 'x'"):
+        summarise(rows, "x")
+
+
+def test_drift_holds_the_end_against_frames_50_to_100() -> None:
+    black = np.zeros((150, 16, 16, 3), dtype=np.uint8)
+    made = black + np.uint8(1)
+    made[100:] = 2
+    assert clip_quality(made, black, {}).means["drift_psnr_db"] == pytest.approx(20 * np.log10(0.5))
+    assert "drift_psnr_db" not in clip_quality(made[:149], black[:149], {}).means
+
+
+def test_shown_frames_lie_in_the_clip() -> None:
+    assert shown_frames(198) == (19, 98, 191)
+    assert shown_frames(2) == (0,)
+
+
+def test_pictures_of_other_sizes_are_not_laid_out() -> None:
+    a, b = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 9, 3), np.uint8)
+    with pytest.raises(EvaluatorError, match="sizes"):
+        sheet({"a": [a], "b": [b]}, ["x"])

@@ -1,0 +1,185 @@
+"""Every causal arm, end to end: its stages train, resume bit for bit, and give a bundle that steps as a renderer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import bundle_fixer
+from alpasim_plugin.fixers.networks import load_networks
+from alpasim_plugin.fixers.onefixer import OneFixer
+from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.lab.training.adversarial import AdversarialTerm
+from alpasim_plugin.lab.training.clip_batches import BatchForm
+from alpasim_plugin.lab.training.distillation import Distillation
+from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
+from alpasim_plugin.lab.training.recipes.causal_arms import CAUSAL_ARMS
+from alpasim_plugin.lab.training.recipes.recipe import Recipe, Stage
+from alpasim_plugin.lab.training.recipes.registry import by_name, recipe_of, with_objective
+from alpasim_plugin.lab.training.tail_drop import TailDrop
+from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
+from alpasim_plugin.nets.checkpoints import load_weights
+from tests.fixers.fixer_cases import SMALL_DIT, fixer, maps_of, moving_picture, pixels, run_blocks
+from tests.lab.training.test_generator import FORM, clips_of, data  # noqa: F401 - data is a fixture
+
+STEPS = 2  # U
+
+
+def arm_settings(name: str, *overrides: str) -> OneFixerSettings:
+    sizes = [text for text in SMALL_DIT if text.startswith("dit.")]
+    settings = fixer_settings(name, (*sizes, *overrides))
+    assert isinstance(settings, OneFixerSettings)
+    return settings
+
+
+def run_of(data: Path, recipe: Recipe, **weights: Path) -> FixerRun:  # noqa: F811
+    schedule = Schedule(STEPS, peak_lr=1e-2, warmup=1, accumulate=1, save_every=1, ema=0.5)
+    batches = BatchForm(clips=2, columns=4)
+    return FixerRun(arm_settings(recipe.fixer), recipe, data, data / "vae.safetensors", weights, FORM, batches, schedule)
+
+
+def deployed(path: Path, steps: int = 1) -> OneFixer:
+    name, overrides = bundle_fixer(path)
+    settings = fixer_settings(name, (*overrides, f"steps={steps}"))
+    assert isinstance(settings, OneFixerSettings)
+    return fixer(settings)
+
+
+@pytest.fixture(scope="module")
+def student(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+    return train_fixer(run_of(data, recipe_of("omnidreams")), tmp_path_factory.mktemp("arms") / "student")
+
+
+QUICK = ("self-forcing",)  # it has the stages of the others; the adversarial head is tried by itself
+
+
+@pytest.mark.parametrize("recipe", [pytest.param(r, id=r.name, marks=() if r.name in QUICK else pytest.mark.slow) for r in CAUSAL_ARMS])
+def test_an_arm_trains_resumes_and_drives(data: Path, tmp_path: Path, recipe: Recipe) -> None:  # noqa: F811
+    run = run_of(data, recipe)
+    whole = train_fixer(run, tmp_path / "whole")
+    last = recipe.stages[-1].updates(STEPS)
+    stopped = train_fixer(run, tmp_path / "cut", stop_at=run.updates - last + 1)  # within the last stage
+    assert json.loads(stopped.with_suffix(".card.json").read_text())["curves"][-1]["step"] == 1
+    again = train_fixer(run, tmp_path / "cut")
+    assert stopped == again
+    one, other = (load_weights(path.with_name(STATE_FILE)) for path in (whole, again))
+    assert all(torch.equal(value, other[key]) for key, value in one.items())
+    for stage in recipe.stages[:-1]:
+        one, other = (load_weights(tmp_path / folder / stage.name / STATE_FILE) for folder in ("whole", "cut"))
+        assert all(torch.equal(value, other[key]) for key, value in one.items())
+    session = deployed(whole)
+    assert session.label.startswith(f"{recipe.fixer}, {recipe.name}, {last} updates")
+    frames = moving_picture(9)
+    fixed = pixels(run_blocks(session, frames, maps_of(frames)))
+    assert np.abs(fixed.astype(int) - pixels(frames)).max() > 0
+    assert deployed(whole, steps=4).label.startswith(f"{recipe.fixer}@4")
+
+
+def test_the_bundle_carries_what_the_network_sees(data: Path, tmp_path: Path) -> None:  # noqa: F811
+    recipe = replace(recipe_of("artifixer-pre"), stages=(replace(recipe_of("artifixer-pre").stages[0], name="only"),))
+    session = deployed(train_fixer(run_of(data, recipe), tmp_path / "run"))
+    settings = session.settings
+    assert (settings.uses_map, settings.no_map, settings.opacity_input) == (False, "nothing", True)
+    assert (settings.block_latents, settings.window, settings.history) == (4, 4, "last-forward")
+    assert session.networks.dit.sizes.opacity_channels == 16
+    frames = moving_picture(13)
+    opaque = [replace(frame, alpha=np.ones_like(frame.alpha)) for frame in frames]
+    a, b = (pixels(run_blocks(fixer(settings), clip, maps_of(clip))) for clip in (frames, opaque))
+    assert (a != b).any()
+
+
+@pytest.mark.slow
+def test_given_weights_take_a_stages_place_and_the_student_moves_in_its_updates_alone(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811
+    recipe = recipe_of("self-forcing")
+    run = run_of(data, recipe, student=student, teacher=student)
+    assert [stage.name for stage in run.stages()] == ["dmd"]
+    first = load_weights(train_fixer(run, tmp_path / "run", stop_at=1).with_name(STATE_FILE))
+    path = train_fixer(run, tmp_path / "run")
+    assert not (tmp_path / "run" / "student").exists()
+    second = load_weights(path.with_name(STATE_FILE))
+    moved = {key.split(".")[1] for key in first if key.startswith("weight.") and not torch.equal(first[key], second[key])}
+    assert moved == {"fake"}, "the second update trains the critic alone"
+    assert all(torch.equal(first[key], second[key]) for key in first if key.startswith("average.dit"))
+    facts = json.loads(path.with_suffix(".card.json").read_text())["training"]
+    assert facts["start"]["dit"] == facts["start"]["real"]
+    assert len(facts["start"]["dit"]) == 32
+    rows = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert "normaliser_min" in rows[0], "the student is trained in the first update"
+    assert "normaliser_min" not in rows[1], "and then in every fifth"
+    assert all("critic" in row for row in rows)
+    with pytest.raises(InputError, match="no weights of that name"):
+        run_of(data, recipe, pupil=student)
+    less = train_fixer(run_of(data, recipe_of("omnidreams")), tmp_path / "less", stop_at=1)
+    with pytest.raises(InputError, match="it was begun as"):
+        train_fixer(run_of(data, recipe, student=student, teacher=less), tmp_path / "run")
+
+
+@pytest.mark.parametrize(("same", "rollouts"), [(True, 1), (False, 2)])
+def test_the_critic_judges_the_students_rollout_or_one_of_its_own(
+    data: Path,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    same: bool,
+    rollouts: int,
+) -> None:
+    recipe = recipe_of("self-forcing")
+    stage = replace(recipe.stages[-1], objective=Distillation(same_rollout=same))
+    run = run_of(data, recipe)
+    task = stage.objective.task(stage_inputs(run, stage, clips_of(data, tmp_path), {}, None))
+    made: list[torch.Tensor] = []
+    judged: list[torch.Tensor] = []
+    roll_out, critic = task.roll_out, task._critic_loss
+    monkeypatch.setattr(task, "roll_out", lambda *args: made.append(roll_out(*args)) or made[-1])
+    monkeypatch.setattr(task, "_critic_loss", lambda z, *args: judged.append(z) or critic(z, *args))
+    batch = task.batch(0)
+    task.loss(batch, 0)
+    assert len(made) == rollouts
+    assert torch.equal(judged[0], made[-1])
+    assert not judged[0].requires_grad
+    assert batch.student is not None
+    assert not torch.equal(batch.student.score, batch.critic.score)
+    assert task.batch(1).student is None
+
+
+def test_a_head_that_no_longer_teaches_stops_its_run(data: Path, student: Path, tmp_path: Path) -> None:  # noqa: F811
+    recipe = recipe_of("one-forcing")
+    strict = replace(recipe.stages[-1], objective=Distillation(adversarial=AdversarialTerm(most=0.0)))
+    run = run_of(data, replace(recipe, stages=(*recipe.stages[:-1], strict)), student=student, teacher=student)
+    with pytest.raises(InfrastructureError, match="no longer teaches"):
+        train_fixer(run, tmp_path / "run")
+
+
+@pytest.mark.parametrize("name", [recipe.name for recipe in CAUSAL_ARMS])
+def test_without_weights_an_arm_says_what_trains_it(name: str) -> None:
+    with pytest.raises(InputError, match=f"simrun train fixer .* --recipe {name}"):
+        load_networks(arm_settings(name))
+
+
+def test_objectives_can_be_changed_by_field() -> None:
+    four = with_objective(recipe_of("one-forcing"), ["steps=4", "dmd.gradient_latents=null", "teacher.shift=5"])
+    teacher, student, dmd = (stage.objective for stage in four.stages)
+    assert (dmd.steps, dmd.gradient_latents, dmd.adversarial) == (4, None, AdversarialTerm())
+    assert (teacher.shift, student.shift) == (5.0, 1.0)
+    shown = with_objective(recipe_of("artifixer"), ["tail_drop=null", "causal.tail_drop={whole: 0.2}"])
+    assert [stage.objective.tail_drop for stage in shown.stages] == [None, TailDrop(0.2), None]
+    for text in ("steps", "step=4", "student.steps=4"):
+        with pytest.raises(InputError, match=r"no such field[\s\S]*dmd\.steps"):
+            with_objective(recipe_of("self-forcing"), [text])
+    with pytest.raises(InputError, match="not a value of steps"):
+        with_objective(recipe_of("self-forcing"), ["steps=many"])
+
+
+def test_recipes_that_do_not_fit_together_are_refused() -> None:
+    stage = recipe_of("omnidreams").stages[0]
+    with pytest.raises(InputError, match="starts from nowhere"):
+        Recipe("odd", "", (replace(stage, start={"dit": "nowhere.dit"}),))
+    with pytest.raises(InputError, match="already"):
+        by_name([recipe_of("V9"), recipe_of("V9")])
+    assert Stage("half", stage.objective, share=0.5).updates(5) == 2

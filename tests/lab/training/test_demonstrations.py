@@ -1,0 +1,169 @@
+"""Demonstrations of the learned policy: drawn the same every time, kept once made, and enough to learn from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import yaw_of
+from alpasim_plugin.core.types import Trajectory
+from alpasim_plugin.lab.cli.train import app
+from alpasim_plugin.lab.training.demonstrations import (
+    DEMONSTRATIONS_FILE,
+    DemonstrationRecipe,
+    Demonstrations,
+    read_demonstrations,
+    rotated_about_camera,
+    wide_camera,
+    write_demonstrations,
+)
+from alpasim_plugin.lab.training.perturbed_rollouts import perturbed_rollouts, traffic_at, turning_lines
+from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
+from alpasim_plugin.lab.training.trainer import Schedule, Trainer
+from policies.learned_command import COMMANDS
+from policies.learned_net import LearnedNet, load_net
+from scenarios.load import load_scenario
+
+BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
+QUICK = DemonstrationRecipe(drives=1, drive_s=1.6, headings=3)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return load_scenario("smoke/lead_car", overrides=BARE)
+
+
+@pytest.fixture(scope="module")
+def root(scenario, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("demonstrations")
+    assert write_demonstrations(scenario, folder / "train" / "lead_000", QUICK, 0)
+    return folder
+
+
+def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root: Path) -> None:
+    folder = root / "train" / "lead_000"
+    before = (folder / "frames.npy").stat().st_mtime_ns
+    assert not write_demonstrations(scenario, folder, QUICK, 0)
+    assert (folder / "frames.npy").stat().st_mtime_ns == before
+    first, other = Demonstrations(folder), root / "other"
+    write_demonstrations(scenario, other, QUICK, 0)
+    for name, array in first.arrays.items():
+        np.testing.assert_array_equal(array, Demonstrations(other).arrays[name])
+    assert write_demonstrations(scenario, other, QUICK, 1)
+    assert not np.array_equal(Demonstrations(other).arrays["yaw"], first.arrays["yaw"])
+
+
+def test_sample_has_a_frame_a_state_and_a_target(root: Path) -> None:
+    (demonstrations,) = read_demonstrations(root, "train")
+    a = demonstrations.arrays
+    assert len(demonstrations) == len(a["frame"]) == 3 * len(a["frames"]) == 12
+    assert a["frames"].shape[1:] == (114, 352, 3)
+    assert np.abs(a["yaw"]).max() <= np.deg2rad(8.5) + 1e-6
+    assert (a["yaw"][::3] == 0).all()
+    assert (a["before"] <= a["frame"]).all()
+    assert set(a["command"].tolist()) == {COMMANDS.index("keep")}
+    # A car rotated_about_camera to the left of its road is led to the right.
+    turn, heading = (x.reshape(-1, 3) - x.reshape(-1, 3).mean(axis=1, keepdims=True) for x in (a["yaw"], a["headings"][:, -1]))
+    assert np.corrcoef(turn.ravel(), heading.ravel())[0, 1] < -0.7
+
+
+def test_missing_and_damaged_demonstrations_are_named(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no complete scene"):
+        read_demonstrations(root, "val")
+    broken = tmp_path / "train" / "a"
+    broken.mkdir(parents=True)
+    (broken / DEMONSTRATIONS_FILE).write_text((root / "train" / "lead_000" / DEMONSTRATIONS_FILE).read_text())
+    np.save(broken / "frames.npy", np.zeros((2, 3)))
+    with pytest.raises(InputError, match=r"float64 with 2 axes"):
+        _ = read_demonstrations(tmp_path, "train")[0].arrays
+
+
+def test_turning_leaves_the_camera_where_it_is(scenario) -> None:
+    camera = wide_camera(scenario.cameras[0])
+    T = np.array([[0.6, -0.8, 0, 5], [0.8, 0.6, 0, 7], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    after = rotated_about_camera(T, camera, 0.1)
+    np.testing.assert_allclose((after @ camera.T_rig_camera)[:3, 3], (T @ camera.T_rig_camera)[:3, 3], atol=1e-12)
+    assert yaw_of(after) - yaw_of(T) == pytest.approx(0.1)
+
+
+def test_every_turn_of_a_junction_has_a_rollout() -> None:
+    scenario = load_scenario("urban/junction_straight", overrides=BARE)
+    lines = turning_lines(scenario)
+    bends = sorted(round(float(np.degrees(path.yaw[-1] - path.yaw[0]))) for path, _ in lines)
+    assert bends == [-90, 90]
+    for path, begins_m in lines:
+        before = path.yaw[path.s < begins_m - 0.5]
+        assert np.ptp(before) < 0.02
+    drives = list(perturbed_rollouts(scenario, 3, 3.0, 0))
+    turned_by = [np.degrees(d.line.path.yaw[-1] - d.line.path.yaw[0]) for d in drives]
+    assert sorted(np.round(turned_by)) == [-90, 0, 90]
+
+
+def test_who_appears_at_this_instant_moves_as_the_log_shows_it_next(scenario) -> None:
+    actor = next(a for a in scenario.actors if np.linalg.norm(np.ptp(a.track.xyz[:, :2], axis=0)) > 5.0)
+    late = replace(actor, track=Trajectory(actor.track.t_us[10:], actor.track.xyz[10:], actor.track.quat[10:]))
+    t_us = int(late.track.t_us[0])
+    _, seen = traffic_at(replace(scenario, actors=(late,)), t_us, None)
+    _, before = traffic_at(replace(scenario, actors=(actor,)), t_us, None)
+    assert np.linalg.norm(before.velocity) > 1.0
+    np.testing.assert_allclose(seen.velocity, before.velocity, atol=0.5)
+
+
+def test_drives_leave_the_path_and_meet_others(scenario) -> None:
+    drives = list(perturbed_rollouts(scenario, 12, 3.0, 0))
+    lateral = np.array([d.line.path.project(m.T_world_rig[None, :2, 3])[1][0] for d in drives for m in d.states])
+    assert 0.3 < np.abs(lateral).mean() < 1.0
+    assert np.abs(lateral).max() < 1.85
+    slow = [m.speed_mps < 0.7 * d.style.desired_mps for d in drives for m in d.states]
+    assert 0.05 < np.mean(slow) < 0.6
+    assert np.mean([m.collision_free for d in drives for m in d.states]) > 0.9
+
+
+@pytest.mark.slow
+def test_batches_depend_on_their_number_alone_and_can_be_learned(root: Path, tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    task = PolicyTask(LearnedNet(0), read_demonstrations(root, "train"), PolicyRecipe(batch=6, brightness_jitter=0.0))
+    first, again, other = task.batch(3), task.batch(3), task.batch(4)
+    assert torch.equal(first.image, again.image)
+    assert not torch.equal(first.image, other.image)
+    before = measure(task)
+    Trainer(task.net, tmp_path, Schedule(60, peak_lr=2e-3, warmup=5), task.batch, task.loss, task.facts).run()
+    after = measure(task)
+    assert after["lateral_16m_m"] < 0.6 * before["lateral_16m_m"]
+    assert after["speed_mps"] < 0.8 * before["speed_mps"]
+
+
+def test_sigma_sends_no_gradient_into_the_plan(root: Path) -> None:
+    """The likelihood term must train sigma alone."""
+
+    def gradients(sigma: float) -> tuple[torch.Tensor, torch.Tensor]:
+        net = LearnedNet(0)
+        torch.nn.init.normal_(net.out.weight, std=0.02, generator=torch.Generator().manual_seed(0))
+        torch.nn.init.constant_(net.out.bias[-2:], sigma)
+        task = PolicyTask(net, read_demonstrations(root, "train"), PolicyRecipe(batch=4))
+        task.loss(task.batch(0), 0)[0].backward()
+        assert net.out.weight.grad is not None
+        return net.out.weight.grad[:-2], net.out.weight.grad[-2:]
+
+    (plan, sigma), (plan_again, other_sigma) = gradients(0.0), gradients(1.5)
+    assert torch.equal(plan, plan_again)
+    assert not torch.allclose(sigma, other_sigma)
+
+
+def test_commands_train_a_policy_that_can_be_loaded(root: Path, tmp_path: Path) -> None:
+    run = CliRunner().invoke(app, ["policy", str(root), "--out", str(tmp_path / "run"), "--steps", "2"])
+    assert run.exit_code == 0, run.output
+    load_net(tmp_path / "run" / "learned.safetensors")
+    card = json.loads((tmp_path / "run" / "learned.json").read_text())
+    assert card["data"]["scenes"] == {"lead": 1}
+    assert card["steps"] == 2
+    assert card["parameters"] < 600_000
+    refused = CliRunner().invoke(app, ["policy-data", str(root), "--out", str(tmp_path), "--split", "test-known"])
+    assert isinstance(refused.exception, InputError)

@@ -1,0 +1,213 @@
+"""DMD: the direction is a divergence's gradient, scales do not matter, and gradients go where each paper sends them and nowhere else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
+from alpasim_plugin.lab.training.causal_rollout import causal_rollout
+from alpasim_plugin.lab.training.distillation import ScoreNet
+from alpasim_plugin.lab.training.dmd import critic_loss, direction, generator_loss, noised, score_levels
+from alpasim_plugin.lab.training.flow_matching import FlowMatching, bell_weight, noise_levels
+from alpasim_plugin.lab.training.recipes.causal_arms import long_blocks
+from alpasim_plugin.lab.training.recipes.recipe import Attention
+from alpasim_plugin.lab.training.shared_rollout import Sample
+from alpasim_plugin.lab.training.tail_drop import TailDrop, visible_share
+from alpasim_plugin.nets import CosmosCausalDiT
+from alpasim_plugin.nets.init import initial_weights
+from alpasim_plugin.nets.schedule import steps
+from alpasim_plugin.nets.sizes import DiTSizes
+
+N = 4
+TEXT = torch.zeros(1, 1, 8)
+
+
+def noise(name: str, *shape: int) -> Tensor:
+    return torch.from_numpy(stream("dmd", 0, name).standard_normal(shape)).float()
+
+
+@pytest.fixture(scope="module")
+def net() -> CosmosCausalDiT:
+    sizes = DiTSizes(width=24, blocks=2, head_width=12, mlp_width=32, adaln_rank=4, text_width=8, context_width=8)
+    weights = initial_weights(sizes, 0)
+    key = "final_layer.adaln_modulation.2.weight"
+    return CosmosCausalDiT.from_state_dict({**weights, key: 0.05 * noise(key, *weights[key].shape)})
+
+
+class Gaussian:
+    """A normal distribution of clean latents and the exact velocity of its noised samples."""
+
+    def __init__(self, mean: float, std: float) -> None:
+        self.mean, self.std = mean, std
+
+    def __call__(self, x: Tensor, sigma: Tensor) -> Tensor:
+        s = sigma[:, None, None, None, None].double()
+        variance = (1 - s) ** 2 * self.std**2 + s**2
+        z_0 = self.mean + (1 - s) * self.std**2 / variance * (x - (1 - s) * self.mean)  # E[z | x]
+        return (x - z_0) / s
+
+    def noised(self, sigma: float) -> tuple[float, float]:
+        """Return mean and deviation of the noised samples."""
+        return (1 - sigma) * self.mean, math.hypot((1 - sigma) * self.std, sigma)
+
+
+def divergence(a: Gaussian, b: Gaussian, sigma: float) -> float:
+    """Return KL(a, b) of the noised distributions."""
+    (ma, sa), (mb, sb) = a.noised(sigma), b.noised(sigma)
+    return math.log(sb / sa) + (sa**2 + (ma - mb) ** 2) / (2 * sb**2) - 0.5
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 0.9])
+def test_the_direction_is_the_gradient_of_the_divergence_from_the_student_to_the_teacher(sigma: float) -> None:
+    """With z = mean + std a, the gradient of KL to the mean is E[(score_F - score_R)(1 - sigma)], score = ((1-sigma) x0 - x) / sigma^2."""
+    fake, real, h = Gaussian(0.7, 0.5), Gaussian(-0.4, 1.2), 1e-5
+    a, n = noise("a", 64, 1, 1, 1, 1).double(), noise("n", 64, 1, 1, 1, 1).double()
+    a, n = torch.cat([a, -a, a, -a]), torch.cat([n, n, -n, -n])  # means of linear functions are then exact
+    levels = torch.full((len(a),), sigma, dtype=torch.float64)
+    z = fake.mean + fake.std * a
+    g, normaliser = direction(real, fake, z, n, levels)
+    plain = g * normaliser[:, None, None, None, None]
+    found = float(plain.mean()) * (1 - sigma) ** 2 / sigma**2
+    ahead, behind = (divergence(Gaussian(fake.mean + d, fake.std), real, sigma) for d in (h, -h))
+    assert found == pytest.approx((ahead - behind) / (2 * h), rel=1e-6)
+    mean = torch.tensor(fake.mean, dtype=torch.float64, requires_grad=True)
+    generator_loss(mean + fake.std * a, g).backward()
+    assert float(mean.grad) == pytest.approx(float(g.mean()), rel=1e-9)
+
+
+def test_scaling_latents_and_predictions_leaves_the_direction() -> None:
+    z, n, sigma = (
+        noise("z", 3, 2, 4, 2, 2).double(),
+        noise("n", 3, 2, 4, 2, 2).double(),
+        score_levels(torch.tensor([0.1, 0.5, 0.9])).double(),
+    )
+    real, fake = noise("real", *z.shape).double(), noise("fake", *z.shape).double()
+
+    def seeing(z_0: Tensor, scale: float) -> Tensor:
+        """Return g where the scores see ``z_0`` behind whatever is given, all at a scale."""
+        s = sigma[:, None, None, None, None]
+        scores = [lambda x, _, z_0=z_0: (x - scale * z_0) / s for z_0 in (real, fake)]
+        return direction(scores[0], scores[1], scale * z, scale * n, sigma).g
+
+    torch.testing.assert_close(seeing(z, 7.0), seeing(z, 1.0), rtol=1e-9, atol=1e-12)
+    s = sigma[:, None, None, None, None]
+    still = direction(lambda x, _: (x - z) / s, lambda x, _: (x - fake) / s, z, n, sigma)
+    assert float(still.normaliser.max()) < 1e-9
+    assert torch.isfinite(still.g).all(), "the floor holds where the teacher sees the student's own latents"
+
+
+def test_both_scores_see_the_same_noised_latents_and_the_critic_sends_no_gradient_to_the_student() -> None:
+    seen: list[Tensor] = []
+
+    def score(x: Tensor, sigma: Tensor) -> Tensor:
+        seen.append(x)
+        return torch.zeros_like(x)
+
+    z, n, sigma = noise("z", 2, 2, 4, 2, 2).requires_grad_(True), noise("n", 2, 2, 4, 2, 2), torch.tensor([0.3, 0.6])
+    direction(score, score, z, n, sigma)
+    assert torch.equal(seen[0], seen[1])
+    torch.testing.assert_close(seen[0], noised(z, n, sigma))
+    weight = torch.tensor(0.5, requires_grad=True)
+    loss = critic_loss(lambda x, s: weight * x, z, n, sigma)
+    torch.testing.assert_close(loss, (0.5 * noised(z, n, sigma) - (n - z)).square().mean())
+    loss.backward()
+    assert z.grad is None
+    assert weight.grad is not None
+
+
+def test_levels_of_the_scores_are_the_tables_and_bounded() -> None:
+    levels = score_levels(torch.tensor([0.0, 0.0015, 0.5004, 0.9999]))
+    torch.testing.assert_close(levels, torch.tensor([0.02, 0.02, 5 * 0.5 / 3, 0.98]), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("history", "crosses"), [("finalise", False), ("last-forward", True)])
+def test_gradients_cross_blocks_where_the_history_is_the_last_forward(net: CosmosCausalDiT, history: str, crosses: bool) -> None:
+    z_1 = noise("z_1", 1, 16, N, 4, 4).requires_grad_(True)
+    second = noise("second", 1, 16, N, 4, 4)
+    made = causal_rollout(
+        net, [second, z_1], steps(2), noise("context", *z_1.shape), TEXT, torch.zeros_like(second), Attention(2, 4, 0, history)
+    )  # the exit step's source enters without the first step's prediction
+    reached = torch.autograd.grad(made[:, :, 2:].square().sum(), z_1, allow_unused=True)[0]
+    assert reached is None, "steps before the exit, and their renoising, carry no gradient"
+    one = causal_rollout(net, [z_1], steps(1), noise("context", *z_1.shape), TEXT, torch.zeros_like(second), Attention(2, 4, 0, history))
+    (reached,) = torch.autograd.grad(one[:, :, 2:].square().sum(), z_1)
+    assert float(reached[:, :, 2:].abs().max()) > 0
+    assert (float(reached[:, :, :2].abs().max()) > 0) == crosses
+
+
+def test_gradients_are_those_of_the_last_latents_alone_and_values_are_the_deployed_ones(net: CosmosCausalDiT) -> None:
+    z_1, context = noise("z_1", 1, 16, N, 4, 4).requires_grad_(True), noise("context", 1, 16, N, 4, 4)
+    args = steps(1), context, TEXT, torch.zeros_like(context), Attention(2, 4, 0, "finalise")
+    made = causal_rollout(net, [z_1], *args, gradient_latents=2)
+    (reached,) = torch.autograd.grad(made.square().sum(), z_1)
+    assert [float(reached[:, :, i].abs().max()) > 0 for i in range(N)] == [False, False, True, True]
+    with torch.no_grad():
+        torch.testing.assert_close(made, causal_rollout(net, [z_1], *args), rtol=0, atol=0)
+
+
+def test_the_head_judges_frozen_trunks_for_the_student_and_trains_them_for_the_critic(net: CosmosCausalDiT) -> None:
+    term = AdversarialTerm(heads=2, inner=8)
+    head, score = AdversarialHead(24, 1, 2, 8, seed=0), ScoreNet(net, TEXT, term.taps)
+    x, sigma, condition = noise("x", 2, 16, N, 4, 4).requires_grad_(True), torch.tensor([0.2, 0.7]), torch.zeros(2, 16, N, 4, 4)
+    v = score(x, sigma, condition, frozen=True)
+    torch.testing.assert_close(v, net(x, 1000 * sigma[:, None], TEXT, condition, block_latents=None))
+    score(x, sigma, condition, frozen=True)
+    term.generator(head(score.features)).backward()
+    assert float(x.grad.abs().max()) > 0
+    assert all(p.grad is None for p in net.parameters())
+
+    def logits(x: Tensor) -> Tensor:
+        score(x, sigma, condition)
+        return head(score.features)
+
+    fake = x.detach() + 1
+    xi = noise("xi", *x.shape)
+    loss, real = term.critic(logits, x.detach(), fake, logits(fake), xi)
+    plain, _ = replace(term, r1=0.0, r2=0.0).critic(logits, x.detach(), fake, logits(fake), xi)
+    r1 = (logits(x.detach() + 0.1 * xi) - real).square().mean()
+    r2 = 0.5 * 0.001 * ((logits(fake + 0.01 * xi) - logits(fake)) / 0.01).square().mean()
+    torch.testing.assert_close(loss, plain + r1 + r2)
+    loss.backward()
+    assert all(p.grad is not None for p in head.parameters())
+    assert net.blocks[0].self_attn.q_proj.weight.grad is not None
+    net.zero_grad(set_to_none=True)
+    assert head(score.features).shape == (2,)
+
+
+def test_the_tail_drop_shows_forty_five_percent_on_average() -> None:
+    assert visible_share(TailDrop(), 93, 20_000) == pytest.approx(0.45, abs=0.01)
+    ones = torch.ones(64, 16, 6, 2, 2)
+    sample = Sample(ones, ones, torch.cat([ones, ones], dim=1), ones[:, :1], ones, ones, ones[:, 0, :, 0, 0], ones[:, 0, :, 0, 0], 0)
+    hidden = TailDrop()(sample, 0, 0)
+    shown = hidden.m[:, 0, :, 0, 0]
+    assert (shown[:, 1:] <= shown[:, :-1]).all(), "hidden from some latent on"
+    assert {0.0, 6.0} < set(shown.sum(dim=1).tolist())
+    assert torch.equal(hidden.condition[:, 16, :, 0, 0], shown)
+    assert (hidden.condition[:, :16] == 1).all(), "the map stays"
+
+
+def test_times_are_one_a_latent_a_block_or_a_clip_and_the_bell_has_mean_one() -> None:
+    t = torch.from_numpy(stream("dmd", 0, "t").random((3, 8))).float()
+    z = torch.zeros(3, 16, 8, 2, 2)
+    sample = Sample(z, z, z, z[:, :1], z, z, t, t, 0)
+    drawn = {times: noise_levels(FlowMatching(times), sample, Attention(2), 0, 0)[0] for times in ("latent", "block", "clip")}
+    assert torch.equal(drawn["latent"], t)
+    assert torch.equal(drawn["block"], t[:, [0, 0, 2, 2, 4, 4, 6, 6]])
+    assert torch.equal(drawn["clip"], t[:, :1].expand(3, 8))
+    shifted = noise_levels(FlowMatching("clip", shift=5.0), sample, Attention(2), 0, 0)[0]
+    torch.testing.assert_close(shifted, 5 * drawn["clip"] / (1 + 4 * drawn["clip"]))
+    u = 1 - torch.arange(1000, dtype=torch.float64) / 1000
+    weights = bell_weight(5 * u / (1 + 4 * u))
+    assert float(weights.mean()) == pytest.approx(1.0, abs=1e-6)
+    assert float(weights.min()) == pytest.approx(0.0, abs=1e-6)
+    assert weights.argmax() == (5 * u / (1 + 4 * u) - 0.5).abs().argmin()
+
+
+def test_blocks_of_the_long_block_arm() -> None:
+    assert [long_blocks(n) for n in (24, 12)] == [Attention(6, 18, 6, "last-forward"), Attention(4, 12, 4, "last-forward")]

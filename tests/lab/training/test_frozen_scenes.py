@@ -1,0 +1,80 @@
+"""The frozen test scenes: what is drawn today is what was frozen, and any change is noticed."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.lab.training.frozen_scenes import RECORD, check_scenes, freeze_scenes, hash_scenes
+from alpasim_plugin.lab.training.scenes import SPLITS, TEST_SPLITS, write_scenes
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> Path:
+    for split in TEST_SPLITS:
+        (tmp_path / "scenes" / split).mkdir(parents=True)
+        for name in ("a", "b"):
+            (tmp_path / "scenes" / split / f"{name}.yaml").write_text(f"scene_id: {split}-{name}\n")
+    return tmp_path / "scenes"
+
+
+def test_frozen_scenes_pass_their_check(scenes: Path, tmp_path: Path) -> None:
+    record = tmp_path / "record.json"
+    frozen = freeze_scenes(scenes, record)
+    assert check_scenes(scenes, record) == frozen
+    assert len({split.sha256 for split in frozen.values()}) == len(TEST_SPLITS)
+
+
+def test_a_changed_a_missing_and_a_further_scene_are_each_noticed(scenes: Path, tmp_path: Path) -> None:
+    record, one = tmp_path / "record.json", scenes / TEST_SPLITS[1] / "b.yaml"
+    freeze_scenes(scenes, record)
+    before = one.read_text()
+    one.write_text(before + "seed: 1\n")
+    with pytest.raises(InputError, match="1 differ: b"):
+        check_scenes(scenes, record)
+    one.unlink()
+    with pytest.raises(InputError, match="1 differ: b"):
+        check_scenes(scenes, record)
+    one.write_text(before)
+    (one.parent / "c.yaml").write_text("scene_id: c\n")
+    with pytest.raises(InputError, match="1 differ: c"):
+        check_scenes(scenes, record)
+
+
+def test_a_record_is_never_written_over(scenes: Path, tmp_path: Path) -> None:
+    record = tmp_path / "record.json"
+    freeze_scenes(scenes, record)
+    with pytest.raises(InputError, match="it exists"):
+        freeze_scenes(scenes, record)
+
+
+def test_a_record_that_cannot_be_read_is_said(scenes: Path, tmp_path: Path) -> None:
+    for text in ("{", '{"test-known": {"sha256": "x"}}', "[1]"):
+        (tmp_path / "record.json").write_text(text)
+        with pytest.raises(InputError, match="give the record"):
+            check_scenes(scenes, tmp_path / "record.json")
+
+
+def test_command_freezes_and_checks(scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record = ["--record", str(tmp_path / "record.json")]
+    assert run_command(["train", "check-scenes", str(scenes), *record, "--freeze"]) == 0
+    assert run_command(["train", "check-scenes", str(scenes), *record, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["test-known"] == hash_scenes(scenes / "test-known").sha256
+    assert run_command(["train", "check-scenes", str(scenes)]) != 0  # these are not the shipped ones
+
+
+def test_first_scene_of_each_split_is_drawn_as_it_was_frozen(tmp_path: Path) -> None:
+    known = json.loads(RECORD.read_text())
+    for split in TEST_SPLITS:
+        assert len(known[split]["scenes"]) == SPLITS[split].count
+        (path,) = write_scenes(tmp_path, split, 1, SPLITS[split].duration_s)
+        assert hash_scenes(path.parent).scenes[path.stem] == known[split]["scenes"][path.stem]
+
+
+@pytest.mark.slow
+def test_all_test_scenes_are_drawn_as_they_were_frozen(tmp_path: Path) -> None:
+    for split in TEST_SPLITS:
+        list(write_scenes(tmp_path, split, SPLITS[split].count, SPLITS[split].duration_s))
+    check_scenes(tmp_path)

@@ -1,0 +1,65 @@
+"""The term sees patterns of the cells and nothing else: noise, blur and edges do not count, and it falls by its own gradient."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from alpasim_plugin.lab.training.grid_term import grid_term
+
+SIDE = 96
+
+
+def picture(seed: int = 0) -> Tensor:
+    """A smooth picture with an edge, ``(2, 2, 96, 96, 3)``."""
+    rng = np.random.default_rng(seed)
+    coarse = torch.from_numpy(rng.uniform(-0.1, 0.1, (4, 3, 12, 12)).astype(np.float32))
+    smooth = functional.interpolate(coarse, size=(SIDE, SIDE), mode="bicubic", align_corners=False)
+    smooth[..., 37:] += 0.4
+    fine = torch.from_numpy(rng.normal(0, 0.003, smooth.shape).astype(np.float32))
+    return (smooth + fine).permute(0, 2, 3, 1).unflatten(0, (2, 2))
+
+
+def pattern(period: int, size: float) -> Tensor:
+    """A line at every border of a cell, in columns and rows."""
+    line = (torch.arange(SIDE) % period == 0).float() * size
+    return (line[:, None] + line[None, :])[None, None, :, :, None]
+
+
+def test_the_truth_has_none() -> None:
+    assert float(grid_term(picture(), picture())) == 0
+
+
+@pytest.mark.parametrize("period", [4, 16])
+def test_it_grows_with_a_pattern_of_a_cell(period: int) -> None:
+    truth = picture()
+    found = [float(grid_term(truth + pattern(period, size), truth)) for size in (0.0, 0.005, 0.01, 0.02)]
+    assert found == sorted(found)
+    assert found[-1] > 0.02
+
+
+def test_blur_noise_and_contrast_count_little() -> None:
+    truth = picture()
+    marked = float(grid_term(truth + pattern(4, 0.02), truth))
+    flat = truth.flatten(0, 1).permute(0, 3, 1, 2)
+    blurred = functional.avg_pool2d(functional.pad(flat, (1, 1, 1, 1), mode="replicate"), 3, 1).permute(0, 2, 3, 1).unflatten(0, (2, 2))
+    noisy = truth + 0.003 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
+    for other in (blurred, noisy, 0.8 * truth):
+        assert float(grid_term(other, truth)) < 0.35 * marked
+
+
+def test_its_gradient_removes_the_pattern() -> None:
+    truth, size = picture(), torch.tensor(0.02, requires_grad=True)
+    (gradient,) = torch.autograd.grad(grid_term(truth + pattern(4, 1.0) * size, truth), size)
+    assert float(gradient) > 0
+
+
+def test_streams_count_one_by_one_and_a_flat_picture_is_finite() -> None:
+    truth = picture()
+    made = truth + pattern(4, 0.02)
+    alone = torch.stack([grid_term(made[b : b + 1], truth[b : b + 1]) for b in range(2)]).mean()
+    torch.testing.assert_close(grid_term(made, truth), alone)
+    flat = torch.zeros(1, 1, 32, 32, 3, requires_grad=True)
+    (gradient,) = torch.autograd.grad(grid_term(flat, torch.zeros(1, 1, 32, 32, 3)), flat)
+    assert bool(torch.isfinite(gradient).all())

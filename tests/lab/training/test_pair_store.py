@@ -1,0 +1,120 @@
+"""Pairs on disk: whole or not there, readable while more are written, refused when damaged."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.lab.training.pair_store import CHANNELS, OPEN_CLIPS, Pair, PairDataset, PairSequence, write_sequence
+from tests.lab.training.pair_files import make, pair
+
+
+def test_sequence_comes_back_as_memory_maps_with_every_value(tmp_path: Path) -> None:
+    clip = make(tmp_path).clip
+    assert len(clip) == 12
+    for i in (0, 7, 11):
+        for name, value in pair(i)._asdict().items():
+            np.testing.assert_array_equal(getattr(clip, name)[i], value)
+    assert all(isinstance(getattr(clip, name), np.memmap) for name in CHANNELS)
+    with pytest.raises(ValueError, match="read-only"):
+        clip.rgb_gt[0, 0, 0] = 1
+
+
+def test_fewer_frames_than_announced_leave_true_headers(tmp_path: Path) -> None:
+    write_sequence(tmp_path / "train" / "short", (pair(i) for i in range(5)), 9, {})
+    sequence = PairSequence(tmp_path / "train" / "short")
+    assert sequence.clip.rgb_gt.shape == (5, 32, 48, 3)
+    assert sequence.info["frames"] == 5
+    np.testing.assert_array_equal(sequence.clip.rgb_gt[4], pair(4).rgb_gt)
+
+
+def test_sequence_is_as_long_as_its_shortest_channel(tmp_path: Path) -> None:
+    sequence = make(tmp_path)
+    np.save(sequence.folder / "opacity.npy", np.load(sequence.folder / "opacity.npy")[:8])
+    assert len(PairSequence(sequence.folder).clip) == 8
+
+
+def test_failure_in_the_middle_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> None:
+    before = make(tmp_path)
+
+    def breaks() -> object:
+        yield pair(0)
+        raise RuntimeError("renderer fell over")
+
+    with pytest.raises(RuntimeError):
+        write_sequence(before.folder, breaks(), 9, {})
+    assert [p.name for p in before.folder.parent.iterdir()] == ["a"]
+    assert len(PairSequence(before.folder).clip) == 12
+
+
+def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_path: Path) -> None:
+    make(tmp_path, name="b")
+    unfinished = tmp_path / "train" / ".c.1.part"
+    unfinished.mkdir()
+    dataset = PairDataset(tmp_path, "train")
+    first = dataset.sequences[0].clip
+    make(tmp_path, name="a")
+    dataset.refresh()
+    assert [s.name for s in dataset.sequences] == ["a", "b"]
+    assert dataset.sequences[1].clip is first
+    with pytest.raises(InputError, match="no finished sequence"):
+        PairDataset(tmp_path, "val")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: (f / "sdmap.npy").unlink(), "sdmap.npy"),
+        (lambda f: np.save(f / "rgb_gt.npy", np.zeros((3, 8, 8, 3))), "float64 with 4 axes"),
+        (lambda f: np.save(f / "rgb_input.npy", np.zeros((12, 8, 8, 3), np.uint8)), "rgb_input is"),
+        (lambda f: np.save(f / "t_us.npy", np.zeros(0, np.int64)), "no frame that every channel has"),
+        (lambda f: (f / "opacity.npy").write_bytes(b"\x93NUMPY\x01\x00"), "opacity.npy"),
+    ],
+)
+def test_damaged_channel_is_named(tmp_path: Path, damage: object, message: str) -> None:
+    folder = make(tmp_path).folder
+    damage(folder)  # type: ignore[operator]
+    with pytest.raises(InputError, match=message):
+        _ = PairSequence(folder).clip
+
+
+def test_pickled_array_is_refused(tmp_path: Path) -> None:
+    folder = make(tmp_path).folder
+    np.save(folder / "rgb_gt.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match=r"rgb_gt\.npy"):
+        _ = PairSequence(folder).clip
+
+
+def test_frames_of_changing_size_are_refused(tmp_path: Path) -> None:
+    frames = [pair(0), Pair(*(v[:16] if i < 4 else v for i, v in enumerate(pair(1)[:4])), pair(1).T_world_camera, 5)]
+    with pytest.raises(InputError, match="frame 2 of 2"):
+        write_sequence(tmp_path / "train" / "x", frames, 2, {})
+
+
+def test_cut_beyond_the_end_is_refused(tmp_path: Path) -> None:
+    clip = make(tmp_path).clip
+    assert len(clip.cut(4, 8)) == 8
+    with pytest.raises(InputError, match="the sequence has 12"):
+        clip.cut(5, 8)
+
+
+def test_facts_are_plain_json(tmp_path: Path) -> None:
+    assert json.loads((make(tmp_path).folder / "sequence.json").read_text())["scene_id"] == "a"
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts the open files of the process")
+def test_many_sequences_are_read_with_few_open_files(tmp_path: Path) -> None:
+    first = make(tmp_path, name="0", frames=2, height=4, width=4)
+    for i in range(1, OPEN_CLIPS + 8):
+        shutil.copytree(first.folder, tmp_path / "train" / str(i))
+    before = len(os.listdir("/proc/self/fd"))
+    dataset = PairDataset(tmp_path, "train")
+    shown = [sequence.clip.rgb_gt[1, 0, 0, 0] for sequence in dataset.sequences]
+    assert len(shown) == OPEN_CLIPS + 8
+    assert len(set(map(int, shown))) == 1
+    assert len(os.listdir("/proc/self/fd")) - before <= OPEN_CLIPS * len(CHANNELS)
+    np.testing.assert_array_equal(dataset.sequences[0].clip.rgb_gt, first.clip.rgb_gt)

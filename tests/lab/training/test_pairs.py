@@ -1,0 +1,76 @@
+"""How a sequence of pairs is drawn and made: real renderers on a tiny street."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import Degradation, Environment, Scenario
+from alpasim_plugin.lab.training.pair_store import PairSequence
+from alpasim_plugin.lab.training.pairs import MOVING_M, PairRecipe, lateral_offsets, make_sequence
+from alpasim_plugin.renderers.gaussian import clear_cache
+from tests.gaussians.scene_maps import parked, straight, with_camera
+
+EMPTY = Environment(buildings=0.0, trees_per_100m=0.0, poles_spacing_m=0.0)
+
+
+@pytest.fixture
+def street(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scenario:
+    """Give 0.4 s of a bare street, 64 x 36 pixels, with a cache of its own."""
+    monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path / "cache"))
+    scenario = with_camera(straight(actors=(parked("car", 22.0, -1.8),), environment=EMPTY), 64, 36)
+    log = scenario.ego_log
+    log = replace(log, t_us=log.t_us[:4], xyz=log.xyz[:4], quat=log.quat[:4])
+    return replace(scenario, ego_log=log, end_us=400_000)
+
+
+def test_camera_drifts_beside_a_reconstruction_and_stays_on_the_path_of_a_cycle_render(street: Scenario) -> None:
+    def largest(scenario: Scenario) -> list[float]:
+        return [float(np.abs(lateral_offsets(scenario, PairRecipe(), seed)).max()) for seed in range(60)]
+
+    aside = largest(street)
+    assert max(aside) > 0.4
+    assert max(aside) <= 1.5
+    assert 4 <= aside.count(0.0) <= 22  # a fifth stays on the path
+    assert aside == largest(street) != largest(replace(street, scene_id="another"))
+    assert set(largest(replace(street, degradation=Degradation("cycle")))) == {0.0}
+
+
+def test_sequence_holds_both_renders_opacity_map_and_how_it_was_made(street: Scenario, tmp_path: Path) -> None:
+    recipe, folder = PairRecipe(), tmp_path / "pairs" / "val" / "s"
+    cycle = replace(street, degradation=Degradation("cycle", share=0.1))
+    assert make_sequence(cycle, folder, recipe, 0, split="val", family="street")
+    sequence = PairSequence(folder)
+    clip = sequence.clip
+    assert len(clip) == 5
+    assert clip.rgb_gt.shape == (5, 36, 64, 3)
+    error = np.abs(clip.rgb_input[0].astype(float) - clip.rgb_gt[0]).mean()
+    assert 1.0 < error < 40.0
+    assert clip.opacity[0, :4].mean() > 240  # the sky is filled
+    assert sequence.info["degradation"]["kind"] == "cycle"
+    assert sequence.info["moving_actors"] == 0
+    assert not make_sequence(cycle, folder, recipe, 0, split="val", family="street")
+    clear_cache()
+    other = replace(street, degradation=Degradation("surrogate"))
+    assert make_sequence(other, folder, recipe, 0, split="val", family="street")
+    assert json.loads((folder / "sequence.json").read_text())["degradation"]["kind"] == "surrogate"
+
+
+def test_actors_whose_tracks_are_long_count_as_moving(street: Scenario, tmp_path: Path) -> None:
+    car = street.actors[0]
+    track = replace(car.track, xyz=car.track.xyz + np.array([[0.0, 0, 0], [MOVING_M + 1, 0, 0]]))
+    moving = replace(street, actors=(car, replace(car, actor_id="moves", track=track)), degradation=Degradation("none"))
+    folder = tmp_path / "pairs" / "val" / "s"
+    make_sequence(moving, folder, PairRecipe(), 0, split="val", family="street")
+    assert PairSequence(folder).info["moving_actors"] == 1
+    assert PairSequence(folder).info["actors"] == 2
+
+
+def test_unknown_camera_names_the_known_ones(street: Scenario, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has \['front'\]"):
+        make_sequence(street, tmp_path / "x", PairRecipe(camera="rear"), 0, split="val", family="street")

@@ -1,0 +1,217 @@
+"""The per-frame generator's training: objectives against their definition, gradients through k frames, resumed runs are equal."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
+from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.lab.training.grid_term import grid_term
+from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
+from alpasim_plugin.lab.training.pixel_run import PixelRun, train_per_frame
+from alpasim_plugin.lab.training.pixel_variants import pixel_variant
+from alpasim_plugin.lab.training.trainer import STATE_FILE, Schedule
+from alpasim_plugin.nets.checkpoints import load_weights
+from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
+from alpasim_plugin.nets.pixel_source import pixel_source
+
+SMALL = ("generator.widths=[8,8,8]", "generator.detail=8", "generator.hidden=4", "weights.bundle=null")
+FRAMES = 3
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Like `training.streams.StreamBatch`."""
+
+    render: Tensor
+    opacity: Tensor
+    map: Tensor
+    target: Tensor
+    fresh: Tensor
+
+
+class Streams:
+    """Two streams whose renders are darker than the truth; one starts anew at every third update."""
+
+    batch = 2
+
+    def update(self, i: int, slots: slice = slice(None)) -> Batch:
+        source = torch.Generator().manual_seed(i)
+        target = torch.rand(2, FRAMES, 3, 16, 32, generator=source) * 2 - 1
+        opacity = torch.rand(2, FRAMES, 1, 16, 32, generator=source)
+        whole = Batch(target * 0.5 - 0.4, opacity, target.roll(1, 2), target, torch.tensor([i % 3 == 0, i == 0]))
+        return Batch(*(getattr(whole, field.name)[slots] for field in fields(whole)))
+
+    def facts(self) -> dict[str, Any]:
+        return {"streams": "dark"}
+
+
+def sample(seed: int = 0, t: float = 0.4) -> PixelSample:
+    got = Streams().update(seed)
+    render, truth, sdmap, opacity = (x.permute(0, 1, 3, 4, 2) for x in (got.render, got.target, got.map, got.opacity))
+    torch.manual_seed(seed)
+    return PixelSample(
+        render,
+        truth,
+        sdmap,
+        opacity,
+        torch.randn_like(render),
+        torch.randn_like(render[:, 0]),
+        torch.full((2,), t),
+        1,
+        (0, 2),
+        (3, 1),
+        torch.rand(2, FRAMES),
+    )
+
+
+def generator() -> PixelGenerator:
+    torch.manual_seed(3)
+    return PixelGenerator(PixelSizes((8, 8, 8), detail=8, hidden=4))
+
+
+def test_terms_are_what_they_are_called() -> None:
+    net, s = generator(), sample()
+    found = pixel_losses(net, s, net.start(s.render[:, 0]), PixelObjectives(), lambda a, b: (a - b).abs().amax((1, 2, 3)))
+    state, made = net.start(s.render[:, 0]), []
+    for i in range(FRAMES):
+        if i == 1:  # the flow term: the velocity of the interpolant, on the rollout's history
+            z_1 = pixel_source(s.render[:, 1], s.opacity[:, 1], s.eps_flow)
+            z_t = 0.6 * s.truth[:, 1] + 0.4 * z_1
+            guess, _ = net(s.render[:, 1], s.opacity[:, 1], s.sdmap[:, 1], state, z_t, s.t)
+            velocity = (z_t - guess) / 0.4
+            torch.testing.assert_close(found.flow, (velocity - (z_1 - s.truth[:, 1])).abs().mean(), atol=1e-5, rtol=0)
+        out, state = net(s.render[:, i], s.opacity[:, i], s.sdmap[:, i], state, pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i]))
+        made.append(out)
+    torch.testing.assert_close(found.predictions, torch.stack(made, 1))
+    error = found.predictions - s.truth
+    torch.testing.assert_close(found.picture, error.abs().mean())
+    torch.testing.assert_close(found.temporal, (error[:, 1:] - error[:, :-1]).abs().mean())
+    torch.testing.assert_close(found.perceptual, error[:, [0, 2], 3:, 1:].abs().amax((2, 3, 4)).mean())
+    torch.testing.assert_close(found.grid, grid_term(found.predictions, s.truth))
+    total = found.picture + 0.1 * found.perceptual + 0.25 * found.temporal + 0.25 * found.flow + 0.01 * found.grid
+    torch.testing.assert_close(found.total, total)
+    assert torch.equal(found.state.output, made[-1].clamp(-1, 1))
+
+
+@pytest.mark.parametrize(("horizon", "reaches"), [(1, 0), (2, 0), (3, 2), (4, 2)])
+def test_gradients_pass_through_the_last_k_frames(horizon: int, reaches: int) -> None:
+    net, s = generator(), sample()
+    eps = s.eps.clone().requires_grad_()
+    found = pixel_losses(net, replace(s, eps=eps), net.start(s.render[:, 0]), PixelObjectives(0, 0, 0, horizon=horizon), None)
+    (gradient,) = torch.autograd.grad(found.predictions[:, 2].square().mean(), eps)
+    reached = [i for i in range(FRAMES) if bool(gradient[:, i].any())]
+    assert len(reached) - 1 == reaches
+    assert not found.state.hidden.requires_grad
+
+
+def test_switches_of_the_ablation() -> None:
+    net, s = generator(), sample()
+    start = net.start(s.render[:, 0])
+
+    def made(**changes: Any) -> Tensor:
+        return pixel_losses(net, s, start, PixelObjectives(perceptual=0, **changes), None).predictions
+
+    own = made()
+    for history in ("clean", "redenoised"):
+        assert torch.equal(made(history=history)[:, 0], own[:, 0])
+        assert not torch.allclose(made(history=history)[:, 1], own[:, 1])
+    assert not torch.allclose(made(use_map=False), own)
+    assert not torch.allclose(made(mixed=False), own)
+    assert float(pixel_losses(net, s, start, PixelObjectives(flow=0, temporal=0), None).flow) == 0
+
+
+def test_a_redenoised_history_is_the_truth_noised_and_denoised() -> None:
+    net, s = generator(), sample()
+    found = pixel_losses(net, s, net.start(s.render[:, 0]), PixelObjectives(perceptual=0, history="redenoised"), None)
+    state = net.start(s.render[:, 0])
+    for i in range(FRAMES):
+        z_1 = pixel_source(s.render[:, i], s.opacity[:, i], s.eps[:, i])
+        given = (s.render[:, i], s.opacity[:, i], s.sdmap[:, i], state)
+        torch.testing.assert_close(found.predictions[:, i], net(*given, z_1)[0])
+        t = s.t_history[:, i]
+        at = t[:, None, None, None]
+        _, state = net(*given, (1 - at) * s.truth[:, i] + at * z_1, t)
+
+
+def test_flow_matching_alone_sends_no_gradient_through_the_rollout() -> None:
+    net, s = generator(), sample()
+    flow_alone = pixel_variant("V2").stages[0]
+    found = pixel_losses(net, s, net.start(s.render[:, 0]), flow_alone, None)
+    assert not found.predictions.requires_grad
+    assert torch.equal(found.total, found.flow)
+
+
+def test_stages_take_their_shares_of_the_updates() -> None:
+    two = pixel_variant("V7").weighted(perceptual=0.2, temporal=0.25, flow=0.25, grid=0.01, horizon=4)
+    assert [two.objectives(i, 8).in_pixels for i in range(8)] == [False] * 5 + [True] * 3
+    assert two.objectives(7, 8).perceptual == 0.2
+    assert two.objectives(0, 8).perceptual == 0
+    assert two.facts(8) != two.facts(16)
+    assert pixel_variant("V9").facts(8) == pixel_variant("V9").facts(16)
+
+
+def test_a_variant_is_written_as_it_must_be_run(tmp_path: Path) -> None:
+    for name, holes, uses_map in (("V5", "noise", False), ("V6", "everywhere", True)):
+        bundle = train_per_frame(run_of(2, 1, variant=name), tmp_path / name, None)
+        settings = fixer_settings(*bundle_fixer(bundle))
+        assert isinstance(settings, PixelFixerSettings)
+        assert (settings.holes, settings.uses_map) == (holes, uses_map)
+
+
+def run_of(steps: int = 4, decay_from: int = 3, variant: str = "V9", **changes: Any) -> PixelRun:
+    settings = fixer_settings("onefixer", SMALL)
+    assert isinstance(settings, PixelFixerSettings)
+    schedule = Schedule(steps, peak_lr=3e-3, warmup=2, clip=0.5, ema=0.9, save_every=2, decay_from=decay_from)
+    return PixelRun(settings, Streams(), pixel_variant(variant).weighted(0, 0.25, 0.25, 0.01, horizon=4), schedule, **changes)
+
+
+def weights(path: Path) -> dict[str, Tensor]:
+    return load_weights(path / STATE_FILE)
+
+
+def test_a_resumed_run_ends_with_equal_weights_and_state(tmp_path: Path) -> None:
+    train_per_frame(run_of(), tmp_path / "whole", None)
+    train_per_frame(run_of(), tmp_path / "cut", None, stop_at=2)
+    bundle = train_per_frame(run_of(), tmp_path / "cut", None)
+    one, other = weights(tmp_path / "whole"), weights(tmp_path / "cut")
+    assert any(key.startswith("carried.") for key in one)
+    assert one.keys() == other.keys()
+    assert all(torch.equal(value, other[key]) for key, value in one.items())
+    saved = parts_of(load_weights(bundle))["generator"]
+    assert torch.equal(saved["mix.weight"], one["average.mix.weight"].half())
+
+
+@pytest.mark.slow
+def test_a_run_may_be_prolonged_until_its_decay_begins(tmp_path: Path) -> None:
+    train_per_frame(run_of(20, 12), tmp_path / "long", None, stop_at=3)
+    train_per_frame(run_of(6, 4), tmp_path / "run", None, stop_at=2)
+    train_per_frame(run_of(20, 12), tmp_path / "run", None, stop_at=3)
+    assert all(torch.equal(value, weights(tmp_path / "run")[key]) for key, value in weights(tmp_path / "long").items())
+    train_per_frame(run_of(5, 3), tmp_path / "run", None)
+    with pytest.raises(InputError, match="its decay from 3 to 5 has begun"):
+        train_per_frame(run_of(20, 12), tmp_path / "run", None)
+
+
+def test_a_run_goes_on_from_another_runs_checkpoint(tmp_path: Path) -> None:
+    train_per_frame(run_of(), tmp_path / "first", None)
+    begin = tmp_path / "first" / STATE_FILE
+    train_per_frame(run_of(init=begin, keep_every=1), tmp_path / "next", None, stop_at=1)
+    assert float(weights(tmp_path / "next")["moment.step.mix.weight"]) == 5  # its moments go on
+    assert (tmp_path / "next" / "fixer-000001.safetensors").is_file()
+    wide = fixer_settings("onefixer", (*SMALL, "generator.detail=12"))
+    assert isinstance(wide, PixelFixerSettings)
+    with pytest.raises(InputError, match="another shape of: read"):
+        train_per_frame(replace(run_of(init=begin), settings=wide), tmp_path / "wide", None)
+
+
+def test_it_learns(tmp_path: Path) -> None:
+    seen: list[float] = []
+    train_per_frame(run_of(24, 20), tmp_path, None, report=lambda step, numbers: seen.append(numbers["picture"]))
+    assert sum(seen[-4:]) < 0.7 * sum(seen[:4])

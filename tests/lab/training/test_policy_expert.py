@@ -1,0 +1,100 @@
+"""The expert of the learned policy: recovery to the line, and speed behind others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.core.geometry import se2
+from alpasim_plugin.core.types import Box
+from alpasim_plugin.lab.training.policy_expert import (
+    DrivingStyle,
+    ReferenceLine,
+    acceleration,
+    advance,
+    expert_path,
+    expert_speeds,
+    leader_on,
+)
+from alpasim_plugin.world.idm import NO_LEADER, Leader
+from alpasim_plugin.world.path import smooth_path
+from alpasim_plugin.world.state import NO_BODIES, bodies_from
+from policies.learned_net import KNOTS_M, TIMES_S
+
+STRAIGHT = smooth_path(np.stack([np.linspace(0.0, 200.0, 60), np.zeros(60)], axis=1))
+ANGLE = np.linspace(0.0, 2.0, 120)
+LEFT_CIRCLE = smooth_path(40.0 * np.stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)], axis=1))
+STYLE = DrivingStyle(10.0)
+
+
+def speeds(speed_mps: float, leader: Leader = NO_LEADER, line: ReferenceLine | None = None, s_m: float = 20.0) -> np.ndarray:
+    return speed_mps + expert_speeds(line or ReferenceLine.along(STRAIGHT, 20.0), s_m, speed_mps, leader, STYLE)
+
+
+@pytest.mark.parametrize("offset_m", [-1.5, 0.0, 0.7])
+def test_car_beside_a_straight_line_is_led_back_to_it_without_a_jump(offset_m: float) -> None:
+    points, heading = expert_path(STRAIGHT, 50.0, se2(50.0, offset_m, 0.0), 10.0)
+    assert points[-1, 1] == pytest.approx(-offset_m, abs=0.05)
+    assert np.abs(heading[-1]) < 0.01
+    assert abs(points[0, 1]) < 0.2 * abs(offset_m) + 1e-6  # the first metres go where the car already points
+    assert (np.diff(np.abs(points[:, 1])) > -0.2).all()
+
+
+def test_car_on_a_bend_stays_on_it() -> None:
+    s = 20.0
+    xyz, yaw = LEFT_CIRCLE.at(s)
+    points, heading = expert_path(LEFT_CIRCLE, s, se2(float(xyz[0]), float(xyz[1]), float(yaw)), 8.0)
+    k = KNOTS_M.index(22.0)
+    wanted = 40.0 * np.array([np.sin(22.0 / 40.0), 1.0 - np.cos(22.0 / 40.0)])
+    np.testing.assert_allclose(points[k], wanted, atol=0.35)
+    assert heading[k] == pytest.approx(22.0 / 40.0, abs=0.04)
+
+
+def test_car_that_points_away_is_turned_back() -> None:
+    _, heading = expert_path(STRAIGHT, 50.0, se2(50.0, 0.0, np.deg2rad(8.0)), 10.0)
+    assert heading[-1] == pytest.approx(-np.deg2rad(8.0), abs=0.02)
+    assert heading.min() < -np.deg2rad(8.0)  # it left the line and must come back
+
+
+def test_line_that_ends_goes_on_straight() -> None:
+    points, _ = expert_path(STRAIGHT, 190.0, se2(190.0, 0.0, 0.0), 10.0)
+    np.testing.assert_allclose(points[:, 0], KNOTS_M, atol=1e-6)
+    np.testing.assert_allclose(points[:, 1], 0.0, atol=1e-6)
+
+
+def test_free_car_at_the_wanted_speed_keeps_it_and_a_slower_one_gains_it() -> None:
+    np.testing.assert_allclose(speeds(10.0), 10.0, atol=1e-6)
+    after = speeds(0.0)
+    assert (np.diff(after) > 0).all()
+    assert after[0] == pytest.approx(0.75, abs=0.1)
+
+
+def test_car_stops_before_what_stands_and_stays_there() -> None:
+    for gap_m in (12.0, 20.0, 30.0):
+        s, v, line = 20.0, 8.0, ReferenceLine.along(STRAIGHT, 20.0)
+        wall = 20.0 + gap_m
+        for _ in range(150):
+            s, v = advance(s, v, acceleration(line, s, v, Leader(wall - s, 0.0, 0), STYLE), 0.1)
+        assert v < 0.1
+        assert 1.0 < wall - s < 4.5
+    assert speeds(8.0, Leader(12.0, 0.0, 0))[TIMES_S.index(2.5)] < 2.0
+
+
+def test_leader_that_drives_away_hinders_less_than_one_that_stands() -> None:
+    moving, standing = speeds(8.0, Leader(12.0, 8.0, 0)), speeds(8.0, Leader(12.0, 0.0, 0))
+    assert (moving > standing).all()
+
+
+def test_bend_is_entered_slowly() -> None:
+    line = ReferenceLine.along(LEFT_CIRCLE, 20.0)
+    assert speeds(12.0, line=line, s_m=5.0)[-1] == pytest.approx(np.sqrt(2.0 * 40.0), abs=0.5)
+
+
+def test_only_bodies_that_reach_into_the_way_are_leaders() -> None:
+    line, car = ReferenceLine.along(STRAIGHT, 20.0), Box(4.5, 1.8, 1.5)
+    there = bodies_from(np.array([[40.0, 3.4], [60.0, 0.3]]), np.zeros(2), [car, car], np.array([[0.0, 0.0], [5.0, 0.0]]))
+    leader = leader_on(line, 10.0, 3.8, 0.94, there)
+    assert leader.index == 1
+    assert leader.gap_m == pytest.approx(60.0 - 2.25 - 13.8, abs=0.05)
+    assert leader.speed_mps == pytest.approx(5.0)
+    assert leader_on(line, 10.0, 3.8, 0.94, NO_BODIES).index == -1

@@ -1,0 +1,104 @@
+"""Scenes of the splits: apart by seed and, for the unseen test, by family, look and damage; all of them can be driven."""
+
+import itertools
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES
+from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
+from alpasim_plugin.lab.training.scene_looks import KNOWN_DAMAGE, SIZES, UNSEEN_DAMAGE
+from alpasim_plugin.lab.training.scenes import DRAWS, SPLITS, Split, draw_spec, write_scenes
+from scenarios.load import load_scenario
+
+DRAWN = 60
+ALL = [(split, family) for split in ("train", "test-unseen") for family in SPLITS[split].families]  # type: ignore[index]
+
+
+def drawn(split: Split) -> list[dict]:
+    families = list(SPLITS[split].families)
+    return [draw_spec(split, families[i % len(families)], f"s{i}", i, 6.0) for i in range(DRAWN)]
+
+
+def test_seeds_of_splits_do_not_meet() -> None:
+    ranges = sorted((r.first_seed, r.first_seed + 10 * r.count * DRAWS) for r in SPLITS.values())
+    assert all(a[1] <= b[0] for a, b in itertools.pairwise(ranges))
+
+
+def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training() -> None:
+    assert not set(KNOWN_FAMILIES) & set(UNSEEN_FAMILIES)
+    parts = {split: {s["kind"] for spec in drawn(split) for s in spec["road"]["segments"]} for split in ("train", "test-unseen")}
+    assert {"merge", "narrow_gap"} <= parts["test-unseen"] - parts["train"]
+    labels = {split: {a.get("label", "car") for spec in drawn(split) for a in spec["actors"]} for split in ("train", "test-unseen")}
+    assert labels["test-unseen"] - labels["train"] == {"other"}
+    assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels["train"]
+
+
+def test_every_unseen_scene_looks_as_no_training_scene_can() -> None:
+    def strange(around: dict) -> bool:
+        low, high = around["building_height_m"]
+        return around["sky"] == "dusk" or around["texture"] <= 0.15 or high < 4 or low > 26 or around["trees_per_100m"] > 9
+
+    assert all(strange(spec["environment"]) for spec in drawn("test-unseen"))
+    for split in ("train", "val", "test-known"):
+        assert not any(strange(spec["environment"]) for spec in drawn(split))
+
+
+def test_every_unseen_scene_is_damaged_beyond_some_range_of_training() -> None:
+    def beyond(damage: dict) -> bool:
+        names = [f.name for f in fields(KNOWN_DAMAGE) if f.name in damage and f.name != "shift_m"]
+        return any(not low <= damage[name] <= high for name in names for low, high in [getattr(KNOWN_DAMAGE, name)])
+
+    unseen, train = ([spec["degradation"] for spec in drawn(split)] for split in ("test-unseen", "train"))
+    assert all(beyond(damage) for damage in unseen)
+    assert not any(beyond(damage) for damage in train)
+    cycles = [abs(d["shift_m"]) for d in unseen if d["kind"] == "cycle"]
+    assert cycles
+    assert min(cycles) > KNOWN_DAMAGE.shift_m[1]
+    assert len(UNSEEN_DAMAGE) == 4
+
+
+def test_training_damage_covers_its_ranges_and_both_kinds() -> None:
+    damage = [spec["degradation"] for spec in drawn("train")]
+    assert {d["kind"] for d in damage} == {"reconstruction", "cycle"}
+    share = np.array([d["share"] for d in damage])
+    assert share.min() < 0.08
+    assert share.max() > 0.3
+    poses = [d["pose_error_m"] for d in damage]
+    assert 0.2 * DRAWN < sum(p > 0 for p in poses) < 0.8 * DRAWN
+    assert {np.sign(d["shift_m"]) for d in damage if d["kind"] == "cycle"} == {-1.0, 1.0}
+
+
+def test_cameras_vary_in_training_only() -> None:
+    sizes = [(c["width"], c["height"]) for spec in drawn("train") for c in spec["cameras"]]
+    assert set(sizes) == set(SIZES)
+    assert sizes.count((256, 144)) > DRAWN / 2
+    assert all("cameras" not in spec for split in ("val", "test-known", "test-unseen") for spec in drawn(split))
+
+
+@pytest.mark.parametrize(("split", "family"), ALL)
+def test_draws_repeat_and_differ_by_seed(split: Split, family: str) -> None:
+    one, again, other = (draw_spec(split, family, "s", seed, 10.0) for seed in (3, 3, 4))
+    assert one == again
+    assert one["road"] != other["road"]
+    assert one["degradation"] != other["degradation"]
+
+
+def test_scenes_can_be_driven_and_files_are_kept(tmp_path: Path) -> None:
+    paths = [*write_scenes(tmp_path, "train", 2, 2.0), *write_scenes(tmp_path, "test-unseen", 1, 2.0)]
+    assert [p.parent.name for p in paths] == ["train", "train", "test-unseen"]
+    scenario = load_scenario(paths[0])
+    assert scenario.end_us - scenario.start_us == 2_000_000
+    assert scenario.degradation.views_per_s != 6.0
+    paths[0].write_text(paths[0].read_text() + "# touched\n")
+    list(write_scenes(tmp_path, "train", 1, 2.0))
+    assert paths[0].read_text().endswith("# touched\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("split", list(SPLITS))
+def test_every_family_can_be_driven(split: Split, tmp_path: Path) -> None:
+    paths = list(write_scenes(tmp_path, split, len(SPLITS[split].families), SPLITS[split].duration_s))
+    assert {p.stem.rsplit("_", 1)[0] for p in paths} == set(SPLITS[split].families)

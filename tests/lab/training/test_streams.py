@@ -1,0 +1,170 @@
+"""Training streams: a pure function of the update's number, frames in a row within an episode, identity where it is promised."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.lab.training.streams import KINDS, StreamBatch, StreamShares, TrainingStreams, _detailed, there_and_back
+from tests.lab.training.pair_files import make
+
+ALL_KINDS = StreamShares(0.25, 0.25, 0.25, 0.25)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("streams")
+    for i, frames in enumerate((12, 7, 5)):
+        make(folder / "pairs", name=f"street_{i:03d}", frames=frames, height=40, width=64)
+    make(folder / "video", name="drive", frames=9, height=48, width=48)
+    make(folder / "video", split="held-out", name="drive", frames=9, height=48, width=48)
+    return folder
+
+
+def streams(root: Path, **settings: object) -> TrainingStreams:
+    chosen = {"batch": 3, "frames": 2, "crop": (32, 48), "episode": 4, "shares": ALL_KINDS} | settings
+    return TrainingStreams(root / "pairs", root / "video", **chosen)  # type: ignore[arg-type]
+
+
+def equal(a: StreamBatch, b: StreamBatch) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+
+
+def test_update_is_a_pure_function_of_its_number_and_the_seed(root: Path) -> None:
+    one, other = streams(root), streams(root)
+    forward = [one.update(i) for i in range(9)]
+    for i in (7, 0, 3, 8):  # out of order, by another object
+        assert equal(other.update(i), forward[i])
+    assert not equal(streams(root, seed=1).update(7), forward[7])
+
+
+def test_shapes_types_and_ranges_are_those_promised(root: Path) -> None:
+    batch = streams(root).update(5)
+    for name, channels, low in (("render", 3, -1), ("opacity", 1, 0), ("map", 3, -1), ("target", 3, -1)):
+        value = getattr(batch, name)
+        assert value.shape == (3, 2, channels, 32, 48)
+        assert value.dtype == torch.float32
+        assert low <= value.min()
+        assert value.max() <= 1
+        assert value.is_contiguous()
+    assert batch.fresh.shape == batch.kind.shape == (3,)
+
+
+def test_slots_begin_anew_once_an_episode_and_not_all_at_once(root: Path) -> None:
+    made = streams(root)
+    fresh = torch.stack([made.update(i).fresh for i in range(9)]).numpy()
+    assert fresh[0].all()
+    assert fresh[1:].sum(axis=0).tolist() == [2, 2, 2]
+    assert fresh[1:].sum(axis=1).max() == 1
+
+
+def test_frames_follow_one_another_across_updates(root: Path) -> None:
+    made = streams(root, shares=StreamShares(1, 0, 0, 0))
+    for slot in range(3):
+        for i in range(1, 30):
+            (episode, at), (before, _) = made.episode_of(slot, i), made.episode_of(slot, i - 1)
+            if at == 0:
+                continue
+            assert replace(episode, levels=before.levels) == before
+            length = len(episode.sequence.clip)
+            raw = episode.start + episode.step * np.arange(at * 2 - 1, at * 2 + 1)
+            assert np.abs(np.diff(there_and_back(raw, length))).max() <= abs(episode.step)
+
+
+def test_all_kinds_are_drawn_and_only_damaged_ones_differ_from_their_target(root: Path) -> None:
+    made, seen = streams(root), set()
+    for i in range(24):
+        batch = made.update(i)
+        for slot, kind in enumerate(batch.kind.tolist()):
+            name = KINDS[kind]
+            seen.add(name)
+            same = torch.equal(batch.render[slot], batch.target[slot])
+            assert same == (name in ("identity", "video"))
+            if same:
+                assert (batch.opacity[slot] == 1).all()
+    assert seen == set(KINDS)
+
+
+def test_undamaged_frames_get_detail_and_damaged_ones_none(root: Path) -> None:
+    made = streams(root)
+    seen = set()
+    for i in range(0, 48, 4):
+        batch = made.update(i)
+        for slot, kind in enumerate(batch.kind.tolist()):
+            (episode, at) = made.episode_of(slot, i)
+            index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
+            raw = episode.sequence.clip.rgb_gt[index, episode.top : episode.top + 32, episode.left : episode.left + 48]
+            raw = raw[:, :, ::-1] if episode.flip else raw
+            plain = np.stack([episode.levels[raw[..., c], c] for c in range(3)], axis=1)
+            changed = not np.array_equal(batch.target[slot].numpy(), plain)
+            assert changed == (KINDS[kind] in ("identity", "video") and episode.grain > 0)
+            seen.add((KINDS[kind], changed))
+    assert {("identity", True), ("identity", False), ("pairs", False)} <= seen
+    rng = np.random.default_rng(0)
+    grey = np.zeros((2, 3, 64, 64), np.float32)
+    noisy = _detailed(grey, 1.0, 0.05, rng)
+    assert noisy.std() == pytest.approx(0.05, rel=0.02)  # flat: nothing to sharpen
+    assert abs(np.corrcoef(noisy[0].ravel(), noisy[1].ravel())[0, 1]) < 0.05  # no pattern that stays
+    edge = np.where(np.arange(64) < 32, -0.5, 0.5).astype(np.float32) * np.ones((1, 3, 64, 1), np.float32)
+    assert np.ptp(_detailed(edge, 1.0, 0.0, rng)) > 1.2 * np.ptp(edge)
+
+
+def test_render_and_target_are_relit_by_the_same_levels(root: Path) -> None:
+    made = streams(root, shares=StreamShares(1, 0, 0, 0))
+    for i in range(0, 24, 4):
+        (episode, at), batch = made.episode_of(0, i), made.update(i)
+        index = there_and_back(episode.start + episode.step * (at * 2 + np.arange(2)), len(episode.sequence.clip))
+        cut = np.s_[episode.top : episode.top + 32, episode.left : episode.left + 48]
+        for channel, shown in ((episode.sequence.clip.rgb_input, batch.render), (episode.sequence.clip.rgb_gt, batch.target)):
+            raw = channel[index[0]][cut][:, ::-1] if episode.flip else channel[index[0]][cut]
+            wanted = np.stack([episode.levels[raw[..., c], c] for c in range(3)])
+            np.testing.assert_array_equal(shown[0, 0].numpy(), wanted)
+        assert (np.diff(episode.levels, axis=0) >= 0).all()
+
+
+def test_held_out_video_is_never_shown(root: Path) -> None:
+    made = streams(root, shares=StreamShares(0, 0, 0.5, 0.5))
+    shown = {made.episode_of(slot, i)[0].sequence.folder for slot in range(3) for i in range(60)}
+    assert shown == {root / "video" / "train" / "drive"}
+
+
+def test_a_count_keeps_the_list_while_more_are_made(root: Path, tmp_path: Path) -> None:
+    for i in (0, 10, 2):
+        make(tmp_path, name=f"{'z' if i < 5 else 'a'}_{i:03d}", height=32, width=48)
+    shares = StreamShares(1, 0, 0, 0)
+    two = TrainingStreams(tmp_path, crop=(32, 48), shares=shares, count=2)
+    assert [s.name for s in two.pairs] == ["z_000", "z_002"]  # in order of number, not of family
+    before = two.facts()
+    make(tmp_path, name="b_011", height=32, width=48)
+    assert TrainingStreams(tmp_path, crop=(32, 48), shares=shares, count=2).facts() == before
+    assert TrainingStreams(tmp_path, crop=(32, 48), shares=shares).facts()["pairs_digest"] != before["pairs_digest"]
+
+
+def test_reflection_keeps_neighbours_together_on_both_sides() -> None:
+    for length in (1, 2, 5):
+        index = there_and_back(np.arange(-3 * length, 3 * length), length)
+        assert set(index) == set(range(length))
+        assert np.abs(np.diff(index)).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        ({"crop": (30, 48)}, "no batch"),
+        ({"frames": 0}, "no batch"),
+        ({"crop": (48, 48)}, "smaller than the crop"),
+    ],
+)
+def test_what_makes_no_batch_is_refused(root: Path, settings: dict, found: str) -> None:
+    with pytest.raises(InputError, match=found):
+        streams(root, **settings)
+
+
+def test_video_needs_a_folder_and_shares_must_add_up(root: Path) -> None:
+    with pytest.raises(InputError, match="no folder of videos"):
+        TrainingStreams(root / "pairs", None, crop=(32, 48))
+    with pytest.raises(InputError, match=r"add up to 1\.1"):
+        StreamShares(0.8, 0.1, 0.1, 0.1)

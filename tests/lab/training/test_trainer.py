@@ -1,0 +1,196 @@
+"""The training loop: resuming gives equal weights, and a non-finite loss or a full disk loses nothing."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.lab.training.trainer import BAD_FILE, PartSchedule, Schedule, Trainer
+
+
+class Linear(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(3, 4))
+        self.bias = nn.Parameter(torch.zeros(3))
+        self.fixed = nn.Parameter(torch.ones(3), requires_grad=False)
+
+
+def batch(index: int) -> Tensor:
+    return torch.from_numpy(stream("t", 0, "x", index).standard_normal((8, 4))).float()
+
+
+TRUTH = torch.arange(12.0).reshape(3, 4) / 12
+
+
+def trainer(folder: Path, schedule: Schedule, facts: str = "a", bad_at: int = -1) -> Trainer[Tensor]:
+    model = Linear()
+
+    def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
+        error = ((x @ model.weight.T + model.bias - x @ TRUTH.T) ** 2).mean()
+        return (error * float("nan") if index == bad_at else error), {"error": float(error.detach())}
+
+    return Trainer(model, folder, schedule, batch, loss, {"data": facts})
+
+
+def test_learns_and_averages(tmp_path: Path) -> None:
+    t = trainer(tmp_path, Schedule(steps=300, peak_lr=0.03, warmup=5, weight_decay=0.0, ema=0.9))
+    t.run()
+    torch.testing.assert_close(t.module.weight, TRUTH, atol=0.02, rtol=0)
+    torch.testing.assert_close(t.averaged()["weight"], TRUTH, atol=0.02, rtol=0)
+    assert set(t.averaged()) == {"weight", "bias", "fixed"}
+
+
+def test_resumed_run_ends_with_equal_weights_and_log(tmp_path: Path) -> None:
+    schedule = Schedule(steps=20, warmup=3, accumulate=2, save_every=7)
+    whole = trainer(tmp_path / "whole", schedule)
+    whole.run()
+    trainer(tmp_path / "cut", schedule).run(until=10)
+    again = trainer(tmp_path / "cut", schedule)
+    assert again.step == 10
+    again.run()
+    for name, p in whole.averaged().items():
+        assert torch.equal(p, again.averaged()[name])
+    steps = [line.split(",")[0] for line in (tmp_path / "cut" / "log.jsonl").read_text().splitlines()]
+    assert steps == [f'{{"step": {i}' for i in range(1, 21)]
+
+
+def test_kill_after_a_checkpoint_repeats_the_lost_updates_once(tmp_path: Path) -> None:
+    schedule = Schedule(steps=12, save_every=5)
+    t = trainer(tmp_path, schedule)
+    for _ in range(8):
+        t._write_log(t._update())
+        if t.step % 5 == 0:
+            t.save()
+    again = trainer(tmp_path, schedule)
+    assert again.step == 5
+    again.run()
+    assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 12
+
+
+def test_kill_before_the_first_checkpoint_leaves_no_rows(tmp_path: Path) -> None:
+    t = trainer(tmp_path, Schedule(steps=4, warmup=1, save_every=4))
+    t._write_log(t._update())
+    trainer(tmp_path, Schedule(steps=4, warmup=1, save_every=4)).run()
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2, 3, 4]
+    assert all(row["core_s"] >= 0 for row in rows)
+
+
+def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path: Path) -> None:
+    schedule = Schedule(steps=9)
+    t = trainer(tmp_path, schedule, bad_at=4)
+    with pytest.raises(InfrastructureError, match="loss nan in batch 4"):
+        t.run()
+    assert torch.equal(torch.load(tmp_path / BAD_FILE, weights_only=True), batch(4))
+    again = trainer(tmp_path, schedule)
+    assert again.step == 4
+    assert torch.isfinite(again.module.weight).all()
+    again.run()
+    assert again.step == 9
+
+
+def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+    trainer(tmp_path, Schedule(steps=2)).run()
+    with pytest.raises(InputError, match="it was begun as"):
+        trainer(tmp_path, Schedule(steps=2), facts="b")
+    with pytest.raises(InputError, match="it was begun as"):
+        trainer(tmp_path, Schedule(steps=3))
+
+
+def test_learning_rate_rises_then_falls_along_a_cosine() -> None:
+    s = Schedule(steps=110, peak_lr=1.0, warmup=10)
+    assert s.lr(0) == pytest.approx(0.1)
+    assert s.lr(10) == pytest.approx(1.0)
+    assert s.lr(60) == pytest.approx(0.505)
+    assert s.lr(110) == pytest.approx(0.01)
+
+
+def test_learning_rate_falls_exponentially_or_stays() -> None:
+    s = Schedule(steps=110, peak_lr=2.0, warmup=10, decay="exponential", last_share=0.01)
+    assert [s.lr(step) for step in (4, 10, 60, 110, 500)] == pytest.approx([1.0, 2.0, 0.2, 0.02, 0.02])
+    assert [Schedule(steps=110, peak_lr=2.0, warmup=10, decay="constant").lr(step) for step in (4, 10, 110)] == pytest.approx(
+        [1.0, 2.0, 2.0]
+    )
+
+
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="this system has no /dev/full")
+def test_full_disk_under_the_log_has_four_parts(tmp_path: Path) -> None:
+    (tmp_path / "log.jsonl").symlink_to("/dev/full")
+    with pytest.raises(InfrastructureError, match="No space left on device") as caught:
+        trainer(tmp_path, Schedule(steps=2)).run()
+    assert caught.value.doing == "writing a training log"
+
+
+def test_full_disk_under_the_checkpoint_has_four_parts_and_keeps_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    t = trainer(tmp_path, Schedule(steps=4, save_every=2))
+    t.run(until=2)
+
+    def refuse(fd: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(InfrastructureError, match="free disk space"):
+        t.run()
+    monkeypatch.undo()
+    assert trainer(tmp_path, Schedule(steps=4, save_every=2)).step == 2
+
+
+class Two(nn.Module):
+    """Two parts, of which one is trained in every third update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.student, self.critic = Linear(), Linear()
+
+
+def two_parts(folder: Path, schedule: Schedule, parts: dict[str, PartSchedule]) -> Trainer[Tensor]:
+    model = Two()
+
+    def loss(x: Tensor, index: int) -> tuple[Tensor, dict[str, float]]:
+        trained = (model.critic, model.student) if index % 3 == 0 else (model.critic,)
+        return torch.stack([((x @ part.weight.T + part.bias - x @ TRUTH.T) ** 2).mean() for part in trained]).sum(), {}
+
+    return Trainer(model, folder, schedule, batch, loss, {}, parts=parts)
+
+
+PARTS = {"student": PartSchedule(rate=0.5), "critic": PartSchedule(betas=(0.0, 0.9), clip=1e-3)}
+
+
+def test_parts_have_rates_and_clips_of_their_own_and_rest_without_a_gradient(tmp_path: Path) -> None:
+    schedule = Schedule(steps=6, peak_lr=0.01, warmup=1, weight_decay=0.0, clip=100.0)
+    t = two_parts(tmp_path, schedule, PARTS)
+    t.run(until=1)
+    first = {name: p.detach().clone() for name, p in t.parameters.items()}
+    assert float(first["student.weight"].abs().max()) == pytest.approx(0.005, rel=1e-3), "Adam's first step is the rate"
+    assert float(first["critic.weight"].abs().max()) == pytest.approx(0.01, rel=1e-3)
+    average = t.average["student.weight"].clone()
+    t.run(until=3)
+    assert torch.equal(first["student.weight"], t.parameters["student.weight"])
+    assert torch.equal(average, t.average["student.weight"])
+    assert not torch.equal(first["critic.weight"], t.parameters["critic.weight"])
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert ["grad_norm.student" in row for row in rows] == [True, False, False]
+    assert [group["weight_decay"] for group in t.optimiser.param_groups] == [0.0] * 4
+
+
+def test_parts_resume_bit_for_bit_also_before_their_first_gradient(tmp_path: Path) -> None:
+    schedule = Schedule(steps=6, save_every=1)
+    whole = two_parts(tmp_path / "whole", schedule, PARTS)
+    whole.run()
+    two_parts(tmp_path / "cut", schedule, PARTS).run(until=2)
+    again = two_parts(tmp_path / "cut", schedule, PARTS)
+    again.run()
+    assert all(torch.equal(p, again.averaged()[name]) for name, p in whole.averaged().items())
+    with pytest.raises(InputError, match="begun as"):
+        two_parts(tmp_path / "cut", schedule, {**PARTS, "student": PartSchedule(rate=1.0)})
+
+
+def test_a_trained_parameter_of_no_part_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"trained without a schedule: critic\.bias"):
+        two_parts(tmp_path, Schedule(steps=1), {"student": PartSchedule()})

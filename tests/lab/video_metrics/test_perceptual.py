@@ -1,0 +1,143 @@
+"""`perceptual-syn`: what holds for any weights, and what the shipped ones must do on pictures made here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.lab.video_metrics.perceptual_net import PerceptualDistance, load_perceptual, shipped_weights, unit
+
+
+def pictures(count: int = 2, height: int = 40, width: int = 56, seed: int = 0) -> Tensor:
+    """Draw soft coloured blobs ``(count, 3, height, width)`` in [-1, 1]."""
+    noise = stream("nets", seed, "perceptual").standard_normal((count, height, width, 3))
+    soft = np.stack([cv2.GaussianBlur(x, (0, 0), 2.0) for x in noise])
+    return torch.from_numpy(np.clip(soft / soft.std() / 2.5, -1, 1)).permute(0, 3, 1, 2).float()
+
+
+def blurred(image: Tensor, sigma: float) -> Tensor:
+    arrays = image.permute(0, 2, 3, 1).numpy()
+    return torch.from_numpy(np.stack([cv2.GaussianBlur(x, (0, 0), sigma) for x in arrays])).permute(0, 3, 1, 2)
+
+
+@pytest.fixture(scope="module")
+def net() -> PerceptualDistance:
+    return load_perceptual()
+
+
+def test_distance_is_zero_for_equal_and_symmetric_for_other_pictures(net: PerceptualDistance) -> None:
+    a, b = pictures(), pictures(seed=1)
+    assert torch.equal(net.distance(a, a), torch.zeros(2))
+    torch.testing.assert_close(net.distance(a, b), net.distance(b, a))
+    assert torch.all(net.distance(a, b) > 0)
+
+
+def test_pictures_of_a_batch_do_not_meet(net: PerceptualDistance) -> None:
+    a, b = pictures(3), pictures(3, seed=1)
+    alone = torch.cat([net.distance(a[i : i + 1], b[i : i + 1]) for i in range(3)])
+    torch.testing.assert_close(net.distance(a, b), alone)
+    torch.testing.assert_close(net.distance(a.flip(0), b.flip(0)), alone.flip(0))
+
+
+def test_distance_is_the_sum_over_stages_written_out(net: PerceptualDistance) -> None:
+    a, b = pictures(1), pictures(1, seed=1)
+    wanted = 0.0
+    for x, y, head in zip(net.trunk(a), net.trunk(b), net.heads, strict=True):
+        p, q = (f[0].double() / (f[0].double().square().sum(0) + 1e-4).sqrt() for f in (x, y))
+        wanted += float(((p - q) ** 2 * torch.nn.functional.softplus(head.double())[:, None, None]).sum(0).mean())
+    assert float(net.distance(a, b)) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_gradient_is_that_of_finite_differences() -> None:
+    torch.manual_seed(0)
+    net = PerceptualDistance((2, 3, 4, 5)).double().requires_grad_(False)
+    a, b = pictures(1, 16, 24).double().requires_grad_(), pictures(1, 16, 24, seed=1).double()
+    (gradient,) = torch.autograd.grad(net.distance(a, b).sum(), a)
+    for seed in range(4):
+        along = torch.from_numpy(stream("nets", seed, "direction").standard_normal(a.shape))
+        plus, minus = (net.distance(a.detach() + step * along, b) for step in (1e-6, -1e-6))
+        assert float((gradient * along).sum()) == pytest.approx(float((plus - minus) / 2e-6), rel=1e-5, abs=1e-9)
+
+
+def test_network_is_frozen_and_pictures_get_a_finite_gradient(net: PerceptualDistance) -> None:
+    assert not any(p.requires_grad for p in net.parameters())
+    a = pictures().requires_grad_()
+    net.distance(a, pictures(seed=1)).sum().backward()
+    assert a.grad is not None
+    assert torch.isfinite(a.grad).all()
+    assert a.grad.abs().sum() > 0
+
+
+def test_equal_and_flat_pictures_have_a_finite_gradient(net: PerceptualDistance) -> None:
+    for value in (-1.0, 0.0, 1.0):
+        flat = torch.full((1, 3, 32, 32), value, requires_grad=True)
+        net.distance(flat, flat.detach()).sum().backward()
+        assert flat.grad is not None
+        assert torch.equal(flat.grad, torch.zeros_like(flat))
+
+
+def test_unit_features_have_unit_length_unless_they_are_nearly_nothing() -> None:
+    x = torch.tensor([3.0, 4.0, 0.0]).view(1, 3, 1, 1)
+    assert float(unit(x).norm()) == pytest.approx(1.0, abs=1e-5)
+    assert torch.equal(unit(torch.zeros(1, 3, 1, 1)), torch.zeros(1, 3, 1, 1))
+
+
+def test_shipped_distance_grows_with_blur_and_noise(net: PerceptualDistance) -> None:
+    a = pictures(4, 64, 96)
+    noise = torch.from_numpy(stream("nets", 0, "noise").standard_normal(a.shape)).float()
+    for damaged in ([blurred(a, s) for s in (0.5, 1.0, 2.0, 4.0)], [(a + s * noise).clamp(-1, 1) for s in (0.02, 0.05, 0.1, 0.3)]):
+        rungs = torch.stack([net.distance(d, a) for d in damaged])
+        assert torch.all(rungs.diff(dim=0) > 0)
+
+
+def test_shipped_distance_minds_blur_more_than_a_shift_of_one_pixel_where_ssim_does_not(shared_data: Path, net: PerceptualDistance) -> None:
+    """The example pictures of LPIPS: p0 is blurred, p1 is warped and nearer to the eye (and to LPIPS); by SSIM it is farther."""
+
+    def read(name: str) -> Tensor:
+        image = cv2.imread(str(shared_data / "lpips" / f"{name}.png"))[..., ::-1]
+        return torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float() / 127.5 - 1
+
+    ref, p0, p1 = read("ex_ref"), read("ex_p0"), read("ex_p1")
+    assert float(net.distance(ref, p1)) < float(net.distance(ref, p0))
+
+
+def test_weights_are_small_and_have_a_card() -> None:
+    path = shipped_weights()
+    assert path.stat().st_size <= 700_000
+    assert path.with_suffix(".card.json").is_file()
+
+
+def test_saved_weights_load_as_they_were(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    net = PerceptualDistance((4, 5, 6, 7))
+    net.save(tmp_path / "n.safetensors", {"steps": "1"})
+    again = load_perceptual(tmp_path / "n.safetensors")
+    for key, value in net.state_dict().items():
+        assert torch.equal(again.state_dict()[key], value.detach().half().float())
+
+
+@pytest.mark.parametrize(("a", "b"), [((1, 3, 32, 32), (2, 3, 32, 32)), ((3, 32, 32), (3, 32, 32)), ((1, 3, 8, 32), (1, 3, 8, 32))])
+def test_pictures_that_cannot_be_compared_are_refused(net: PerceptualDistance, a: tuple[int, ...], b: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match="two tensors"):
+        net.distance(torch.zeros(a), torch.zeros(b))
+
+
+def test_foreign_and_incomplete_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_perceptual(tmp_path / "none.safetensors")
+    save_file({"x": torch.zeros(1)}, tmp_path / "x.safetensors")
+    with pytest.raises(InputError, match="simrun-perceptual-1"):
+        load_perceptual(tmp_path / "x.safetensors")
+    tensors = load_file(shipped_weights())
+    del tensors["heads.2"]
+    save_file(tensors, tmp_path / "y.safetensors", {"format": "simrun-perceptual-1"})
+    with pytest.raises(InputError, match="without the heads"):
+        load_perceptual(tmp_path / "y.safetensors")
