@@ -1,73 +1,42 @@
-"""Data flows one way (docs/architecture.md): a stage imports what comes before it, never what comes after."""
+"""Data flows one way (docs/architecture.md): a room imports what stands before it in `ROOMS`, never what stands after it."""
 
 from __future__ import annotations
 
 import ast
+import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-REPO = Path(__file__).resolve().parents[1]
+import pytest
 
-# Stage -> what it may import besides itself and the shared modules directly in alpasim_plugin.
-# Third-party imports are free, except torch in evaluators.
-MAY_IMPORT: dict[str, set[str]] = {
-    "alpasim_plugin.world": set(),
-    "alpasim_plugin.gaussians": set(),
-    "scenarios": {"alpasim_plugin.world"},
-    "alpasim_plugin.renderers": {"alpasim_plugin.gaussians", "alpasim_plugin.world"},
-    "alpasim_plugin.nets": set(),
-    "alpasim_plugin.semantic_map": {"alpasim_plugin.gaussians"},
-    "alpasim_plugin.fixers": {"alpasim_plugin.gaussians", "alpasim_plugin.nets", "alpasim_plugin.semantic_map", "alpasim_plugin.world"},
-    "alpasim_plugin.lab.training": {
-        "alpasim_plugin.fixers",
-        "alpasim_plugin.gaussians",
-        "alpasim_plugin.log",
-        "alpasim_plugin.nets",
-        "alpasim_plugin.renderers",
-        "alpasim_plugin.semantic_map",
-        "alpasim_plugin.world",
-        "policies",
-        "scenarios",
-    },
-    "alpasim_plugin.control": set(),
-    "policies": set(),
-    "alpasim_plugin.alpasim": set(),
-    "alpasim_plugin.alpasim.client": {
-        "alpasim_plugin.alpasim",
-        "alpasim_plugin.control",  # a remote vehicle checks plans as every controller does
-        "alpasim_plugin.log",
-        "alpasim_plugin.world",  # road users behind a service stand in for the scenario's
-    },
-    "alpasim_plugin.alpasim.server": {
-        "alpasim_plugin.alpasim",
-        "alpasim_plugin.fixers",
-        "alpasim_plugin.log",
-        "alpasim_plugin.runtime",
-        "alpasim_plugin.semantic_map",
-        "scenarios",
-    },
-    "alpasim_plugin.log": {"alpasim_plugin.alpasim"},
-    "evaluators": set(),
-    "alpasim_plugin.viewer": {"alpasim_plugin.log", "evaluators"},
-    "alpasim_plugin.recordings": {"alpasim_plugin.log", "alpasim_plugin.viewer", "evaluators"},
-    "alpasim_plugin.runtime": {
-        "alpasim_plugin.alpasim",  # the messages of logs that it exports
-        "alpasim_plugin.alpasim.client",  # road users behind a service
-        "alpasim_plugin.fixers",
-        "alpasim_plugin.world",
-        "alpasim_plugin.renderers",
-        "alpasim_plugin.control",
-        "alpasim_plugin.log",
-        "alpasim_plugin.viewer",
-        "evaluators",
-        "policies",
-        "scenarios",
-    },
+REPO = Path(__file__).resolve().parents[1]
+A = "alpasim_plugin."
+
+# The rooms in the order in which data flows, and what each may import besides itself and `BASE`.
+BASE = (A + "core", A + "io", A + "process", A + "plugins")
+STAGES: dict[str, tuple[str, ...]] = {
+    A + "world": (),
+    A + "gaussians": (),
+    "scenarios": (A + "world",),
+    A + "nets": (),
+    A + "semantic_map": (A + "gaussians",),
+    A + "renderers": (A + "gaussians", A + "world"),
+    A + "fixers": (A + "gaussians", A + "world", A + "nets", A + "semantic_map"),
+    "policies": (),
+    A + "control": (),
+    A + "wire": (),
+    A + "log": (A + "wire",),
+    A + "run_folder": (A + "log",),
+    "evaluators": (A + "run_folder",),
+    A + "viewer": (A + "log", A + "run_folder", "evaluators"),
 }
-# What stands outside the stages: it may import everything, and nothing imports it.
-OUTSIDE = ("alpasim_plugin.cli", "alpasim_plugin.lab.bench", "alpasim_plugin.gym", "alpasim_plugin.notebook")
+# These compose the stages: each may import everything that stands before it, but no plug-in room.
+AFTER_THE_STAGES = (A + "runtime", A + "alpasim", A + "gym", A + "recordings", A + "notebook", A + "cli")
+# Rooms that register themselves by entry points, as another distribution does. Nobody imports them.
+PLUG_INS = (A + "block_fixers", A + "lab")
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios", "configs")
+ROOMS = (*BASE, *STAGES, *AFTER_THE_STAGES, *PLUG_INS)
 
 
 @dataclass(frozen=True)
@@ -96,10 +65,9 @@ def modules() -> tuple[Module, ...]:
     return tuple(found)
 
 
-def stage_of(module: str) -> str | None:
-    """Return the longest stage name that a module lies in; None for the shared modules and the package face."""
-    inside = [stage for stage in MAY_IMPORT if module == stage or module.startswith(stage + ".")]
-    return max(inside, key=len) if inside else None
+def room_of(module: str) -> str | None:
+    """Return the room that a module lies in; None for the face of the package."""
+    return next((room for room in ROOMS if module == room or module.startswith(room + ".")), None)
 
 
 def imported(nodes: tuple[ast.AST, ...]) -> set[str]:
@@ -109,40 +77,91 @@ def imported(nodes: tuple[ast.AST, ...]) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
             found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    return {name for name in found if name.split(".")[0] in PACKAGES}
 
 
-def imports_against_the_stream(module: Module) -> list[str]:
-    """Return a line for every import of this module that its stage may not make."""
-    if module.name.startswith(OUTSIDE) or module.name == "alpasim_plugin":
+def may_import(room: str) -> set[str]:
+    """Return the rooms that a room may import besides itself."""
+    if room in PLUG_INS:
+        return set(ROOMS)
+    if room in STAGES:
+        return {*BASE, *STAGES[room]}
+    return set(ROOMS[: ROOMS.index(room)])
+
+
+def upward_imports(module: Module) -> list[str]:
+    """Return a line for every import that a module's room may not make."""
+    room = room_of(module.name)
+    if room is None:
         return []
-    stage = stage_of(module.name)
-    wrong = []
-    for name in sorted(n for n in imported(module.nodes) if n.split(".")[0] in PACKAGES):
-        target = stage_of(name)
-        if name.startswith(OUTSIDE):
-            wrong.append(f"{module.name} imports what stands outside the stages: {name}")
-        elif target is None or target == stage:
+    allowed = may_import(room)
+    found = {(name, room_of(name)) for name in imported(module.nodes)}
+    return [f"{module.name} imports {name}" for name, target in sorted(found, key=str) if target not in (None, room, *allowed)]
+
+
+def test_every_module_lies_in_a_room() -> None:
+    faces = {"alpasim_plugin", "configs", "configs.can", "configs.fixers", "configs.paper"}
+    assert {module.name for module in modules() if room_of(module.name) is None} - faces == set()
+    assert {room for room in ROOMS if not any(room_of(module.name) == room for module in modules())} <= set(PLUG_INS)
+
+
+def test_rooms_import_only_rooms_that_stand_before_them() -> None:
+    assert [line for module in modules() for line in upward_imports(module)] == []
+
+
+def test_no_room_imports_in_a_circle() -> None:
+    """Modules of one room may import one another, but not in a circle either, imports inside functions included."""
+    arrows = {module.name: targets_of(module) for module in modules()}
+    done: set[str] = set()
+    path: list[str] = []
+
+    def visit(name: str) -> list[str]:
+        if name in path:
+            return [*path[path.index(name) :], name]
+        if name in done or name not in arrows:
+            return []
+        path.append(name)
+        circle = next((found for target in sorted(arrows[name]) if (found := visit(target))), [])
+        path.pop()
+        done.add(name)
+        return circle
+
+    assert [circle for name in arrows if (circle := visit(name))] == []
+
+
+def targets_of(module: Module) -> set[str]:
+    """Return the modules that a module imports when it runs: not what only type checkers import, nor a package for one of its modules."""
+    names = {one.name for one in modules()}
+    guarded = {id(inner) for node in module.nodes if is_for_type_checkers(node) for inner in ast.walk(node)}
+    found: set[str] = set()
+    for node in module.nodes:
+        if id(node) in guarded:
             continue
-        elif stage is None:
-            wrong.append(f"shared module {module.name} imports stage {target}")
-        elif target not in MAY_IMPORT[stage]:
-            wrong.append(f"{module.name} ({stage}) imports {name} ({target})")
-    return wrong
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            inner = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= inner & names or {node.module}
+    return (found & names) - {module.name}
 
 
-def test_the_rules_see_the_packages() -> None:
-    seen = {module.name for module in modules()}
-    assert {"alpasim_plugin", "alpasim_plugin.runtime.rollout", "evaluators", "policies.base", "scenarios", "configs"} <= seen
+def is_for_type_checkers(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
 
 
-def test_modules_import_only_what_lies_upstream() -> None:
-    assert [line for module in modules() for line in imports_against_the_stream(module)] == []
+@pytest.mark.parametrize("room", PLUG_INS)
+def test_the_core_does_not_name_a_plug_in_room(room: str) -> None:
+    """A string that names one of their modules is an import too: it would break where the room is not installed."""
+    word = re.compile(re.escape(room) + r"\b")
+    outside = [module for module in modules() if room_of(module.name) not in PLUG_INS]
+    assert [module.name for module in outside if word.search(module.path.read_text())] == []
 
 
 def test_evaluators_do_not_load_torch() -> None:
     own = [module for module in modules() if module.name.startswith("evaluators")]
-    assert [m.name for m in own if any(name.split(".")[0] == "torch" for name in imported(m.top))] == []
+    top = {m.name: {alias.name for node in m.top if isinstance(node, ast.Import) for alias in node.names} for m in own}
+    assert [name for name, names in top.items() if any(one.split(".")[0] == "torch" for one in names)] == []
+    assert [m.name for m in own if any(isinstance(n, ast.ImportFrom) and (n.module or "").split(".")[0] == "torch" for n in m.top)] == []
 
 
 def test_modules_stay_readable_in_one_sitting() -> None:
