@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from alpasim_plugin.core.errors import FixerError, SimrunError
 from alpasim_plugin.core.types import U8, Actor, Fixer, Frame, RenderRequest
 from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import actor_boxes
-from alpasim_plugin.semantic_map.prepare import PreparedMap
+from alpasim_plugin.semantic_map.prepare import PreparedMap, actor_boxes
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 DOING = "fixing a block of frames"

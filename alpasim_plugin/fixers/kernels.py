@@ -10,8 +10,7 @@ from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
 from alpasim_plugin.fixers.gather import gather_cells_cpu
 from alpasim_plugin.nets.pixel_generator import CELL, PixelState
 from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import ActorBox
-from alpasim_plugin.semantic_map.prepare import prepare_map
+from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
 
 SIDE_PX = 16
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x

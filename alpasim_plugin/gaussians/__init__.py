@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from alpasim_plugin.gaussians.camera import PinholeCamera as PinholeCamera
     from alpasim_plugin.gaussians.cloud import CleanReport as CleanReport
     from alpasim_plugin.gaussians.cloud import GaussianCloud as GaussianCloud
-    from alpasim_plugin.gaussians.files.formats import read_gaussians as read_gaussians
+    from alpasim_plugin.gaussians.files import read_gaussians as read_gaussians
     from alpasim_plugin.gaussians.files.ply import read_ply as read_ply
     from alpasim_plugin.gaussians.files.ply import write_ply as write_ply
-    from alpasim_plugin.gaussians.raster.output import RasterOutput as RasterOutput
     from alpasim_plugin.gaussians.raster.prepared import PreparedCloud as PreparedCloud
     from alpasim_plugin.gaussians.raster.prepared import prepare as prepare
+    from alpasim_plugin.gaussians.raster.rasterize import RasterOutput as RasterOutput
     from alpasim_plugin.gaussians.raster.rasterize import rasterize as rasterize
     from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared as rasterize_prepared
 
@@ -40,11 +40,11 @@ __getattr__ = lazy_names(
         "GaussianCloud": ".cloud",
         "PinholeCamera": ".camera",
         "PreparedCloud": ".raster.prepared",
-        "RasterOutput": ".raster.output",
+        "RasterOutput": ".raster.rasterize",
         "prepare": ".raster.prepared",
         "rasterize": ".raster.rasterize",
         "rasterize_prepared": ".raster.rasterize_cpu",
-        "read_gaussians": ".files.formats",
+        "read_gaussians": ".files",
         "read_ply": ".files.ply",
         "write_ply": ".files.ply",
     },

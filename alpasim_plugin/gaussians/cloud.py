@@ -1,9 +1,10 @@
-"""Hold a set of 3D Gaussians, and clean, move and join such sets."""
+"""Hold a set of 3D Gaussians, as a file states them or cleaned for drawing; clean, move and join such sets."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -259,3 +260,57 @@ def require_rigid(T: npt.ArrayLike, doing: str) -> None:
         fault = f"last row {m[3].tolist()}"
     if fault:
         raise InputError(doing, "a transform", fault, "give a (4, 4) rotation and translation, metres, column vectors")
+
+
+def all_rigid(T: F64) -> bool:
+    """Return whether all of ``(N, 4, 4)`` pass `require_rigid`; cheap for many."""
+    rotation = T[:, :3, :3]
+    gram = rotation @ rotation.transpose(0, 2, 1)
+    turns = np.all(np.abs(gram - np.eye(3)) <= 1e-5) and np.all(np.linalg.det(rotation) > 0)
+    return bool(turns and np.isfinite(T).all() and np.all(np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9))
+
+
+class GaussianArrays(NamedTuple):
+    """Decoded columns of a Gaussian file; values may still be NaN, infinite or unnormalised.
+
+    Attributes:
+        means: ``(N, 3)`` positions, file units and axes.
+        quats: ``(N, 4)`` wxyz, as stored.
+        scales: ``(N, 3)`` linear standard deviations.
+        opacities: ``(N,)`` linear, 0..1.
+        sh: ``(N, K, 3)`` colour coefficients, constant term first.
+    """
+
+    means: FloatArray
+    quats: FloatArray
+    scales: FloatArray
+    opacities: FloatArray
+    sh: FloatArray
+
+
+def sigmoid(x: FloatArray) -> F64:
+    """Return the logistic function in float64, without overflow for large negative input."""
+    e = np.exp(-np.abs(np.asarray(x, dtype=np.float64)))
+    return np.where(np.asarray(x) >= 0, 1.0 / (1.0 + e), e / (1.0 + e))
+
+
+def logit(p: FloatArray) -> F64:
+    """Return the inverse of `sigmoid` in float64; 0 and 1 give minus and plus infinity."""
+    q = np.asarray(p, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        return np.log(q) - np.log1p(-q)
+
+
+def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
+    """Clean decoded columns into a cloud; bands of harmonics above what can be drawn are left out and counted as repaired.
+
+    Raises:
+        InputError: Shapes disagree.
+    """
+    k = arrays.sh.shape[1]
+    kept = min(k, SH_SIZES[-1])
+    cloud, report = GaussianCloud.cleaned(*arrays[:4], arrays.sh[:, :kept])
+    if k > kept:
+        cause = f"colour harmonics beyond {kept} coefficients left out"
+        report = replace(report, repaired={**report.repaired, cause: len(cloud)})
+    return cloud, report

@@ -6,6 +6,7 @@ The basis (order k = 0 | -1, 0, 1 | -2..2 | -3..3) is orthonormal over the unit 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,17 +21,10 @@ C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
-def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
-    """Return the ``(..., size)`` basis at unit directions ``(..., 3)``; size is 1, 4, 9 or 16.
-
-    Example:
-        >>> sh_basis([0.0, 0.0, 1.0], 4).round(4).tolist()
-        [0.2821, -0.0, 0.4886, -0.0]
-    """
-    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+def sh_terms(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    """Return the basis functions of degrees 1 to 3, fifteen of them, at a unit direction: numbers, arrays or tensors alike."""
     xx, yy, zz = x * x, y * y, z * z
-    terms = [
-        np.full_like(x, C0),
+    return (
         -C1 * y,
         C1 * z,
         -C1 * x,
@@ -46,7 +40,18 @@ def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
         -C3[2] * x * (4 * zz - xx - yy),
         C3[4] * z * (xx - yy),
         -C3[0] * x * (xx - 3 * yy),
-    ]
+    )
+
+
+def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
+    """Return the ``(..., size)`` basis at unit directions ``(..., 3)``; size is 1, 4, 9 or 16.
+
+    Example:
+        >>> sh_basis([0.0, 0.0, 1.0], 4).round(4).tolist()
+        [0.2821, -0.0, 0.4886, -0.0]
+    """
+    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+    terms = (np.full_like(x, C0), *sh_terms(x, y, z))
     return np.stack(terms[:size], axis=-1)
 
 

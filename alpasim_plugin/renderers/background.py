@@ -1,15 +1,111 @@
-"""The background file of a scenario: read, placed, and refused where nothing of it could be seen on the drive."""
+"""The background file of a scenario: read, placed, and refused where nothing of it could be seen on the drive.
+
+`Coverage` says whether a Gaussian file stands where the drive is: its bounds, the share of the path near it, a place where it might belong.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, BackgroundFile, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.files.formats import read_gaussians
+from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.scene.builder import placed_cloud
-from alpasim_plugin.gaussians.scene.coverage import Coverage, coverage_of, suggested_transform
+
+NEAR_M, BELOW_M, ABOVE_M = 10.0, 5.0, 15.0  # a Gaussian is near a point of the path: in plan view, and in height
+FEWEST = 20  # Gaussians near a point of the path for it to count as covered
+STEP_M = 2.0
+VISIBLE = 0.05  # opacity
+BULK = (1.0, 99.0)  # percentiles: files have strays
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Where a model stands.
+
+    Attributes:
+        low, high: ``(3,)`` bounds of its bulk (1st to 99th percentile of what is not transparent), metres, world.
+        covered: Share of the path with Gaussians near it, 0..1.
+    """
+
+    low: F64
+    high: F64
+    covered: float
+
+    def __str__(self) -> str:
+        spans = (f"{axis} {low:.1f} to {high:.1f}" for axis, low, high in zip("xyz", self.low, self.high, strict=True))
+        return f"it spans {', '.join(spans)} m and covers {100 * self.covered:.0f} % of the route"
+
+
+def coverage_of(cloud: GaussianCloud, path: F64) -> Coverage:
+    """Measure how much of a path a model covers.
+
+    Args:
+        cloud: In world coordinates.
+        path: ``(N, 3)`` metres, world: the recorded drive.
+    """
+    points = _bulk(cloud)
+    if not len(points):
+        return Coverage(np.full(3, np.nan), np.full(3, np.nan), 0.0)
+    low, high = np.percentile(points, BULK, axis=0)
+    at = _along(path)
+    covered = [_count_near(points, one) >= FEWEST for one in at]
+    return Coverage(low, high, float(np.mean(covered)))
+
+
+def suggested_transform(cloud: GaussianCloud, path: F64) -> F64:
+    """Guess where a file belongs: ``(4, 4)`` from its frame to the world, without scale.
+
+    The axis of least spread is taken as vertical, its dense end as the ground; the longer horizontal axis is laid along the path, the
+    middle on the path's middle, the ground at its height. A start to correct by eye: a file does not say which end of it is the front.
+    """
+    points = _bulk(cloud)
+    low, middle, high = np.percentile(points, (5.0, 50.0, 95.0), axis=0)
+    vertical = int(np.argmin(high - low))
+    sign = 1.0 if middle[vertical] - low[vertical] <= high[vertical] - middle[vertical] else -1.0
+    up = sign * np.eye(3)[vertical]
+    one = np.eye(3)[(vertical + 1) % 3]
+    R_flat_file = np.stack([one, np.cross(up, one), up])  # (3, 3): its rows are the flat frame's axes in the file
+    flat = points @ R_flat_file.T
+    turn = _heading(path[:, :2]) - _heading(flat[:, :2])
+    c, s = np.cos(turn), np.sin(turn)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_flat_file
+    placed = points @ R.T
+    at = _along(path)
+    target = np.array([*at[len(at) // 2, :2], np.median(at[:, 2])])
+    source = np.array([*np.median(placed[:, :2], axis=0), np.percentile(placed[:, 2], 5.0)])
+    T_world_file = np.eye(4)
+    T_world_file[:3, :3], T_world_file[:3, 3] = R, target - source
+    return T_world_file
+
+
+def _bulk(cloud: GaussianCloud) -> F64:
+    return np.asarray(cloud.means[cloud.opacities > VISIBLE], dtype=np.float64)
+
+
+def _along(path: F64) -> F64:
+    """Return points ``(K, 3)`` every `STEP_M` along a path ``(N, 3)``."""
+    s = arc_lengths(path[:, :2])
+    at = np.linspace(0.0, s[-1], max(2, int(s[-1] / STEP_M) + 1))
+    return np.stack([np.interp(at, s, path[:, axis]) for axis in range(3)], axis=1)
+
+
+def _count_near(points: F64, at: F64) -> int:
+    rise = points[:, 2] - at[2]
+    flat = (points[:, 0] - at[0]) ** 2 + (points[:, 1] - at[1]) ** 2 <= NEAR_M**2
+    return int(np.sum(flat & (rise >= -BELOW_M) & (rise <= ABOVE_M)))
+
+
+def _heading(xy: F64) -> float:
+    """Return the direction of the longest extent of points ``(N, 2)``, radians in (-pi/2, pi/2]."""
+    centred = xy - xy.mean(axis=0)
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    return float(np.arctan2(vectors[1, -1], vectors[0, -1]))
+
 
 LEAST = 0.05  # share of the route with Gaussians near it; below it the cameras look into emptiness
 
@@ -62,5 +158,5 @@ def _advice(cloud: GaussianCloud, path: F64) -> str:
 
 
 def _short(value: float) -> str:
-    """Print a number of a matrix; a rotation with fewer digits would be refused as none."""
+    """Print a number of a matrix; a rotation with fewer digits would be refused."""
     return f"{np.round(value, 7) + 0.0:.8g}"

@@ -17,17 +17,15 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.core.types import F64, CameraSpec, Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.core.types import F64, Frame, Renderer, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.raster.rasterize import Backend
+from alpasim_plugin.gaussians.fit.views import scaled_camera
+from alpasim_plugin.gaussians.raster.rasterize import Backend, RasterOutput
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.degrade import GHOST, Surrogate, log_actors, log_times
-from alpasim_plugin.gaussians.scene.log_views import LogView
-from alpasim_plugin.gaussians.scene.nodes import SceneNode
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
+from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode
 from alpasim_plugin.renderers.background import read_background
 from alpasim_plugin.world.ground import height_at
 
@@ -140,19 +138,10 @@ def log_views(scenario: Scenario, scene: SceneGraph) -> list[LogView]:
     for t_us in times:
         T_world_rig = interpolate(scenario.ego_log, t_us)
         for spec in cameras:
-            camera = _small(spec, T_world_rig)
+            camera = scaled_camera(spec, T_world_rig @ spec.T_rig_camera, LOG_VIEW_WIDTH)
             out = scene.render(camera, log_actors(scenario, t_us))
             views.append(LogView(camera, out.depth, out.alpha))
     return views
-
-
-def _small(spec: CameraSpec, T_world_rig: F64) -> PinholeCamera:
-    scale = min(1.0, LOG_VIEW_WIDTH / spec.width)
-    width, height = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
-    K = spec.K.copy()
-    K[0] *= width / spec.width
-    K[1] *= height / spec.height
-    return PinholeCamera.from_pose(width, height, K, T_world_rig @ spec.T_rig_camera)
 
 
 def scene_key(scenario: Scenario) -> str:

@@ -19,8 +19,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.fit import SplatRecipe, Start, held_out, logged_views, start_from_depth
 from alpasim_plugin.gaussians.fit.loop import fit
-from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary
-from alpasim_plugin.gaussians.fit.similarity import SsimTarget
+from alpasim_plugin.gaussians.fit.quality import Comparison, SsimTarget, compare, summary
 from alpasim_plugin.renderers.gaussian import scene_of
 from scenarios.load import load_scenario
 

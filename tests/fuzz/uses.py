@@ -71,7 +71,7 @@ def one_of(pattern: str, use: Callable[[Path], object]) -> Callable[[Path], None
 
 def use_gaussians(path: Path) -> None:
     from alpasim_plugin.gaussians import PinholeCamera, rasterize
-    from alpasim_plugin.gaussians.files.formats import read_gaussians
+    from alpasim_plugin.gaussians.files import read_gaussians
 
     cloud, _ = read_gaussians(path)
     camera = PinholeCamera(16, 12, np.array([[12.0, 0, 8], [0, 12.0, 6], [0, 0, 1]]), np.eye(4))
@@ -151,6 +151,6 @@ def use_poses(path: Path) -> None:
 
 
 def use_views(folder: Path) -> None:
-    from alpasim_plugin.gaussians.fit.view_files import read_views
+    from alpasim_plugin.gaussians.fit.photographs import read_views
 
     read_views(folder)

@@ -103,7 +103,7 @@ def make_commonroad(folder: Path) -> None:
 def make_cloud(writer: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         from alpasim_plugin.gaussians import write_ply
-        from alpasim_plugin.gaussians.files.splat import write_splat
+        from alpasim_plugin.gaussians.files.packed import write_splat
         from tests.gaussians.gaussian_scenes import random_cloud
 
         if writer == "ply":

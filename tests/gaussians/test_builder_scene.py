@@ -12,9 +12,8 @@ from alpasim_plugin.core.types import Environment, LaneMap, Route, Scenario, Tra
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
 from alpasim_plugin.gaussians.scene.builder import build_scene, placed_cloud, with_background
-from alpasim_plugin.gaussians.scene.contours import contours
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.scene.site import make_site
+from alpasim_plugin.gaussians.scene.site import contours, make_site
 from alpasim_plugin.world.ground import height_at
 from tests.examples import first_of
 from tests.gaussians.scene_maps import STREET_ACTORS, camera_spec, crossing, curve, line, make_scenario, road_lanes, straight

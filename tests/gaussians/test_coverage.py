@@ -14,7 +14,7 @@ from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.gaussians.scene.builder import placed_cloud
-from alpasim_plugin.gaussians.scene.coverage import coverage_of, suggested_transform
+from alpasim_plugin.renderers.background import coverage_of, suggested_transform
 from scenarios.load import load_scenario
 
 PATH = np.stack([np.linspace(0.0, 80.0, 81), np.zeros(81), np.zeros(81)], axis=1)

@@ -12,9 +12,8 @@ import torch
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians import PinholeCamera
 from alpasim_plugin.gaussians.raster import rasterize_gsplat
-from alpasim_plugin.gaussians.raster.gradient_gsplat import rasterize_gradient_gsplat
-from alpasim_plugin.gaussians.raster.gradient_types import Splats
-from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gradient_gsplat
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import FIELDS
@@ -40,7 +39,7 @@ def gsplat(monkeypatch):
     """Replace gsplat by the stand-in; the one-Gaussian check of the device has tests of its own."""
     module = types.ModuleType("gsplat")
     module.rasterization = stand_in
-    monkeypatch.setattr("alpasim_plugin.gaussians.raster.gradient_gsplat.require_gsplat", lambda device: module)
+    monkeypatch.setattr("alpasim_plugin.gaussians.raster.rasterize_gsplat.require_gsplat", lambda device: module)
 
 
 def test_gradients_and_images_equal_those_of_the_cpu(gsplat):

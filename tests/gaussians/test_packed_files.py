@@ -14,13 +14,17 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply
-from alpasim_plugin.gaussians.arrays import SH_C0
-from alpasim_plugin.gaussians.files.compressed_ply import read_compressed_ply, unpack_rotation
-from alpasim_plugin.gaussians.files.formats import read_gaussians
-from alpasim_plugin.gaussians.files.ply_header import read_ply_header
-from alpasim_plugin.gaussians.files.splat import read_splat, write_splat
-from alpasim_plugin.gaussians.files.spz import read_spz, unpack_smallest_three
-from alpasim_plugin.gaussians.sh import sh_basis
+from alpasim_plugin.gaussians.files import read_gaussians
+from alpasim_plugin.gaussians.files.packed import (
+    read_compressed_ply,
+    read_splat,
+    read_spz,
+    unpack_rotation,
+    unpack_smallest_three,
+    write_splat,
+)
+from alpasim_plugin.gaussians.files.ply import read_ply_header
+from alpasim_plugin.gaussians.sh import C0, sh_basis
 from tests.examples import examples
 
 
@@ -105,7 +109,7 @@ def test_packed_bits_are_spread_over_the_chunk(tmp_path: Path) -> None:
     raw = read_compressed_ply(path)
     np.testing.assert_allclose(raw.means, [[2, 10, 22]])
     np.testing.assert_allclose(raw.scales, np.exp([[-3, -3, -3]]))
-    np.testing.assert_allclose(raw.sh[0, 0], (np.array([1, 0, 0.2]) - 0.5) / SH_C0, rtol=1e-6)
+    np.testing.assert_allclose(raw.sh[0, 0], (np.array([1, 0, 0.2]) - 0.5) / C0, rtol=1e-6)
     assert raw.opacities[0] == pytest.approx(0.4)
     np.testing.assert_allclose(raw.quats[0], [1, 0, 0, 0], atol=1e-3)
 
@@ -147,8 +151,8 @@ def test_splat_round_trip_keeps_positions_and_scales_exactly(tmp_path: Path, bik
     np.testing.assert_array_equal(back.means, cloud.means)
     np.testing.assert_array_equal(back.scales, cloud.scales.astype(np.float32))
     assert np.abs(back.opacities - cloud.opacities).max() <= 0.5 / 255 + 1e-9
-    rgb = np.clip(0.5 + SH_C0 * cloud.sh[:, 0], 0, 1)
-    assert np.abs(0.5 + SH_C0 * back.sh[:, 0] - rgb).max() <= 0.5 / 255 + 1e-6
+    rgb = np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)
+    assert np.abs(0.5 + C0 * back.sh[:, 0] - rgb).max() <= 0.5 / 255 + 1e-6
     angle = 2 * np.arccos(np.clip(np.abs(np.sum(back.quats * cloud.quats, axis=1)), 0, 1))
     # Each component is off by up to 1/256, and +1 is stored as 127/128.
     assert angle.max() < 2 * np.sqrt(4) / 128
@@ -166,7 +170,7 @@ def test_splat_bytes_worked_by_hand(tmp_path: Path) -> None:
     (tmp_path / "a.splat").write_bytes(row)
     raw = read_splat(tmp_path / "a.splat")
     np.testing.assert_array_equal(raw.quats, [[0.5, 0, -0.5, 0]])
-    np.testing.assert_allclose(0.5 + SH_C0 * raw.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(0.5 + C0 * raw.sh[0, 0], [1, 0, 0.2], atol=1e-6)
     assert raw.opacities[0] == 128 / 255
 
 

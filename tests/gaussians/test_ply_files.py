@@ -12,9 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud, read_ply, write_ply
-from alpasim_plugin.gaussians.files.formats import read_gaussians
-from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays
-from alpasim_plugin.gaussians.files.ply_header import read_ply_element, read_ply_header
+from alpasim_plugin.gaussians.files import read_gaussians
+from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays, read_ply_element, read_ply_header
 from tests.examples import examples
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasterize_prepared
+from alpasim_plugin.gaussians.constants import BLOCK_REACH, RADIUS_X, RADIUS_Y, RECORD
 from alpasim_plugin.gaussians.raster import rasterize_cpu as cpu
 from alpasim_plugin.gaussians.raster.binning import depth_order
-from alpasim_plugin.gaussians.raster.layout import BLOCK_REACH, RADIUS_X, RADIUS_Y, RECORD
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT, P0, P1, P2, P3, P4, P5, raster_tiles
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from alpasim_plugin.lab.bench.raster import driving_camera, driving_like_scene

@@ -11,8 +11,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
-from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, split_by_tile
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, in_view
+from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, in_view, split_by_tile
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.examples import examples

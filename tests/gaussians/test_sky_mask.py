@@ -4,8 +4,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.scene.log_views import LogView
-from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
+from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask
 
 
 def camera(width: int, height: int, yaw_rad: float = 0.0, x_m: float = 0.0) -> PinholeCamera:

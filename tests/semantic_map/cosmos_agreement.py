@@ -27,10 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.core.geometry import se2, se3
 from alpasim_plugin.core.types import F64, U8, Bool, Box, LaneMap
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import ActorBox, Area, MapExtras
-from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
-from alpasim_plugin.semantic_map.projection import FThetaCamera
+from alpasim_plugin.semantic_map.draw import FThetaCamera, draw_map
+from alpasim_plugin.semantic_map.prepare import ActorBox, Area, MapExtras, PreparedMap, prepare_map
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL, MapStyle
 from scenarios.cosmos import read_cosmos
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses

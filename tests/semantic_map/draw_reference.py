@@ -17,7 +17,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec
-from alpasim_plugin.semantic_map.draw import actor_geometry, samples_of, stretch_of, view_of
+from alpasim_plugin.semantic_map.draw import MapCamera, actor_geometry, radius_of, samples_of, stretch_of, view_of
 from alpasim_plugin.semantic_map.kernels import (
     BACK,
     BIAS,
@@ -31,9 +31,7 @@ from alpasim_plugin.semantic_map.kernels import (
     SHAPE,
     STROKE,
 )
-from alpasim_plugin.semantic_map.layers import ActorBox
-from alpasim_plugin.semantic_map.prepare import PreparedMap, Segments, Triangles
-from alpasim_plugin.semantic_map.projection import MapCamera, radius_of
+from alpasim_plugin.semantic_map.prepare import ActorBox, PreparedMap, Segments, Triangles
 from alpasim_plugin.semantic_map.style import WIDTH_DEFINED_AT_PX, MapStyle
 
 

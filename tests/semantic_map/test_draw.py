@@ -11,10 +11,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Actor, Box, CameraSpec, FTheta, LaneMap, Trajectory
 from alpasim_plugin.semantic_map import draw as conditioning
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import ActorBox, Area, LaneLine, MapExtras, TrafficLight, actor_boxes
-from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.semantic_map.projection import FThetaCamera
+from alpasim_plugin.semantic_map.draw import FThetaCamera, draw_map
+from alpasim_plugin.semantic_map.prepare import ActorBox, Area, LaneLine, MapExtras, TrafficLight, actor_boxes, prepare_map
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL
 from tests.examples import examples, first_of
 from tests.semantic_map.draw_reference import draw_map_reference, draw_reference

@@ -11,10 +11,8 @@ import pytest
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import ActorBox
-from alpasim_plugin.semantic_map.prepare import prepare_map
-from alpasim_plugin.semantic_map.projection import kernel_camera
+from alpasim_plugin.semantic_map.draw import draw_map, kernel_camera
+from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
 from alpasim_plugin.semantic_map.style import BOX_COLOURS, COLOURS
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
 from scenarios.reading import SourceFiles

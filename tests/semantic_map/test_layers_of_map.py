@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.types import Lane, LaneMap, Marking
-from alpasim_plugin.semantic_map.layers import LaneLine, MapExtras, lane_lines
-from alpasim_plugin.semantic_map.prepare import cut_dashes, prepare_map, triangulate
+from alpasim_plugin.semantic_map.prepare import LaneLine, MapExtras, cut_dashes, lane_lines, prepare_map, triangulate
 from alpasim_plugin.semantic_map.style import LUDUS, OPENGL, STYLES, box_class
 from tests.examples import examples
 

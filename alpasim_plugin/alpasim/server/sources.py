@@ -22,7 +22,7 @@ from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import actor_boxes
+from alpasim_plugin.semantic_map.prepare import actor_boxes
 from alpasim_plugin.wire import sensorsim_pb2
 
 DOING = "rendering a requested frame"

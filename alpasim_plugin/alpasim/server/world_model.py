@@ -35,8 +35,7 @@ from alpasim_plugin.io.reading.images import check_image
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import actor_boxes
-from alpasim_plugin.semantic_map.prepare import prepare_map
+from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.wire import common_pb2, video_model_pb2
 
 DOING = "serving AlpaSim's video-model service"

@@ -18,18 +18,17 @@ from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.fit.adam import RowAdam
-from alpasim_plugin.gaussians.fit.checkpoint import STATE_FILE, load_state, save_state
-from alpasim_plugin.gaussians.fit.density import ScreenGradients, densify, reset_opacities
-from alpasim_plugin.gaussians.fit.model import Motion, SplatModel
-from alpasim_plugin.gaussians.fit.panorama import sky_of
+from alpasim_plugin.gaussians.fit.model import NAMES, Motion, RowAdam, ScreenGradients, SplatModel, densify, reset_opacities
+from alpasim_plugin.gaussians.fit.quality import SsimTarget
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
-from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.fit.similarity import SsimTarget
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.io.atomic import write_safetensors
+from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.io.reading.checkpoints import START_ANEW, read_checkpoint
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
 SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves
@@ -120,7 +119,7 @@ class SplatFit:
         self.targets = [_target(view, self.model, self.sky, device) for view in views]
         self._facts = json.dumps({"recipe": asdict(recipe), "scene": scene_id, "views": _digest(views, start)}, sort_keys=True)
         if folder is not None and (folder / STATE_FILE).exists():
-            self._resume(folder)
+            self.step = load_state(folder, self.model, self.adam, self.gradients, self._facts)
 
     def update(self) -> dict[str, float]:
         """Learn from one view.
@@ -151,9 +150,6 @@ class SplatFit:
         """Write the checkpoint, whole or not at all."""
         assert self.folder is not None
         save_state(self.folder, self.model, self.adam, self.gradients, self.step, self._facts)
-
-    def _resume(self, folder: Path) -> None:
-        self.step = load_state(folder, self.model, self.adam, self.gradients, self._facts)
 
     def _next_view(self) -> _Target:
         """Return the view of this step: all in a random order, then all in another."""
@@ -224,3 +220,35 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         for part in (cloud.means, cloud.scales, cloud.sh):
             add(part)
     return digest.hexdigest()
+
+
+STATE_FILE = "state.safetensors"
+
+
+def save_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, step: int, facts: str) -> None:
+    """Write everything that later updates depend on; the file appears complete or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {"node": model.node, "gradients.total": gradients.total, "gradients.count": gradients.count}
+    for name in NAMES:
+        tensors |= {f"value.{name}": model.params[name].detach(), f"first.{name}": adam.first[name], f"second.{name}": adam.second[name]}
+    write_safetensors(folder / STATE_FILE, tensors, {"step": str(step), "adam_step": str(adam.step), "facts": facts})
+
+
+def load_state(folder: Path, model: SplatModel, adam: RowAdam, gradients: ScreenGradients, facts: str) -> int:
+    """Put a saved state into objects made from the same start, and return the number of updates made.
+
+    Raises:
+        InputError: The folder was begun with other views, another start or another recipe, or its file is damaged.
+    """
+    path, doing = folder / STATE_FILE, "continuing a fit"
+    meta, stored = read_checkpoint(path, doing, facts)
+    device = model.node.device
+    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+        tensors = {name: t.to(device) for name, t in stored.items()}
+        model.node = tensors["node"]
+        model.params = {name: tensors[f"value.{name}"].requires_grad_() for name in NAMES}
+        adam.first = {name: tensors[f"first.{name}"] for name in NAMES}
+        adam.second = {name: tensors[f"second.{name}"] for name in NAMES}
+        adam.step = int(meta["adam_step"])
+        gradients.total, gradients.count = tensors["gradients.total"], tensors["gradients.count"]
+        return int(meta["step"])

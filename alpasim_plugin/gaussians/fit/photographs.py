@@ -1,13 +1,23 @@
-"""Photographs of a place with poses from structure from motion: read, freed of the lens's distortion, and triangulated.
+"""Read and write photographs with poses: a folder of images and a ``transforms.json``.
 
-The file is Instant-NGP's ``transforms.json``: intrinsics with OpenCV's radial and tangential distortion, and camera-to-world matrices with
-OpenGL axes. Posed images that need no undistortion are read by `view_files`.
+The file's keys are those of Instant-NGP and nerfstudio, which many tools write (COLMAP's poses through their converters, for example):
+
+    {"axes": "opencv", "w": 256, "h": 144, "fl_x": 210.0, "fl_y": 210.0, "cx": 128.0, "cy": 72.0, "k1": -0.1,
+     "ply_file_path": "points.ply",
+     "frames": [{"file_path": "images/0000.png", "transform_matrix": [[...], [...], [...], [0, 0, 0, 1]],
+                 "t_us": 100000, "sky_path": "sky/0000.png", "mask_path": "masks/0000.png"}]}
+
+``transform_matrix`` maps camera points to the world. ``axes`` says how the camera's axes lie: ``opencv`` is x right, y down, z forward;
+``opengl`` is x right, y up, z back (what Instant-NGP and nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3)
+may stand in a frame instead; pictures are freed of their distortion as they are read. Optional: ``t_us`` places the actors of a scenario;
+``sky_path`` is white where the image shows sky; ``mask_path`` is black where pixels do not count; ``ply_file_path`` names points to start
+from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,23 +26,29 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.core.types import F64, U8, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.files.ply import read_ply_element, read_ply_header
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
-from alpasim_plugin.gaussians.fit.view_files import AXES, FILE
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.limits import SOURCE_BYTES
 from alpasim_plugin.io.reading import read_bytes, read_json_object
 from alpasim_plugin.io.reading.images import decode_image
 from alpasim_plugin.io.reading.json_files import as_shape
 
+FILE = "transforms.json"
 DOING = "reading photographs"
-MODEL = ("k1", "k2", "p1", "p2", "k3")  # the order of OpenCV's coefficients
+AXES = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}  # the file's camera axes to ours
+LENS_MODELS = ("OPENCV", "PINHOLE")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # the order of OpenCV
 EXTENT_M = 4.0  # structure from motion has no unit: the camera that is farthest from their middle is put so far from it
 SIDE_PX = 16  # sides are multiples of this, as fixers need
-NEIGHBOURS, FEATURES, RATIO = 4, 2500, 0.75  # of the next photographs; SIFT keypoints; Lowe's ratio test
-LARGEST_ERROR_PX, LEAST_ANGLE_DEG = 1.5, 1.5  # of a triangulated point: reprojection, and between its rays
+RIGID = 1e-12  # a rotation this exact is taken as it is written
+_FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
+
+ActorsAt = Callable[[int], Mapping[str, F64]]  # time in microseconds -> actor id to T_world_box
 
 
 @dataclass(frozen=True)
@@ -50,17 +66,41 @@ class Photographs:
     listed: int
 
 
-class Match(NamedTuple):
-    """A point that two photographs show: their indices, and where, in pixels of their views ``(2,)``."""
+def read_views(folder: Path, actors_at: ActorsAt | None = None) -> tuple[list[PosedView], GaussianCloud | None]:
+    """Read a folder of posed images at full size, in metres: ``axes`` must be there, because files of both kinds look alike.
 
-    first: int
-    second: int
-    at_first: F64
-    at_second: F64
+    Args:
+        folder: Holds ``transforms.json`` and what it names.
+        actors_at: Poses of the actors at a frame's ``t_us``; None, or a frame without time, has no actors.
+
+    Returns:
+        The views in the file's order; and the start cloud that its points give, None where it names no points.
+
+    Raises:
+        InputError: A file or key is missing, or something in them cannot be: names the frame and what was found.
+    """
+    path = folder / FILE
+    document, frames = _frames(path)
+    axes = document.get("axes")
+    if not isinstance(axes, str) or axes not in AXES:
+        do = 'write "axes": "opencv" (y down, z forward) or "axes": "opengl" (y up, z back)'
+        raise InputError(DOING, f"{path}, key 'axes'", repr(axes), do)
+    if not frames:
+        raise InputError(DOING, str(path), "no frames", "list at least one frame")
+    views = []
+    for i, frame in enumerate(frames):
+        where = f"{path}, frame {i}"
+        lens, pose = _lens(frame, where), _pose(frame, where, AXES[axes])
+        view = _view(folder, frame, where, lens, pose)
+        sky, mask = (_flags(folder, frame, key, where, lens) for key in ("sky_path", "mask_path"))
+        actors = actors_at(int(frame["t_us"])) if actors_at is not None and "t_us" in frame else {}
+        views.append(replace(view, sky=sky, mask=mask, actors=actors))
+    points = document.get("ply_file_path")
+    return views, None if points is None else read_points(folder / points)
 
 
 def read_photographs(folder: Path, width: int = 256) -> Photographs:
-    """Read a folder of photographs.
+    """Read a folder of photographs from structure from motion: axes of OpenGL, an arbitrary unit, and not all images there.
 
     A picture is freed of its distortion at full size, then reduced by averaging, and its height is cut at the middle to a multiple of 16.
 
@@ -72,112 +112,127 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
         InputError: No such file, a key is missing, another lens model than OpenCV's, or fewer than two images exist.
     """
     path = folder / FILE
-    document = read_json_object(path, DOING, do_this=f"give a folder with images and their {FILE} (docs/lab/pairs.md)")
     if width < SIDE_PX or width % SIDE_PX:
         raise InputError(DOING, f"width {width}", f"not a multiple of {SIDE_PX}", f"choose for example {16 * SIDE_PX}")
-    odd = sorted({str(document["camera_model"])} if document.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE") else set())
-    if odd or document.get("k4"):
-        found = f"lens model {odd[0]}" if odd else "a coefficient k4"
-        raise InputError(DOING, str(path), found, "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first")
-    frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'", DOING)
-    here = [frame for frame in frames if (folder / str(frame.get("file_path"))).is_file()]
-    missing = tuple(str(frame.get("file_path")) for frame in frames if frame not in here)
-    if len(here) < 2:
-        raise InputError(DOING, str(folder), f"{len(here)} of {len(frames)} listed images exist", "give the images that the file names")
-    poses = _scaled(np.array([_pose(frame, f"{path}, {frame['file_path']}") for frame in here]))
-    views = [_view(folder, {**document, **frame}, T, width, path) for frame, T in zip(here, poses, strict=True)]
-    return Photographs(tuple(views), missing, len(frames))
+    _, frames = _frames(path)
+    there = {f"{path}, frame {i}": frame for i, frame in enumerate(frames) if (folder / str(frame.get("file_path"))).is_file()}
+    missing = [str(frame.get("file_path")) for i, frame in enumerate(frames) if f"{path}, frame {i}" not in there]
+    if len(there) < 2:
+        raise InputError(DOING, str(folder), f"{len(there)} of {len(frames)} listed images exist", "give the images that the file names")
+    poses = _scaled(np.array([_pose(frame, where, AXES["opengl"]) for where, frame in there.items()]))
+    views = []
+    for (where, frame), pose in zip(there.items(), poses, strict=True):
+        views.append(_cut(_view(folder, frame, where, _lens(frame, where), pose), width, where))
+    return Photographs(tuple(views), tuple(missing), len(frames))
+
+
+def write_views(folder: Path, views: Sequence[PosedView]) -> None:
+    """Write views in the form that `read_views` reads: images as PNG, axes of OpenCV; depth and actors are not written."""
+    frames = []
+    for i, view in enumerate(views):
+        camera = view.camera
+        frame: dict[str, Any] = {
+            "file_path": f"images/{i:04d}.png", "transform_matrix": inverse(camera.T_camera_world).tolist(),
+            "w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        }  # fmt: skip
+        _write_image(folder / frame["file_path"], view.rgb[..., ::-1])
+        for key, image in (("sky", view.sky), ("mask", view.mask)):
+            if image is not None:
+                frame[f"{key}_path"] = f"{key}/{i:04d}.png"
+                _write_image(folder / frame[f"{key}_path"], image.astype(np.uint8) * 255)
+        frames.append(frame)
+    write_json(folder / FILE, {"axes": "opencv", "frames": frames})
+
+
+def read_points(path: Path) -> GaussianCloud:
+    """Read a PLY of points as a start cloud; points without colour are grey.
+
+    Raises:
+        InputError: No such file, not a binary PLY of points, or no finite point.
+    """
+    rows = read_ply_element(read_ply_header(path), "vertex")
+    names = rows.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError("reading start points", str(path), f"properties {list(names)}", "give x, y and z")
+    points = np.stack([rows[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
+    coloured = {"red", "green", "blue"} <= set(names)
+    rgb = np.stack([rows[n] for n in ("red", "green", "blue")], axis=1) / 255.0 if coloured else np.full(points.shape, 0.5)
+    good = np.isfinite(points).all(axis=1)
+    if not good.any():
+        raise InputError("reading start points", str(path), f"{len(points)} points, none finite", "give points in metres")
+    return cloud_from_points(points[good], rgb[good])
 
 
 def resized(view: PosedView, width: int) -> PosedView:
-    """Return a view with another number of pixels, its field of view unchanged."""
-    camera, scale = view.camera, width / view.camera.width
-    height = round(camera.height * scale)
-    K = np.diag([scale, height / camera.height, 1.0]) @ camera.K
+    """Return a view with another number of pixels, its field of view unchanged; sky, mask and depth are left out."""
+    camera = view.camera
+    height = round(camera.height * width / camera.width)
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     rgb = cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA)
     return PosedView(PinholeCamera(width, height, K, camera.T_camera_world), np.asarray(rgb, dtype=np.uint8), view.name)
 
 
-def matches(views: Sequence[PosedView]) -> list[Match]:
-    """Return points that a view and one of its next ones show: SIFT, nearest neighbours in both directions, ratio test."""
-    sift, matcher = cv2.SIFT_create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)  # type: ignore[attr-defined]
-    found = []
-    for view in views:
-        points, described = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)
-        found.append((np.array([p.pt for p in points]).reshape(-1, 2) + 0.5, described))
-    out = []
-    for i in range(len(views)):
-        for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(views))):
-            (at_i, describes_i), (at_j, describes_j) = found[i], found[j]
-            if describes_i is None or describes_j is None or len(at_i) < 2 or len(at_j) < 2:
-                continue
-            back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(describes_j, describes_i, k=1)}
-            for best, second in matcher.knnMatch(describes_i, describes_j, k=2):
-                if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx:
-                    out.append(Match(i, j, at_i[best.queryIdx], at_j[best.trainIdx]))
-    return out
+class _Lens(NamedTuple):
+    """What a frame says of its lens: the picture's size, intrinsics, and OpenCV's coefficients of distortion."""
+
+    width: int
+    height: int
+    K: F64
+    distortion: F64
+
+    def straight_K(self) -> F64:
+        """Return the intrinsics without distortion: what they show is all in the photograph."""
+        if not self.distortion.any():
+            return self.K
+        whole, _ = cv2.getOptimalNewCameraMatrix(self.K - _FROM_CORNER, self.distortion, (self.width, self.height), 0.0)
+        return np.asarray(whole, dtype=np.float64) + _FROM_CORNER
+
+    def straightened(self, image: U8) -> U8:
+        """Return an image freed of the distortion."""
+        if not self.distortion.any():
+            return image
+        whole = self.straight_K() - _FROM_CORNER
+        return np.asarray(cv2.undistort(image, self.K - _FROM_CORNER, self.distortion, None, whole), dtype=np.uint8)
 
 
-def triangulated(
-    views: Sequence[PosedView], found: Sequence[Match], used: Sequence[int], most: int, rng: np.random.Generator
-) -> GaussianCloud:
-    """Return start Gaussians at the points that views place consistently.
-
-    Args:
-        views: That were matched.
-        found: Their matches.
-        used: Indices of the views that may be looked at; matches with others are left out.
-        most: Points at most, drawn from all.
-        rng: Draws them.
-
-    Raises:
-        InputError: Fewer than ten such points.
-    """
-    may, points, colours = set(used), [], []
-    pairs = sorted({(m.first, m.second) for m in found if m.first in may and m.second in may})
-    for i, j in pairs:
-        mine = [m for m in found if (m.first, m.second) == (i, j)]
-        a, b = (np.array([at for at in side]) for side in ([m.at_first for m in mine], [m.at_second for m in mine]))
-        place, good = _triangulate(views[i].camera, views[j].camera, a, b)
-        at = a[good].astype(np.int64)
-        points.append(place[good])
-        colours.append(views[i].rgb[at[:, 1], at[:, 0]] / 255.0)
-    count = sum(map(len, points))
-    if count < 10:
-        found_text = f"{count} points that two photographs place consistently"
-        raise InputError(
-            "starting from photographs", f"{len(used)} photographs", found_text, "give photographs that overlap, in order along the way"
-        )
-    kept = rng.permutation(count)[:most]
-    return cloud_from_points(np.concatenate(points)[kept], np.concatenate(colours)[kept])
+def _frames(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the document, and its frames with what it says for all of them."""
+    document = read_json_object(path, DOING, do_this=f"give a folder with images and their {FILE} (docs/reconstruction.md)")
+    frames = as_shape(list[dict[str, Any]], document.get("frames") or [], f"{path}, key 'frames'", DOING)
+    return document, [{**document, **frame} for frame in frames]
 
 
-def _triangulate(first: PinholeCamera, second: PinholeCamera, a: F64, b: F64) -> tuple[F64, np.ndarray[Any, np.dtype[np.bool_]]]:
-    """Return points ``(N, 3)`` and which are good: before both cameras, near both rays, and seen at an angle."""
-    P = [camera.K @ camera.T_camera_world[:3] for camera in (first, second)]
-    homogeneous = cv2.triangulatePoints(P[0], P[1], a.T, b.T)
-    w = np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
-    points = (homogeneous[:3] / w).T
-    good = np.ones(len(points), dtype=bool)
-    for camera, at in ((first, a), (second, b)):
-        local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-        pixel = local @ camera.K.T
-        error = np.linalg.norm(pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - at, axis=1)
-        good &= (local[:, 2] > 1e-3) & (error < LARGEST_ERROR_PX)
-    rays = [points - camera.centre_world for camera in (first, second)]
-    cosine = np.einsum("ij,ij->i", *rays) / np.maximum(np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-12)
-    return points, good & (cosine < np.cos(np.radians(LEAST_ANGLE_DEG)))
+def _lens(frame: Mapping[str, Any], where: str) -> _Lens:
+    model = frame.get("camera_model", LENS_MODELS[0])
+    if model not in LENS_MODELS or frame.get("k4"):
+        found = f"lens model {model}" if model not in LENS_MODELS else "a coefficient k4"
+        do = "give OpenCV's k1, k2, p1, p2, k3, or undistort the images first (ns-process-data, colmap image_undistorter)"
+        raise InputError(DOING, where, found, do)
+    try:
+        width, height = int(frame["w"]), int(frame["h"])
+        K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], dtype=np.float64)
+        distortion = np.array([float(frame.get(key) or 0.0) for key in COEFFICIENTS])
+        if not np.isfinite([*K.ravel(), *distortion]).all() or min(K[0, 0], K[1, 1]) <= 0:
+            raise ValueError("intrinsics that are not finite, or no focal length")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/reconstruction.md)"
+        raise InputError(DOING, where, f"{type(error).__name__}: {error}", do) from error
+    return _Lens(width, height, K, distortion)
 
 
-def _pose(frame: dict[str, Any], where: str) -> F64:
-    T = np.asarray(as_shape(list[list[float]], frame.get("transform_matrix"), f"{where}, transform_matrix", DOING), dtype=np.float64)
+def _pose(frame: Mapping[str, Any], where: str, axes: F64) -> F64:
+    where = f"{where}, transform_matrix"
+    T = np.asarray(as_shape(list[list[float]], frame.get("transform_matrix"), where, DOING), dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(DOING, f"{where}, transform_matrix", f"shape {T.shape}", "give a finite matrix of 4 x 4")
-    u, _, vt = np.linalg.svd(T[:3, :3])  # what is written with a few digits is not quite a rotation
-    if np.abs(T[:3, :3] - u @ vt).max() > 1e-3 or np.linalg.det(u @ vt) < 0:
-        raise InputError(DOING, f"{where}, transform_matrix", "its first three columns are no rotation", "give a rigid transform")
-    T[:3, :3] = u @ vt
-    return np.asarray(T @ AXES["opengl"])
+        raise InputError(DOING, where, f"shape {T.shape}", "give a finite matrix of 4 x 4")
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    rotation = u @ vt
+    off = np.abs(T[:3, :3] - rotation).max()
+    if off > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InputError(DOING, where, "its first three columns are no rotation", "give a rigid transform")
+    if off > RIGID:  # what is written with a few digits is not quite a rotation
+        T[:3, :3] = rotation
+    return np.asarray(T @ axes)
 
 
 def _scaled(poses: F64) -> F64:
@@ -189,35 +244,53 @@ def _scaled(poses: F64) -> F64:
     return out
 
 
-def _view(folder: Path, frame: dict[str, Any], T_world_camera: F64, width: int, path: Path) -> PosedView:
-    where = f"{path}, {frame['file_path']}"
-    try:
-        full_w, full_h = int(frame["w"]), int(frame["h"])
-        K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]], dtype=np.float64)
-        bend = np.array([float(frame.get(key) or 0.0) for key in MODEL])
-        if not np.isfinite([*K.ravel(), *bend]).all() or min(K[0, 0], K[1, 1]) <= 0:
-            raise ValueError("intrinsics that are not finite, or no focal length")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines"
-        raise InputError(DOING, where, f"{type(error).__name__}: {error}", do) from error
-    file = folder / str(frame["file_path"])
-    rgb: U8 = decode_image(read_bytes(file, DOING, SOURCE_BYTES), str(file), DOING)[..., ::-1]
-    if rgb.shape[:2] != (full_h, full_w):
-        raise InputError(
-            DOING, where, f"{rgb.shape[1]}x{rgb.shape[0]} pixels, the file says {full_w}x{full_h}", "give the photographs as they were"
-        )
-    if bend.any():
-        centre = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
-        whole, _ = cv2.getOptimalNewCameraMatrix(K - centre, bend, (full_w, full_h), 0.0)  # shows only what the photograph shows
-        rgb = np.asarray(cv2.undistort(rgb, K - centre, bend, None, whole), dtype=np.uint8)
-        K = np.asarray(whole, dtype=np.float64) + centre
-    height = round(full_h * width / full_w)
-    small = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
+def _view(folder: Path, frame: Mapping[str, Any], where: str, lens: _Lens, T_world_camera: F64) -> PosedView:
+    file = _file(folder, frame, "file_path", where)
+    rgb = lens.straightened(_read_image(file, where, lens, cv2.IMREAD_COLOR)[..., ::-1])
+    camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), T_world_camera)
+    return PosedView(camera, np.ascontiguousarray(rgb), file.stem)
+
+
+def _cut(view: PosedView, width: int, where: str) -> PosedView:
+    """Reduce a view to a width, and cut its height at the middle to a multiple of `SIDE_PX`."""
+    small = resized(view, width)
+    height = small.camera.height
     kept = height // SIDE_PX * SIDE_PX
-    top = (height - kept) // 2
     if kept < SIDE_PX:
         raise InputError(DOING, where, f"{height} pixels high at {width} across", "choose a larger width")
-    K = np.diag([width / full_w, height / full_h, 1.0]) @ K
+    top = (height - kept) // 2
+    K = small.camera.K.copy()
     K[1, 2] -= top
-    camera = PinholeCamera(width, kept, K, inverse(T_world_camera))
-    return PosedView(camera, np.ascontiguousarray(small[top : top + kept], dtype=np.uint8), file.stem)
+    camera = PinholeCamera(width, kept, K, small.camera.T_camera_world)
+    return PosedView(camera, np.ascontiguousarray(small.rgb[top : top + kept]), view.name)
+
+
+def _flags(folder: Path, frame: Mapping[str, Any], key: str, where: str, lens: _Lens) -> Bool | None:
+    if key not in frame:
+        return None
+    image = _read_image(_file(folder, frame, key, where), where, lens, cv2.IMREAD_GRAYSCALE)
+    return np.asarray(lens.straightened(image) > 127)
+
+
+def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
+    name = frame.get(key)
+    if not isinstance(name, str):
+        raise InputError(DOING, f"{where}, {key}", repr(name), "name a file, relative to the folder")
+    return folder / name
+
+
+def _read_image(path: Path, where: str, lens: _Lens, flag: int) -> U8:
+    do = "check the path, which is relative to the folder, and the file"
+    data = read_bytes(path, DOING, SOURCE_BYTES, do)
+    image = np.asarray(decode_image(data, f"{where}, {path}", DOING, do, flag), dtype=np.uint8)
+    height, width = image.shape[:2]
+    if (width, height) != (lens.width, lens.height):
+        found = f"{width}x{height} pixels, the file says {lens.width}x{lens.height}"
+        raise InputError(DOING, f"{where}, {path}", found, "give the photographs as they were")
+    return image
+
+
+def _write_image(path: Path, image: U8) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), image):
+        raise InputError("writing posed views", str(path), "the image could not be written", "check the folder and the space on the disk")

@@ -1,15 +1,17 @@
-"""Draw the Gaussians that a fit starts from: sparse, noisy surface points.
+"""Draw the Gaussians that a fit starts from: sparse, noisy surface points, from depth or from matched photographs.
 
 Published fits start from LiDAR returns (driving) or structure-from-motion points. Rendered views carry depth; points sampled from it,
 evenly over the image, with a range error along the ray, stand for LiDAR returns accumulated over the drive. Returns inside an actor's box
-are carried to the actor's frame and belong to it, as in Street Gaussians.
+are carried to the actor's frame and belong to it, as in Street Gaussians. Photographs without depth are matched (SIFT) and triangulated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 import scipy
 
@@ -17,6 +19,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, transform_points
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, Box
+from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.sh import dc_from_rgb
@@ -27,6 +30,8 @@ START_OPACITY = 0.3
 SMALLEST_M, LARGEST_M = 0.01, 3.0
 FEWEST_POINTS = 4  # an actor seen less often gets no model
 DENSER = 8  # an actor's points are sampled this many times as densely as the background, because they are few and seen from near
+NEIGHBOURS, FEATURES, RATIO = 4, 2500, 0.75  # of the next photographs; SIFT keypoints; Lowe's ratio test
+LARGEST_ERROR_PX, LEAST_ANGLE_DEG = 1.5, 1.5  # of a triangulated point: reprojection, and between its rays
 
 _Points = tuple[F64, F64]  # (N, 3) places, metres; (N, 3) colours 0..1
 
@@ -146,3 +151,84 @@ def _inside(local: F64, box: Box) -> Bool:
     half = np.array([box.length_m, box.width_m, box.height_m]) / 2 + BOX_MARGIN_M
     above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
     return np.asarray(np.all(np.abs(local) <= half, axis=1) & above_ground)
+
+
+class Match(NamedTuple):
+    """A point that two photographs show: their indices, and where, in pixels of their views ``(2,)``."""
+
+    first: int
+    second: int
+    at_first: F64
+    at_second: F64
+
+
+def matches(views: Sequence[PosedView]) -> list[Match]:
+    """Return points that a view and one of its next ones show: SIFT, nearest neighbours in both directions, ratio test."""
+    sift, matcher = cv2.SIFT_create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)  # type: ignore[attr-defined]
+    found = []
+    for view in views:
+        points, described = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)
+        found.append((np.array([p.pt for p in points]).reshape(-1, 2) + 0.5, described))
+    out = []
+    for i in range(len(views)):
+        for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(views))):
+            (at_i, describes_i), (at_j, describes_j) = found[i], found[j]
+            if describes_i is None or describes_j is None or len(at_i) < 2 or len(at_j) < 2:
+                continue
+            back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(describes_j, describes_i, k=1)}
+            for best, second in matcher.knnMatch(describes_i, describes_j, k=2):
+                if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx:
+                    out.append(Match(i, j, at_i[best.queryIdx], at_j[best.trainIdx]))
+    return out
+
+
+def triangulated(
+    views: Sequence[PosedView], found: Sequence[Match], used: Sequence[int], most: int, rng: np.random.Generator
+) -> GaussianCloud:
+    """Return start Gaussians at the points that views place consistently.
+
+    Args:
+        views: That were matched.
+        found: Their matches.
+        used: Indices of the views that may be looked at; matches with others are left out.
+        most: Points at most, drawn from all.
+        rng: Draws them.
+
+    Raises:
+        InputError: Fewer than ten such points.
+    """
+    may = set(used)
+    parts: list[_Points] = []
+    pairs = sorted({(m.first, m.second) for m in found if m.first in may and m.second in may})
+    for i, j in pairs:
+        mine = [m for m in found if (m.first, m.second) == (i, j)]
+        a, b = np.array([m.at_first for m in mine]), np.array([m.at_second for m in mine])
+        place, good = _triangulate(views[i].camera, views[j].camera, a, b)
+        at = a[good].astype(np.int64)
+        parts.append((place[good], views[i].rgb[at[:, 1], at[:, 0]] / 255.0))
+    points, colours = _joined(parts)
+    count = len(points)
+    if count < 10:
+        found_text = f"{count} points that two photographs place consistently"
+        raise InputError(
+            "starting from photographs", f"{len(used)} photographs", found_text, "give photographs that overlap, in order along the way"
+        )
+    kept = rng.permutation(count)[:most]
+    return cloud_from_points(points[kept], colours[kept])
+
+
+def _triangulate(first: PinholeCamera, second: PinholeCamera, a: F64, b: F64) -> tuple[F64, Bool]:
+    """Return points ``(N, 3)`` and which are good: before both cameras, near both rays, and seen at an angle."""
+    P = [camera.K @ camera.T_camera_world[:3] for camera in (first, second)]
+    homogeneous = cv2.triangulatePoints(P[0], P[1], a.T, b.T)
+    w = np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
+    points = (homogeneous[:3] / w).T
+    good = np.ones(len(points), dtype=bool)
+    for camera, at in ((first, a), (second, b)):
+        local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+        pixel = local @ camera.K.T
+        error = np.linalg.norm(pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - at, axis=1)
+        good &= (local[:, 2] > 1e-3) & (error < LARGEST_ERROR_PX)
+    rays = [points - camera.centre_world for camera in (first, second)]
+    cosine = np.einsum("ij,ij->i", *rays) / np.maximum(np.linalg.norm(rays[0], axis=1) * np.linalg.norm(rays[1], axis=1), 1e-12)
+    return points, good & (cosine < np.cos(np.radians(LEAST_ANGLE_DEG)))

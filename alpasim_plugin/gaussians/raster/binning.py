@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from alpasim_plugin.gaussians.constants import HALF_WIDTH, RADIUS_X, RADIUS_Y, RECORD, SLOPE, TILE, TOP_Y, U, V, Z
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.gaussians.raster.layout import HALF_WIDTH, RADIUS_X, RADIUS_Y, RECORD, SLOPE, TILE, TOP_Y, U, V, Z
 
 _RADIX_BITS = 11
 _LOW = np.int64(0xFFFFFFFF)
@@ -152,6 +152,14 @@ def _tile_box(records, at, tiles_x, tiles_y):
     return left, right, top, bottom
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _tiles_in_row(records, at, row, tiles_x, left, right, rows):
+    """Return the first and one past the last tile of a row that a splat meets; only a box of several rows and columns has empty corners."""
+    if rows > 1 and right - left > 1:
+        left, right = _ellipse_columns(records, at, row, tiles_x)
+    return row * tiles_x + left, row * tiles_x + right
+
+
 @njit(cache=True, nogil=True)
 def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y, ordered, histogram):
     """Copy records into depth order and count, per chunk of ``chunk_size`` splats, how many meet each tile."""
@@ -168,11 +176,8 @@ def gather_and_count(cursor, count, chunk_size, order, records, tiles_x, tiles_y
             v.store(ordered, at, v.load(records, source))
             left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
             for row in range(top, bottom):
-                if bottom - top > 1 and right - left > 1:
-                    left_here, right_here = _ellipse_columns(ordered, at, row, tiles_x)
-                else:
-                    left_here, right_here = left, right
-                for tile in range(row * tiles_x + left_here, row * tiles_x + right_here):
+                first, end = _tiles_in_row(ordered, at, row, tiles_x, left, right, bottom - top)
+                for tile in range(first, end):
                     counts[tile] += 1
 
 
@@ -204,10 +209,7 @@ def fill_tiles(cursor, count, chunk_size, ordered, tiles_x, tiles_y, histogram, 
             at = rank * RECORD
             left, right, top, bottom = _tile_box(ordered, at, tiles_x, tiles_y)
             for row in range(top, bottom):
-                if bottom - top > 1 and right - left > 1:
-                    left_here, right_here = _ellipse_columns(ordered, at, row, tiles_x)
-                else:
-                    left_here, right_here = left, right
-                for tile in range(row * tiles_x + left_here, row * tiles_x + right_here):
+                first, end = _tiles_in_row(ordered, at, row, tiles_x, left, right, bottom - top)
+                for tile in range(first, end):
                     lists[position[tile]] = rank
                     position[tile] += 1

@@ -1,6 +1,6 @@
 """Pack training parameters for projection and take the gradients of splats back to them.
 
-The backward pass repeats the projection in float64 (`alpasim_plugin.gaussians.raster.project` is the readable form of the forward pass).
+The backward pass repeats the projection in float64 (`rasterize_reference.project_gaussians` is the readable form of the forward pass).
 With rows ``m, n`` of ``M = J R_camera R_q diag(s)``, ``W`` the upper triangular whitening of the screen covariance
 ``C = M M^T + 0.3 I`` (``W^T W = C^-1``) and moments of ``h = alpha dL/dalpha`` over whitened coordinates ``w``:
 ``dL/d(u, v) = W^T sum h w`` and ``dL/dM = W^T (sum h w w^T) W M``. ``W M`` has entries of at most 1, so that needles of thousands of
@@ -17,9 +17,29 @@ import math
 import numpy as np
 from numba import njit
 
-from alpasim_plugin.gaussians.constants import ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA, LOG_SCALE_LIMIT
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MIN,
+    CAM_FX,
+    CAM_FY,
+    CAM_SLOPE_HIGH_X,
+    CAM_SLOPE_HIGH_Y,
+    CAM_SLOPE_LOW_X,
+    CAM_SLOPE_LOW_Y,
+    EPS2D_PX2,
+    EXPONENT_SCALE,
+    EXTENT_MAX_SIGMA,
+    GEO_EXTENT,
+    GEO_FACTOR,
+    GEO_PEAK,
+    GEO_REACH,
+    GEO_SIZE,
+    LOG_SCALE_LIMIT,
+    POSE_CENTRE,
+    POSE_ROTATION,
+    RECORD,
+    R,
+)
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.gaussians.raster.gradient_colour import basis_gradient, write_basis
 from alpasim_plugin.gaussians.raster.gradient_kernels import (
     PAIR,
     PAIR_B,
@@ -32,24 +52,8 @@ from alpasim_plugin.gaussians.raster.gradient_kernels import (
     PAIR_T,
     PAIR_TT,
     PAIR_Z,
-)
-from alpasim_plugin.gaussians.raster.layout import (
-    CAM_FX,
-    CAM_FY,
-    CAM_SLOPE_HIGH_X,
-    CAM_SLOPE_HIGH_Y,
-    CAM_SLOPE_LOW_X,
-    CAM_SLOPE_LOW_Y,
-    EXPONENT_SCALE,
-    GEO_EXTENT,
-    GEO_FACTOR,
-    GEO_PEAK,
-    GEO_REACH,
-    GEO_SIZE,
-    POSE_CENTRE,
-    POSE_ROTATION,
-    RECORD,
-    R,
+    basis_gradient,
+    write_basis,
 )
 
 _f = np.float32

@@ -10,8 +10,17 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import ALPHA_MIN, EXTENT_MAX_SIGMA
-from alpasim_plugin.gaussians.raster.layout import BUNDLE, GEO_EXTENT, GEO_FACTOR, GEO_PEAK, GEO_REACH, GEO_SIZE, SPHERE_SIZE
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MIN,
+    BUNDLE,
+    EXTENT_MAX_SIGMA,
+    GEO_EXTENT,
+    GEO_FACTOR,
+    GEO_PEAK,
+    GEO_REACH,
+    GEO_SIZE,
+    SPHERE_SIZE,
+)
 from alpasim_plugin.gaussians.raster.project_kernels import colours_in_lanes
 
 ShFrame = Literal["object", "world"]
@@ -22,7 +31,7 @@ _LANES = 16
 
 @dataclass(frozen=True, eq=False)
 class PreparedCloud:
-    """A cloud ready for repeated rendering. Build it with `prepare`; the arrays are private to the rasteriser (see `layout`).
+    """A cloud ready for repeated rendering. Build it with `prepare`; the arrays are private to the rasteriser (see `constants`).
 
     Attributes:
         n_input: Gaussians of the cloud.

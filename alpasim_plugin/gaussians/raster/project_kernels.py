@@ -1,4 +1,4 @@
-"""Project prepared Gaussians, sixteen at a time; `alpasim_plugin.gaussians.raster.project` is the reference implementation."""
+"""Project prepared Gaussians, sixteen at a time; `alpasim_plugin.gaussians.raster.rasterize_reference` is the reference implementation."""
 
 # Numba's decorators and vector types are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from alpasim_plugin.gaussians.constants import ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA
-from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.gaussians.raster.layout import (
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MIN,
+    BLOCK_REACH,
     BUNDLE,
     CAM_CX,
     CAM_CY,
@@ -23,19 +23,37 @@ from alpasim_plugin.gaussians.raster.layout import (
     CAM_SLOPE_LOW_X,
     CAM_SLOPE_LOW_Y,
     CAM_WIDTH,
+    EPS2D_PX2,
     EXPONENT_SCALE,
+    EXTENT_MAX_SIGMA,
     GEO_EXTENT,
     GEO_FACTOR,
     GEO_PEAK,
     GEO_SIZE,
+    HALF_WIDTH,
+    L11,
+    L12,
+    L22,
+    PEAK,
     POSE_CENTRE,
     POSE_COLOUR,
     POSE_FAR,
     POSE_NEAR,
     POSE_ROTATION,
+    RADIUS_X,
+    RADIUS_Y,
     RECORD,
+    SLOPE,
     SPHERE_SIZE,
+    TOP_Y,
+    B,
+    G,
+    R,
+    U,
+    V,
+    Z,
 )
+from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
 
 _f = np.float32
@@ -137,48 +155,78 @@ def _write_basis(basis, x, y, z, size):
             v.store(basis, 240, v.splat(_f(-C3[0])) * x * (xx - three * yy))
 
 
+# Three vectors of sixteen lanes, one per axis, are a tuple.
+
+
+@njit(cache=True, nogil=True)
+def _load3(array, at):
+    return v.load(array, at), v.load(array, at + 16), v.load(array, at + 32)
+
+
+@njit(cache=True, nogil=True)
+def _row(pose, at):
+    """Return three numbers of a pose, each in all lanes."""
+    return v.splat(_f(pose[at])), v.splat(_f(pose[at + 1])), v.splat(_f(pose[at + 2]))
+
+
+@njit(cache=True, nogil=True)
+def _dot(a, b):
+    return v.fma(a[0], b[0], v.fma(a[1], b[1], a[2] * b[2]))
+
+
+@njit(cache=True, nogil=True)
+def _jacobian_row(scale, slope, across, ahead):
+    """Return a row of J R: ``scale (across - slope ahead)``."""
+    return (
+        scale * v.fnma(slope, ahead[0], across[0]),
+        scale * v.fnma(slope, ahead[1], across[1]),
+        scale * v.fnma(slope, ahead[2], across[2]),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _times(row, rows):
+    """Return a row times a matrix of three rows."""
+    a, b, c = rows
+    return _dot(row, (a[0], b[0], c[0])), _dot(row, (a[1], b[1], c[1])), _dot(row, (a[2], b[2], c[2]))
+
+
 @njit(cache=True, nogil=True)
 def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lanes):
     """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask of those that reach the image."""
-    at = group * 48
-    dx = v.load(means, at) - v.splat(pose[POSE_CENTRE])
-    dy = v.load(means, at + 16) - v.splat(pose[POSE_CENTRE + 1])
-    dz = v.load(means, at + 32) - v.splat(pose[POSE_CENTRE + 2])
+    x, y, z = _load3(means, group * 48)
+    dx, dy, dz = x - v.splat(pose[POSE_CENTRE]), y - v.splat(pose[POSE_CENTRE + 1]), z - v.splat(pose[POSE_CENTRE + 2])
     r = POSE_ROTATION
     # Depth decides the order and is kept in float64 up to here; everything else tolerates float32 relative to the camera.
     z64 = v.splat(pose[r + 6]) * dx + v.splat(pose[r + 7]) * dy + v.splat(pose[r + 8]) * dz
-    z = v.to_f32(z64)
     mask = (z64 >= v.splat(pose[POSE_NEAR])) & (z64 <= v.splat(pose[POSE_FAR]))
     if v.bits(mask) == 0:
         return 0
-    dx, dy, dz = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)
-    r00, r01, r02 = v.splat(_f(pose[r])), v.splat(_f(pose[r + 1])), v.splat(_f(pose[r + 2]))
-    r10, r11, r12 = v.splat(_f(pose[r + 3])), v.splat(_f(pose[r + 4])), v.splat(_f(pose[r + 5]))
-    r20, r21, r22 = v.splat(_f(pose[r + 6])), v.splat(_f(pose[r + 7])), v.splat(_f(pose[r + 8]))
+    d = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)
+    chosen = _project_shape(group, mask, d, v.to_f32(z64), geometry, pose, camera, lanes)
+    if chosen != 0:
+        _colour_group(group, d, sh, sh_size, pose, basis, lanes)
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
+    """Write the ellipses of Gaussians at ``d`` from the camera's centre; returns the bit mask of those that reach the image."""
+    right, down, ahead = _row(pose, POSE_ROTATION), _row(pose, POSE_ROTATION + 3), _row(pose, POSE_ROTATION + 6)
+    fx, fy = v.splat(camera[CAM_FX]), v.splat(camera[CAM_FY])
     inverse_z = v.splat(_f(1.0)) / z
-    slope_x = v.fma(r00, dx, v.fma(r01, dy, r02 * dz)) * inverse_z
-    slope_y = v.fma(r10, dx, v.fma(r11, dy, r12 * dz)) * inverse_z
-    u = v.fma(v.splat(camera[CAM_FX]), slope_x, v.splat(camera[CAM_CX]))
-    w = v.fma(v.splat(camera[CAM_FY]), slope_y, v.splat(camera[CAM_CY]))
-    scale_x = v.splat(camera[CAM_FX]) * inverse_z
-    scale_y = v.splat(camera[CAM_FY]) * inverse_z
+    slope_x, slope_y = _dot(right, d) * inverse_z, _dot(down, d) * inverse_z
+    u, w = v.fma(fx, slope_x, v.splat(camera[CAM_CX])), v.fma(fy, slope_y, v.splat(camera[CAM_CY]))
     a = v.minimum(v.maximum(slope_x, v.splat(camera[CAM_SLOPE_LOW_X])), v.splat(camera[CAM_SLOPE_HIGH_X]))
     b = v.minimum(v.maximum(slope_y, v.splat(camera[CAM_SLOPE_LOW_Y])), v.splat(camera[CAM_SLOPE_HIGH_Y]))
 
-    # Rows of J R; then rows m, n of M = J R R_q diag(s).
-    j0, j1, j2 = scale_x * v.fnma(a, r20, r00), scale_x * v.fnma(a, r21, r01), scale_x * v.fnma(a, r22, r02)
-    k0, k1, k2 = scale_y * v.fnma(b, r20, r10), scale_y * v.fnma(b, r21, r11), scale_y * v.fnma(b, r22, r12)
+    # Rows m, n of M = J R R_q diag(s).
     geo = group * (GEO_SIZE * 16)
     f = geo + GEO_FACTOR * 16
-    a00, a01, a02 = v.load(geometry, f), v.load(geometry, f + 16), v.load(geometry, f + 32)
-    a10, a11, a12 = v.load(geometry, f + 48), v.load(geometry, f + 64), v.load(geometry, f + 80)
-    a20, a21, a22 = v.load(geometry, f + 96), v.load(geometry, f + 112), v.load(geometry, f + 128)
-    m0, n0 = v.fma(j0, a00, v.fma(j1, a10, j2 * a20)), v.fma(k0, a00, v.fma(k1, a10, k2 * a20))
-    m1, n1 = v.fma(j0, a01, v.fma(j1, a11, j2 * a21)), v.fma(k0, a01, v.fma(k1, a11, k2 * a21))
-    m2, n2 = v.fma(j0, a02, v.fma(j1, a12, j2 * a22)), v.fma(k0, a02, v.fma(k1, a12, k2 * a22))
-    mm = v.fma(m0, m0, v.fma(m1, m1, m2 * m2))
-    nn = v.fma(n0, n0, v.fma(n1, n1, n2 * n2))
-    mn = v.fma(m0, n0, v.fma(m1, n1, m2 * n2))
+    factor = _load3(geometry, f), _load3(geometry, f + 48), _load3(geometry, f + 96)
+    m = _times(_jacobian_row(fx * inverse_z, a, right, ahead), factor)
+    n = _times(_jacobian_row(fy * inverse_z, b, down, ahead), factor)
+    mm, nn, mn = _dot(m, m), _dot(n, n), _dot(m, n)
     eps = v.splat(_EPS)
     c11, c22 = mm + eps, nn + eps
     extent = v.load(geometry, geo + GEO_EXTENT * 16)
@@ -196,8 +244,9 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
     # Variance of x given y, det / C22, from the Cauchy-Binet parts: scaled before squaring, so that it neither cancels nor overflows.
     inverse_c22 = v.splat(_f(1.0)) / c22
     root = v.sqrt(inverse_c22)
-    x01, x02, x12 = v.fnma(m1, n0, m0 * n1) * root, v.fnma(m2, n0, m0 * n2) * root, v.fnma(m2, n1, m1 * n2) * root
-    variance = v.fma(x01, x01, v.fma(x02, x02, x12 * x12)) + eps * ((c11 + nn) * inverse_c22)
+    x01, x02, x12 = v.fnma(m[1], n[0], m[0] * n[1]), v.fnma(m[2], n[0], m[0] * n[2]), v.fnma(m[2], n[1], m[1] * n[2])
+    minors = x01 * root, x02 * root, x12 * root
+    variance = _dot(minors, minors) + eps * ((c11 + nn) * inverse_c22)
     deviation = v.sqrt(variance)
     scale = v.splat(_f(EXPONENT_SCALE))
     l11 = scale / deviation
@@ -209,38 +258,39 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, basis, lan
     corner_s, corner_t = block_half * (l11 + v.absolute(l12)), block_half * l22
     block_radius = v.sqrt(peak - v.splat(_f(_CUT))) + v.sqrt(v.fma(corner_s, corner_s, corner_t * corner_t)) + v.splat(_f(1e-3))
 
+    v.store(lanes, U * 16, u)
+    v.store(lanes, V * 16, w)
+    v.store(lanes, L11 * 16, l11)
+    v.store(lanes, L12 * 16, l12)
+    v.store(lanes, L22 * 16, l22)
+    v.store(lanes, PEAK * 16, peak)
+    v.store(lanes, Z * 16, z)
+    v.store(lanes, RADIUS_X * 16, radius_x + margin)
+    v.store(lanes, RADIUS_Y * 16, radius_y + margin)
+    v.store(lanes, TOP_Y * 16, radius_x * mn / c11)
+    v.store(lanes, SLOPE * 16, slope)
+    v.store(lanes, HALF_WIDTH * 16, extent * deviation + margin)
+    v.store(lanes, BLOCK_REACH * 16, block_radius * block_radius)
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _colour_group(group, d, sh, sh_size, pose, basis, lanes):
+    """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0 below."""
     c = POSE_COLOUR
-    tx = v.fma(v.splat(_f(pose[c])), dx, v.fma(v.splat(_f(pose[c + 1])), dy, v.splat(_f(pose[c + 2])) * dz))
-    ty = v.fma(v.splat(_f(pose[c + 3])), dx, v.fma(v.splat(_f(pose[c + 4])), dy, v.splat(_f(pose[c + 5])) * dz))
-    tz = v.fma(v.splat(_f(pose[c + 6])), dx, v.fma(v.splat(_f(pose[c + 7])), dy, v.splat(_f(pose[c + 8])) * dz))
-    length = v.splat(_f(1.0)) / v.sqrt(v.fma(tx, tx, v.fma(ty, ty, tz * tz)))
-    _write_basis(basis, tx * length, ty * length, tz * length, sh_size)
+    t = _dot(_row(pose, c), d), _dot(_row(pose, c + 3), d), _dot(_row(pose, c + 6), d)
+    length = v.splat(_f(1.0)) / v.sqrt(_dot(t, t))
+    _write_basis(basis, t[0] * length, t[1] * length, t[2] * length, sh_size)
+    half, zero = v.splat(_f(0.5)), v.splat(_f(0.0))
     red, green, blue = half, half, half
     colour = group * sh_size * 48
     for k in range(sh_size):
         value = v.load(basis, k * 16)
-        red = v.fma(value, v.load(sh, colour + k * 48), red)
-        green = v.fma(value, v.load(sh, colour + k * 48 + 16), green)
-        blue = v.fma(value, v.load(sh, colour + k * 48 + 32), blue)
-    zero = v.splat(_f(0.0))
-
-    v.store(lanes, 0, u)
-    v.store(lanes, 16, w)
-    v.store(lanes, 32, l11)
-    v.store(lanes, 48, l12)
-    v.store(lanes, 64, l22)
-    v.store(lanes, 80, peak)
-    v.store(lanes, 96, v.maximum(red, zero))
-    v.store(lanes, 112, v.maximum(green, zero))
-    v.store(lanes, 128, v.maximum(blue, zero))
-    v.store(lanes, 144, z)
-    v.store(lanes, 160, radius_x + margin)
-    v.store(lanes, 176, radius_y + margin)
-    v.store(lanes, 192, radius_x * mn / c11)
-    v.store(lanes, 208, slope)
-    v.store(lanes, 224, extent * deviation + margin)
-    v.store(lanes, 240, block_radius * block_radius)
-    return chosen
+        r, g, b = _load3(sh, colour + k * 48)
+        red, green, blue = v.fma(value, r, red), v.fma(value, g, green), v.fma(value, b, blue)
+    v.store(lanes, R * 16, v.maximum(red, zero))
+    v.store(lanes, G * 16, v.maximum(green, zero))
+    v.store(lanes, B * 16, v.maximum(blue, zero))
 
 
 @njit(cache=True, nogil=True)

@@ -16,9 +16,27 @@ import numpy as np
 from numba import njit
 from numpy.polynomial import chebyshev
 
-from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLOCK_REACH,
+    L11,
+    L12,
+    L22,
+    PEAK,
+    RADIUS_X,
+    RADIUS_Y,
+    RECORD,
+    TILE,
+    TRANSMITTANCE_STOP,
+    B,
+    G,
+    R,
+    U,
+    V,
+    Z,
+)
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.gaussians.raster.layout import BLOCK_REACH, L11, L12, L22, PEAK, RADIUS_X, RADIUS_Y, RECORD, TILE, B, G, R, U, V, Z
 
 _f = np.float32
 _nodes = np.cos(np.pi * (np.arange(6) + 0.5) / 6) / 2  # interpolation at Chebyshev nodes of [-0.5, 0.5]
@@ -32,14 +50,25 @@ STATE = 80
 
 
 @njit(cache=True, nogil=True)
+def pixel_of(tile_x, tile_y, block, pixel):
+    """Return the image column and row of a pixel (0..15) of a tile's block (0..15)."""
+    return tile_x * TILE + (block & 3) * 4 + (pixel & 3), tile_y * TILE + (block >> 2) * 4 + (pixel >> 2)
+
+
+@njit(cache=True, nogil=True)
+def place_of(row, column):
+    """Return where the state of a tile's pixel begins."""
+    return ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
+
+
+@njit(cache=True, nogil=True)
 def start_tile(state, tile_x, tile_y, width, height):
     """Reset the state of a tile and return the bit mask of blocks that hold a pixel of the image."""
     live = 0
     state[:] = _f(0.0)
     for block in range(16):
         for pixel in range(16):
-            x = tile_x * TILE + (block & 3) * 4 + (pixel & 3)
-            y = tile_y * TILE + (block >> 2) * 4 + (pixel >> 2)
+            x, y = pixel_of(tile_x, tile_y, block, pixel)
             inside = x < width and y < height
             state[block * STATE + STATE_T + pixel] = _f(1.0) if inside else _f(-1.0)
             if inside:
@@ -141,7 +170,7 @@ def _finish_tile(state, tile_x, tile_y, background, rgb, alpha, depth):
         y = tile_y * TILE + row
         for column in range(min(TILE, width - tile_x * TILE)):
             x = tile_x * TILE + column
-            at = ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
+            at = place_of(row, column)
             through = abs(state[at + STATE_T])
             opacity = one - through
             alpha[y, x] = opacity

@@ -1,21 +1,29 @@
-"""Render on the CPU: project, sort, list per tile, composite; each stage on all threads."""
+"""Render on the CPU: project, sort, list per tile, composite; each stage on all threads.
+
+Kernels release the interpreter lock and share work through an atomic counter, so the same compiled code serves any number of threads, no
+threading layer spins between frames, nothing is lost by a fork, and one thread costs nothing extra.
+"""
 
 from __future__ import annotations
 
+import os
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud, require_rigid
-from alpasim_plugin.gaussians.constants import FAR_M, NEAR_M
-from alpasim_plugin.gaussians.raster.binning import depth_order, fill_tiles, gather_and_count, tile_offsets
-from alpasim_plugin.gaussians.raster.layout import (
+from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
+from alpasim_plugin.gaussians.constants import (
+    FAR_M,
+    NEAR_M,
     POSE_CENTRE,
     POSE_COLOUR,
     POSE_FAR,
@@ -26,11 +34,11 @@ from alpasim_plugin.gaussians.raster.layout import (
     SPHERE_SIZE,
     TILE,
 )
-from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.binning import depth_order, fill_tiles, gather_and_count, tile_offsets
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
-from alpasim_plugin.gaussians.raster.workers import run_on_threads, thread_count
+from alpasim_plugin.gaussians.raster.rasterize import F32, Background, RasterOutput, background_image
 
 
 class Buffers(threading.local):
@@ -178,7 +186,8 @@ def node_poses(
     """
     poses = np.empty((len(T_world_nodes), POSE_SIZE))
     given = [_IDENTITY if T is None else np.asarray(T, dtype=np.float64) for T in T_world_nodes]
-    if not all(T.shape == (4, 4) for T in given) or not _all_rigid(np.array(given).reshape(-1, 4, 4)):
+    shaped = all(T.shape == (4, 4) for T in given)
+    if not shaped or not all_rigid(np.array(given).reshape(-1, 4, 4)):
         for T in given:  # the precise message is composed only where the cheap test of all nodes at once fails
             require_rigid(T, "placing a node")
     T_world_node = np.array(given).reshape(-1, 4, 4)
@@ -188,17 +197,6 @@ def node_poses(
     poses[:, POSE_NEAR], poses[:, POSE_FAR] = near_m, FAR_M
     poses[:, POSE_COLOUR:POSE_NEAR] = np.where(turned[:, None], rotation.reshape(-1, 9), np.eye(3).reshape(9))
     return poses
-
-
-def _all_rigid(T: F64) -> bool:
-    """Return whether all of ``(N, 4, 4)`` pass `require_rigid`."""
-    gram = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
-    return bool(
-        np.all(np.abs(gram - np.eye(3)) <= 1e-5)
-        and np.all(np.linalg.det(T[:, :3, :3]) > 0)
-        and np.isfinite(T).all()
-        and np.all(np.abs(T[:, 3] - [0, 0, 0, 1]) <= 1e-9)
-    )
 
 
 def rasterize_cpu(
@@ -219,3 +217,54 @@ def rasterize_cpu(
     if prepared is None:
         prepared = _prepared[cloud] = prepare(cloud)
     return rasterize_prepared([(prepared, None)], camera, background, near_m=near_m, lod_px=lod_px, threads=threads)
+
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+_lock = threading.Lock()
+
+
+def _forget_pools() -> None:
+    """Drop pools after a fork: their threads live only in the parent."""
+    global _lock
+    _lock = threading.Lock()
+    _pools.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pools)
+
+
+def thread_count(threads: int | None) -> int:
+    """Return how many threads to use: the argument, or numba's current setting.
+
+    Raises:
+        InputError: Fewer than one.
+    """
+    if threads is None:
+        import numba
+
+        return int(numba.get_num_threads())
+    if threads < 1:
+        raise InputError("rendering Gaussians", f"threads={threads}", "no thread to work with", "give at least 1, or None for the default")
+    return threads
+
+
+def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> None:
+    """Call ``function(*args)`` on each of ``threads`` threads, this one included, and return when all have ended.
+
+    An exception in any of them is raised here.
+    """
+    if threads == 1:
+        function(*args)
+        return
+    with _lock:
+        pool = _pools.get(threads)
+        if pool is None:
+            pool = _pools[threads] = ThreadPoolExecutor(threads - 1, thread_name_prefix="raster")
+    others = [pool.submit(function, *args) for _ in range(threads - 1)]
+    try:
+        function(*args)
+    finally:
+        wait(others)
+    for other in others:
+        other.result()

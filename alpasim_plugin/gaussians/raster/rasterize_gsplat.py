@@ -1,25 +1,31 @@
-"""Render on a GPU through gsplat, where it works.
+"""Render on a GPU through gsplat, where it works; with gradients for training through its own forward and backward kernels.
 
 gsplat compiles CUDA code on first use, so a successful import does not show that it works. The backend first draws one Gaussian and checks
 the result. It never falls back to another backend; the error says what is missing.
 
-State of testing: the arguments and results have been checked against a stand-in for gsplat on the CPU; the path has not been run on a GPU.
-Known difference: gsplat up to 1.5.3 saturates alpha at 0.999, this package and gsplat 1.6 at 0.99.
+State of testing: arguments, results and gradients have been checked against a stand-in for gsplat on the CPU; the path has not been run on
+a GPU. Differences to the CPU: gsplat up to 1.5.3 saturates alpha at 0.999, this package and gsplat 1.6 at 0.99, and gsplat's kernels sum
+gradients in an order that changes from run to run.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, FAR_M, NEAR_M
-from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.rasterize import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.sh import SH_SIZES
+
+if TYPE_CHECKING:
+    from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, Splats
 
 _DOING = "rendering Gaussians with gsplat"
 
@@ -147,3 +153,37 @@ def rasterize_gsplat(
         rgb = np.broadcast_to(np.clip(background_image(background, camera), 0, 1), (*shape, 3)).copy()
         return RasterOutput(rgb, np.zeros(shape, np.float32), np.zeros(shape, np.float32), {"gaussians": 0})
     return _draw(gsplat, cloud, camera, background, near_m, device)
+
+
+def rasterize_gradient_gsplat(splats: Splats, camera: PinholeCamera, background: Tensor | None, near_m: float) -> GradientOutput:
+    """Render splats whose tensors lie on one GPU; see `rasterize_gradient`, which calls this.
+
+    Raises:
+        RendererError: gsplat does not work on that device.
+    """
+    from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, ScreenStatistics  # which imports this module
+
+    device = str(splats.means.device)
+    gsplat = require_gsplat(device)
+    centre = torch.as_tensor(camera.centre_world, device=device)
+    image, alphas, meta = gsplat.rasterization(
+        means=(splats.means.double() - centre).float(),
+        quats=torch.nn.functional.normalize(splats.quaternions, dim=1),
+        scales=splats.log_scales.exp(),
+        opacities=splats.logit_opacities.sigmoid(),
+        colors=splats.sh,
+        sh_degree=SH_SIZES.index(splats.sh.shape[1]),
+        **{**view_arguments(camera, near_m, device), "packed": False},  # so that what is returned per Gaussian has N rows
+    )
+    rgb, alpha, depth = image[0, ..., :3], alphas[0, ..., 0], image[0, ..., 3]
+    radii = meta["radii"][0]
+    screen = ScreenStatistics((radii if radii.ndim == 1 else radii.amax(dim=1)).int())
+    if meta["means2d"].requires_grad:
+
+        def keep_norm(gradient: Tensor) -> None:
+            screen.gradient_norm = gradient[0].norm(dim=1)
+
+        meta["means2d"].register_hook(keep_norm)
+    if background is not None:
+        rgb = rgb + (1 - alpha)[..., None] * background
+    return GradientOutput(rgb, alpha, depth, screen)

@@ -1,18 +1,108 @@
-"""Composite Gaussians in float64, one after the other: the reference implementation for the fast backends.
+"""Project and composite Gaussians in float64, one after the other: the readable reference implementation for the fast backends.
 
-Kerbl et al., 3D Gaussian Splatting (2023), with the constants of `alpasim_plugin.gaussians.constants`.
+Zwicker et al., EWA Splatting (2002), with the first-order projection of Kerbl et al., 3D Gaussian Splatting (2023), and the constants of
+`alpasim_plugin.gaussians.constants`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, NEAR_M, TRANSMITTANCE_STOP
-from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.raster.project import Projection, project_gaussians
+from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA, FAR_M, NEAR_M, TRANSMITTANCE_STOP
+from alpasim_plugin.gaussians.raster.rasterize import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.sh import sh_colours
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """Screen-space Gaussians in the order in which they are drawn, nearest first.
+
+    Attributes:
+        index: ``(M,)`` position in the cloud.
+        uv: ``(M, 2)`` centres, pixels (column, row).
+        depth: ``(M,)`` metres along the optical axis.
+        cov: ``(M, 3)`` screen covariance with the low-pass added, pixels^2: C11, C12, C22.
+        det: ``(M,)`` its determinant, pixels^4.
+        extent: ``(M,)`` standard deviations beyond which alpha is below the cut.
+        opacity: ``(M,)``.
+        rgb: ``(M, 3)`` colour from the camera's side, clamped at 0 below.
+    """
+
+    index: npt.NDArray[np.intp]
+    uv: F64
+    depth: F64
+    cov: F64
+    det: F64
+    extent: F64
+    opacity: F64
+    rgb: F64
+
+    def __len__(self) -> int:
+        """Return M."""
+        return len(self.index)
+
+    def radii(self) -> F64:
+        """Return ``(M, 2)`` half sizes, pixels, of the box around the ellipse at `extent`."""
+        return self.extent[:, None] * np.sqrt(self.cov[:, [0, 2]])
+
+
+def project_gaussians(
+    cloud: GaussianCloud, camera: PinholeCamera, near_m: float = NEAR_M, lod_px: float = 0.0, on_screen_only: bool = False
+) -> Projection:
+    """Project a cloud and sort it by depth.
+
+    Dropped: centres nearer than ``near_m`` or beyond 1e10 m, opacities below 1/255, with ``lod_px`` also splats whose radius before the
+    low-pass (`Projection.extent` times the larger of the two axis-aligned deviations) is below it, and with ``on_screen_only`` those
+    whose box misses every pixel centre. Depth order is that of the float32 depths, ties in input order: two surfaces that coincide then
+    keep one order while the camera moves, instead of one decided by rounding.
+
+    Raises:
+        InputError: The cloud holds Gaussians that cannot be drawn.
+    """
+    cloud.require_drawable("projecting Gaussians")
+    T = camera.T_camera_world
+    # Subtracting the camera's centre first keeps UTM-sized coordinates exact: the difference is small and rounds once.
+    relative = cloud.means.astype(np.float64) - camera.centre_world
+    p = relative @ T[:3, :3].T
+    opacity = cloud.opacities.astype(np.float64)
+    index = np.flatnonzero((p[:, 2] >= near_m) & (p[:, 2] <= FAR_M) & (opacity >= ALPHA_MIN))
+    cloud, p, relative, opacity = cloud.take(index), p[index], relative[index], opacity[index]
+    x, y, z = p.T
+
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    zero = np.zeros_like(z)
+    jacobian = np.stack(
+        [
+            np.stack([camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z], axis=-1),
+            np.stack([zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z], axis=-1),
+        ],
+        axis=-2,
+    )
+    # With rows m, n of M = J R_camera R_q diag(s) the covariance is M M^T and its determinant a sum of squares (Cauchy-Binet), which
+    # cannot cancel for needles as C11 C22 - C12^2 does.
+    m, n = np.moveaxis(jacobian @ T[:3, :3] @ cloud.rotations() * cloud.scales.astype(np.float64)[:, None, :], 1, 0)
+    raw = np.stack([np.sum(m * m, axis=1), np.sum(m * n, axis=1), np.sum(n * n, axis=1)], axis=1)
+    cov = raw + np.array([EPS2D_PX2, 0.0, EPS2D_PX2])
+    det = np.sum(np.cross(m, n) ** 2, axis=1) + EPS2D_PX2 * (raw[:, 0] + raw[:, 2]) + EPS2D_PX2**2
+    extent = np.minimum(EXTENT_MAX_SIGMA, np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0))))
+    uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+
+    keep = extent * np.sqrt(np.maximum(raw[:, 0], raw[:, 2])) >= lod_px
+    if on_screen_only:
+        radii = extent[:, None] * np.sqrt(cov[:, [0, 2]])
+        keep &= np.all((uv + radii >= 0.5) & (uv - radii <= np.array([camera.width, camera.height]) - 0.5), axis=1)
+    order = np.flatnonzero(keep)
+    order = order[np.argsort(z[order].astype(np.float32), kind="stable")]
+    direction = relative[order] / np.linalg.norm(relative[order], axis=1, keepdims=True)
+    return Projection(
+        index[order], uv[order], z[order], cov[order], det[order], extent[order], opacity[order], sh_colours(cloud.sh[order], direction)
+    )
 
 
 def rasterize_reference(

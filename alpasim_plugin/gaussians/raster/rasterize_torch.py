@@ -15,8 +15,8 @@ from torch import Tensor
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA, FAR_M, NEAR_M, TRANSMITTANCE_STOP
-from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.sh import C0, C1, C2, C3
+from alpasim_plugin.gaussians.raster.rasterize import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.sh import C0, sh_terms
 
 _TILE_PX = 16
 
@@ -179,18 +179,7 @@ def _rotations(quats: Tensor) -> Tensor:
 def sh_colours_torch(sh: Tensor, directions: Tensor) -> Tensor:
     """Return RGB ``(N, 3)`` of coefficients ``(N, K, 3)`` along unit directions ``(N, 3)``, as `sh_colours` does."""
     x, y, z = directions.unbind(1)
-    xx, yy, zz = x * x, y * y, z * z
-    terms = [torch.full_like(x, C0)]
-    if sh.shape[1] > 1:
-        terms += [-C1 * y, C1 * z, -C1 * x]
-    if sh.shape[1] > 4:
-        terms += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy), -C2[0] * x * z, C2[2] * (xx - yy)]
-    if sh.shape[1] > 9:
-        terms += [
-            *(-C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, -C3[2] * y * (4 * zz - xx - yy)),
-            *(C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)),
-            *(C3[4] * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)),
-        ]
+    terms = [torch.full_like(x, C0), *sh_terms(x, y, z)][: sh.shape[1]]
     return torch.clamp(0.5 + torch.einsum("nk,nkc->nc", torch.stack(terms, dim=1), sh), min=0.0)
 
 

@@ -8,6 +8,7 @@ and what is hit are the same size. Colours come from the stream of the actor's i
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,8 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, Actor, Box, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.actor_shapes import STATIONS, Loft
-from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode
-from alpasim_plugin.gaussians.scene.surfels import cloud_of, quad_surfels, rods, with_sheen
+from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneNode
+from alpasim_plugin.gaussians.scene.surfels import IDENTITY, cloud_of, quad_surfels, rods, with_sheen
 from alpasim_plugin.gaussians.sh import C0
 
 CELLS_M = (0.09, 0.22, 0.6)
@@ -40,7 +41,6 @@ SKY_RGB = (0.72, 0.82, 0.92)
 GLASS_RGB = np.array([0.10, 0.12, 0.14])
 TYRE_RGB = np.array([0.07, 0.07, 0.075])
 HUB_RGB = np.array([0.50, 0.51, 0.53])
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def build_actors(scenario: Scenario) -> list[SceneNode]:
@@ -67,8 +67,8 @@ def _shadow(box: Box, label: str) -> GaussianCloud:
     n = max(1, round(box.length_m / 1.2)) if wheels else 1
     x = ((np.arange(n) + 0.5) / n - 0.5) * box.length_m
     means = np.column_stack([x, np.zeros(n), np.full(n, 0.03 - box.height_m / 2)])
-    scales = np.tile([0.5 * box.length_m / n, 0.42 * box.width_m, 0.01], (n, 1))
-    return cloud_of(means, np.tile(IDENTITY, (n, 1)), scales, np.full((n, 3), 0.05), 0.75 if wheels else 0.45)
+    scales = (0.5 * box.length_m / n, 0.42 * box.width_m, 0.01)
+    return cloud_of(means, IDENTITY, scales, (0.05, 0.05, 0.05), 0.75 if wheels else 0.45)
 
 
 def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F64) -> GaussianCloud:
@@ -80,7 +80,7 @@ def _lofted(box: Box, draw: F64, noise: F64, cell_m: float, loft: Loft, body: F6
     cloud, owner, normals = quad_surfels(quads, rgb, cell_m, noise, 0.72)
     # Light from above: roofs bright, flanks in between, undersides dark.
     shade = 0.80 + 0.24 * normals[:, 2]
-    cloud = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, _shaded(cloud.sh, shade[owner]))
+    cloud = replace(cloud, sh=_shaded(cloud.sh, shade[owner]))
     parts = [with_sheen(cloud, normals[owner], gloss[owner], SKY_RGB), _wheels(box, loft, cell_m), _lights(box, loft, cell_m)]
     return GaussianCloud.concatenate(parts)
 
@@ -110,10 +110,9 @@ def _wheels(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     return GaussianCloud.concatenate([disc, tyre, hub])
 
 
-def _blobs(means: F64, scales: tuple[float, float, float], rgb: F64) -> GaussianCloud:
+def _blobs(means: npt.ArrayLike, scales: tuple[float, float, float], rgb: npt.ArrayLike) -> GaussianCloud:
     """Return Gaussians of one size, colour and orientation along the box's axes."""
-    n = len(means)
-    return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.tile(scales, (n, 1)), np.tile(rgb, (n, 1)))
+    return cloud_of(np.asarray(means, dtype=np.float64), IDENTITY, scales, rgb)
 
 
 def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
@@ -123,11 +122,11 @@ def _lights(box: Box, loft: Loft, cell_m: float) -> GaussianCloud:
     plate_z = loft.lamp_z * 0.62 * box.height_m - box.height_m / 2
     end = half + 0.02
     parts = [
-        _blobs(np.array([[end, y, z], [end, -y, z]]), (0.02, 0.10, 0.055), np.array([0.96, 0.96, 0.88])),
-        _blobs(np.array([[-end, y, z], [-end, -y, z]]), (0.02, 0.11, 0.065), np.array([0.80, 0.06, 0.05])),
+        _blobs([[end, y, z], [end, -y, z]], (0.02, 0.10, 0.055), (0.96, 0.96, 0.88)),
+        _blobs([[-end, y, z], [-end, -y, z]], (0.02, 0.11, 0.065), (0.80, 0.06, 0.05)),
     ]
     if cell_m < 0.3:
-        parts.append(_blobs(np.array([[-end, 0, plate_z], [end, 0, 1.05 * plate_z]]), (0.02, 0.14, 0.045), np.array([0.88, 0.88, 0.86])))
+        parts.append(_blobs([[-end, 0, plate_z], [end, 0, 1.05 * plate_z]], (0.02, 0.14, 0.045), (0.88, 0.88, 0.86)))
     return GaussianCloud.concatenate(parts)
 
 
@@ -172,7 +171,7 @@ def _person(height_m: float, width_m: float, draw: F64, stride: float, z0: float
     rows = np.array([[*part[:6], *part[6]] for part in body])
     means = rows[:, :3] * [h, w / 0.33, h] + [x0, 0.0, z0]
     scales = rows[:, 3:6] * [h, w / 0.33 * 0.9, h]
-    return cloud_of(means, np.tile(IDENTITY, (len(rows), 1)), scales, rows[:, 6:], 0.97)
+    return cloud_of(means, IDENTITY, scales, rows[:, 6:], 0.97)
 
 
 def _pedestrian(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
@@ -197,7 +196,7 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     grip = np.array([0.0, 0.25, 0.0])
     pairs = [(seat, centres[1]), (seat, pedal), (bar, pedal), (bar, centres[0]), (seat, bar), (bar + grip, bar - grip)]
     start, end = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
-    frame = rods(start, end, 0.10 if heavy else 0.03, np.tile(body, (len(pairs), 1)), max(cell_m, 0.12))
+    frame = rods(start, end, 0.10 if heavy else 0.03, body, max(cell_m, 0.12))
     rider = _person(0.80 * height, 0.55, draw, 0.06, bottom + 0.22 * height, -0.06 * length, 0.30)
     return GaussianCloud.concatenate([tyres, frame, rider])
 
@@ -219,7 +218,7 @@ def _other(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
         radius = 0.30 * min(length, width) * (1.05 - 0.8 * z)
         rgb = np.where(((z > 0.4) & (z < 0.62))[:, None], [0.92, 0.92, 0.90], [0.90, 0.36, 0.08])
         means = np.column_stack([np.zeros(n), np.zeros(n), (z - 0.5) * height])
-        return cloud_of(means, np.tile(IDENTITY, (n, 1)), np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb)
+        return cloud_of(means, IDENTITY, np.column_stack([radius, radius, np.full(n, 0.55 * height / n)]), rgb)
     return _crate(length / 2, width / 2, height / 2, noise, cell_m)
 
 

@@ -15,9 +15,8 @@ import numpy.typing as npt
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.scene.contours import contours
-from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, to_pixels
+from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile
+from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, contours, to_pixels
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quats_along
 
 SETBACK_M = {False: 5.5, True: 24.0}  # by highway or not

@@ -10,16 +10,188 @@ with distance as the cells do.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F32, F64, I64, Bool
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.scene.ground_texture import KERB_M, GroundTexture, paint_ground
-from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.paint import WHITE, YELLOW, Strokes
-from alpasim_plugin.gaussians.scene.site import Site
+from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
+from alpasim_plugin.gaussians.scene.site import CELL_M, SHIFT_BITS, Site, left_of, to_pixels, unit
 from alpasim_plugin.gaussians.scene.surfels import SPREAD, THICKNESS, cloud_of, grid_cells, quats_along, upright_quats
+
+PAINT_IMAGE_RGB = {WHITE: (0.86, 0.86, 0.84), YELLOW: (0.84, 0.65, 0.17)}
+ASPHALT = (0.335, 0.335, 0.345)
+PAVEMENT = (0.55, 0.53, 0.50)
+GRASS = (0.33, 0.40, 0.22)
+KERB_M = 0.12
+TRENCH_M, TRENCH_DEPTH_M = 0.16, 0.03  # asphalt this near to paint lies this much lower, see build_road
+PAVEMENT_M = 2.6  # width of the pavement beside the road
+FORECOURT_M = 6.5  # paved or planted strip up to the facades
+
+
+@dataclass(frozen=True)
+class GroundTexture:
+    """The painted ground; cell (i, j) has its centre at ``low + (j + 0.5, i + 0.5) * cell_m`` in ground coordinates.
+
+    Attributes:
+        cell_m: Metres.
+        low: ``(2,)`` ground coordinates of the corner.
+        rgb: ``(H, W, 3)`` 0..1.
+        height: ``(H, W)`` metres above the road's surface: a kerb's height beside the road, a little below zero around paint.
+        level: ``(H, W)`` the largest square that may stand for the cell is ``cell_m * 2**level``.
+    """
+
+    cell_m: float
+    low: F64
+    rgb: F32
+    height: F32
+    level: I64
+
+
+def paint_ground(site: Site, strokes: Strokes, cell_m: float, window: tuple[int, int, int, int] | None) -> GroundTexture:
+    """Paint the ground.
+
+    Args:
+        site: What lies where.
+        strokes: Road paint.
+        cell_m: Cell size of the image.
+        window: (first row, first column, rows, columns) in cells of ``cell_m``; None: the whole site, padded to whole tiles of 32 m.
+    """
+    if window is None:
+        n = round(32.0 / cell_m)
+        rows, columns = (int(np.ceil(s * CELL_M / 32.0)) * n for s in site.road.shape)
+        window = (0, 0, rows, columns)
+    i0, j0, rows, columns = window
+    low = site.low + np.array([j0, i0]) * cell_m
+    off, inside, path = (_sampled(d, site, low, cell_m, (rows, columns)) for d in (site.off_road_m, site.inside_m, site.path_m))
+    road = inside > off
+    edge = np.abs(inside - off)
+    texture = site.scenario.environment.texture
+    tag = f"ground-{cell_m}"
+    grain = _noise(site, tag, (rows, columns), cell_m)
+
+    rgb = np.empty((rows, columns, 3), dtype=np.float32)
+    rgb[:] = _verge(site, off, grain, texture)
+    tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
+    rgb[road] = (np.array(ASPHALT, dtype=np.float32) * tone[..., None])[road]
+    # Cells half covered by a thin line would alias along the crisp strokes laid over them.
+    thinnest = 0.3 if cell_m < CELL_M else 0.0
+    covers = [_coverage(strokes, colour, low, cell_m, (rows, columns), thinnest) for colour in (WHITE, YELLOW)]
+    for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
+        worn = cover * (0.95 - 0.12 * texture * np.clip(grain, 0, 2))
+        rgb += worn[..., None] * (np.array(PAINT_IMAGE_RGB[colour], dtype=np.float32) - rgb)
+
+    painted = np.zeros((rows, columns), dtype=bool)
+    for colour in (WHITE, YELLOW):
+        painted |= _coverage(strokes, colour, low, cell_m, (rows, columns)) > 0.04
+    near_paint = np.full_like(edge, 1.0e3)
+    if painted.any():
+        near_paint = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(cell_m)
+    feature = np.minimum(edge, near_paint)
+    if cell_m < CELL_M:
+        cap = np.where(road & (path < 2.5), 0.125, np.where(road & (path < 6.0), 0.25, 0.5))
+    else:
+        cap = np.clip(0.06 * path, 0.5, 4.0)
+    wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
+    level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
+    trench = (near_paint < TRENCH_M) & (edge > TRENCH_M)  # not at the kerb's foot: a gap would open there
+    height = np.where(road, np.where(trench, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
+    return GroundTexture(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
+
+
+def _sampled(raster: F32, site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
+    """Resample one of the site's rasters, bilinear, the border continued."""
+    scale = cell_m / CELL_M
+    shift = (low - site.low) / CELL_M + 0.5 * scale - 0.5
+    matrix = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(raster.astype(np.float32), matrix, (shape[1], shape[0]), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
+    """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to patches of ten metres."""
+    total = np.zeros(shape, dtype=np.float32)
+    rng = site.rng(tag)
+    for grid_m, weight in ((0.13, 0.6), (0.4, 0.45), (1.2, 0.4), (3.0, 0.4), (12.0, 0.45)):
+        step = max(grid_m, cell_m)
+        small = rng.standard_normal((int(shape[0] * cell_m / step) + 3, int(shape[1] * cell_m / step) + 3)).astype(np.float32)
+        total += weight * cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+    return total
+
+
+def _verge(site: Site, off: F32, grain: F32, texture: float) -> F32:
+    """Colour the ground beside the road: pavement with slabs, then forecourt or grass."""
+    grass = np.array(GRASS, dtype=np.float32) * (1 + 0.20 * texture * grain[..., None])
+    if site.highway:
+        gravel = np.array([0.46, 0.43, 0.38], dtype=np.float32) * (1 + 0.08 * texture * grain[..., None])
+        return np.where((off < 1.0)[..., None], gravel, grass)
+    pavement = np.array(PAVEMENT, dtype=np.float32) * (1 + 0.06 * texture * grain[..., None])
+    joint = (np.abs(off - 1.3) < 0.07)[..., None]
+    pavement = np.where(joint, 0.85 * pavement, pavement)
+    built = site.scenario.environment.buildings
+    forecourt = np.array([0.47, 0.45, 0.42], dtype=np.float32) * (1 + 0.08 * texture * grain[..., None]) if built > 0.5 else grass
+    return np.where((off < PAVEMENT_M)[..., None], pavement, np.where((off < FORECOURT_M)[..., None], forecourt, grass))
+
+
+def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
+    """Return what darkens asphalt, 0..1: wheel tracks and the oil line of each lane, patches and cracks near the path."""
+    dark = np.zeros(shape, dtype=np.uint8)
+    high = low + np.array(shape[::-1]) * cell_m
+    for lane in site.scenario.lane_map.lanes.values():
+        if lane.kind not in ("vehicle", "bus") or lane.is_intersection or len(lane.centre) < 2:
+            continue
+        line = site.frame.to_ground(lane.centre)
+        if np.any(line.max(axis=0) < low) or np.any(line.min(axis=0) > high):
+            continue
+        left = left_of(unit(np.gradient(line, axis=0)))
+        for side in (-0.85, 0.85):
+            points = to_pixels(line + side * left, low, cell_m)
+            cv2.polylines(dark, [points], False, 26, max(1, round(0.6 / cell_m)), cv2.LINE_8, SHIFT_BITS)
+        cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, 14, max(1, round(0.4 / cell_m)), cv2.LINE_8, SHIFT_BITS)
+    soft: U8 = cv2.GaussianBlur(dark, (0, 0), max(0.2 / cell_m, 0.5))
+    if cell_m < CELL_M:
+        _patches_and_cracks(site, soft, low, cell_m)
+    return np.asarray(soft.astype(np.float32) / 255.0)
+
+
+def _patches_and_cracks(site: Site, dark: U8, low: F64, cell_m: float) -> None:
+    rng = site.rng("cracks")
+    path = site.path
+    for _ in range(max(2, len(path) // 12)):
+        centre = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
+        half = rng.uniform([0.6, 0.4], [2.2, 1.2])
+        angle = rng.normal(0.0, 0.05)
+        c, s = np.cos(angle), np.sin(angle)
+        ring = centre + (np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half) @ np.array([[c, s], [-s, c]])
+        cv2.fillPoly(dark, [to_pixels(ring, low, cell_m)], int(rng.integers(28, 55)), cv2.LINE_8, SHIFT_BITS)
+    for _ in range(max(3, len(path) // 6)):
+        start = path[rng.integers(len(path))] + rng.uniform(-6, 6, 2)
+        heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.35, 14))
+        line = start + np.cumsum(0.35 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+        cv2.polylines(dark, [to_pixels(line, low, cell_m)], False, int(rng.integers(60, 100)), 1, cv2.LINE_AA, SHIFT_BITS)
+
+
+def _coverage(strokes: Strokes, colour: int, low: F64, cell_m: float, shape: tuple[int, int], thinnest_m: float = 0.0) -> F32:
+    """Return the share ``(H, W)`` of each cell under paint of one colour; strokes thinner than ``thinnest_m`` are left out."""
+    mask = np.zeros(shape, dtype=np.uint8)
+    high = low + np.array(shape[::-1]) * cell_m
+    near = np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
+    mine = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
+    start, end, width = strokes.start[mine], strokes.end[mine], strokes.width_m[mine]
+    direction = unit(end - start)
+    left = left_of(direction) * (width / 2)[:, None]
+    along = direction * 0.02
+    rings = np.stack([start - left - along, end - left + along, end + left + along, start + left - along], axis=1)
+    # Strokes of coarse images are thinner than a pixel: paint at four times the resolution would be exact, area weighting is enough.
+    gain = np.minimum(1.0, width / cell_m)
+    for ring, share in zip(to_pixels(rings.reshape(-1, 2), low, cell_m).reshape(-1, 4, 2), gain, strict=True):
+        cv2.fillConvexPoly(mask, ring, int(255 * share), cv2.LINE_AA if share == 1.0 else cv2.LINE_8, SHIFT_BITS)
+    return np.asarray(mask.astype(np.float32) / 255.0)
+
 
 FINE_M, COARSE_M = 0.125, 0.5
 TILE_M, FAR_TILE_M = 16.0, 32.0
@@ -79,8 +251,7 @@ def _ground_nodes(
             continue
         plan, size_m, rgb, above = (np.concatenate(c) for c in zip(*parts, strict=True))
         cloud = _flat(site, plan, size_m, rgb, np.where(above > KERB_M / 2, KERB_M, np.minimum(above, 0.0)))
-        tile = np.floor((plan - site.low) / tile_m).astype(np.int64)
-        levels.append((image.cell_m * (1 << floor), cloud, tile[:, 1] * 100_000 + tile[:, 0]))
+        levels.append((image.cell_m * (1 << floor), cloud, tile_numbers(plan - site.low, tile_m)))
     return nodes_by_tile(name, levels)
 
 
@@ -142,27 +313,27 @@ def _stroke_nodes(site: Site, strokes: Strokes) -> list[SceneNode]:
     rng = site.rng("paint-wear")
     wear = 1 - 0.16 * rng.random((len(strokes.start), 1)) * site.scenario.environment.texture
     middle = (strokes.start + strokes.end) / 2
-    tile = np.floor((middle - site.low) / TILE_M).astype(np.int64)
-    tile_of = tile[:, 1] * 100_000 + tile[:, 0]
+    tile = tile_numbers(middle - site.low, TILE_M)
     rgb = np.array([PAINT_RGB[WHITE], PAINT_RGB[YELLOW]])[strokes.colour] * wear
     length = np.linalg.norm(strokes.end - strokes.start, axis=1)
+    direction = unit(strokes.end - strokes.start)
     levels = []
     for cell_m, link_m, across_m in ((0.125, 0.19, 0.15), (0.3, 0.75, 0.25), (0.8, 1.5, 0.5)):
         n_u = np.maximum(np.round(length / link_m), 1).astype(np.int64)
         n_v = np.maximum(np.round(strokes.width_m / across_m), 1).astype(np.int64)
         owner, u, v = grid_cells(n_u, n_v)
-        along = (strokes.end - strokes.start)[owner] / np.maximum(length[owner], 1e-9)[:, None]
-        left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        along = direction[owner]
+        left = left_of(along)
         plan = strokes.start[owner] + along * (u * length[owner])[:, None] + left * ((v - 0.5) * strokes.width_m[owner])[:, None]
         means, normals = _on_ground(site, plan, LIFT_M)
         xy = site.frame.to_world(np.concatenate([plan, plan + along]))
         heading = xy[len(plan) :] - xy[: len(plan)]
-        direction = np.column_stack([heading, -np.sum(heading * normals[:, :2], axis=1) / normals[:, 2]])
+        uphill = np.column_stack([heading, -np.sum(heading * normals[:, :2], axis=1) / normals[:, 2]])
         single = (n_v == 1)[owner]
         # A lone row is half as strong at its own edge (sigma 0.42 of the width); rows side by side must close the gap between them.
         across = np.where(single, 0.42, SPREAD) * (strokes.width_m / n_v)[owner]
         scales = np.stack([0.75 * (length / n_u)[owner], across, np.full(len(owner), 0.004)], axis=1)
-        levels.append((cell_m, cloud_of(means, quats_along(direction, normals), scales, rgb[owner], 0.97), tile_of[owner]))
+        levels.append((cell_m, cloud_of(means, quats_along(uphill, normals), scales, rgb[owner], 0.97), tile[owner]))
     return nodes_by_tile("paint", levels, far_m=140.0)
 
 
@@ -178,5 +349,4 @@ def _surroundings(site: Site) -> list[SceneNode]:
     plan = plan[outside]
     rgb = np.array([0.36, 0.40, 0.26]) * (1 + 0.08 * site.rng("far-field").standard_normal((len(plan), 1)))
     cloud = _flat(site, plan, np.full(len(plan), cell), rgb, np.zeros(len(plan)))
-    tile = np.floor(plan / 120.0).astype(np.int64)
-    return nodes_by_tile("surroundings", [(cell, cloud, tile[:, 1] * 100_000 + tile[:, 0])])
+    return nodes_by_tile("surroundings", [(cell, cloud, tile_numbers(plan, 120.0))])

@@ -10,14 +10,14 @@ from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.build_facades import DEPTH_M, Houses
-from alpasim_plugin.gaussians.scene.contours import contours, places
-from alpasim_plugin.gaussians.scene.ground_texture import KERB_M
-from alpasim_plugin.gaussians.scene.nodes import SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.scene.site import CELL_M, Site
-from alpasim_plugin.gaussians.scene.surfels import SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
+from alpasim_plugin.gaussians.scene.build_road import KERB_M
+from alpasim_plugin.gaussians.scene.scene_graph import SceneNode, nodes_by_tile, tile_numbers
+from alpasim_plugin.gaussians.scene.site import CELL_M, Site, contours, places
+from alpasim_plugin.gaussians.scene.surfels import IDENTITY, SPREAD, cloud_of, grid_cells, quad_surfels, quats_along, rods
 
 KERB_RGB = (0.66, 0.65, 0.62)
 RAIL_RGB = (0.62, 0.64, 0.66)
+POST_RGB, POLE_RGB, TRUNK_RGB = (0.45, 0.46, 0.47), (0.36, 0.38, 0.38), (0.30, 0.24, 0.19)
 TREE_LINE_M = {False: 1.6, True: 7.0}  # distance of street trees from the road's edge, by highway or not
 TILE_M = 32.0
 LEAVES = np.array([[0.24, 0.38, 0.15], [0.30, 0.43, 0.18], [0.20, 0.33, 0.17], [0.38, 0.43, 0.17]])
@@ -35,8 +35,7 @@ def _nodes(site: Site, name: str, items: list[Item]) -> list[SceneNode]:
     levels = []
     for cell_m, cloud, at in items:
         if len(cloud):
-            tile = np.floor((at - site.low) / TILE_M).astype(np.int64)
-            levels.append((cell_m, cloud, tile[:, 1] * 100_000 + tile[:, 0]))
+            levels.append((cell_m, cloud, tile_numbers(at - site.low, TILE_M)))
     return nodes_by_tile(name, levels)
 
 
@@ -80,11 +79,11 @@ def _rails(site: Site) -> list[Item]:
         scales = np.column_stack([np.full(n, SPREAD * step), np.full(n, 0.03), np.full(n, 0.05)])
         clouds, at = [], []
         for height, shade in ((0.56, 0.8), (0.72, 1.0)):
-            clouds.append(cloud_of(site.world(xy, height), quats, scales, np.tile(np.array(RAIL_RGB) * shade, (n, 1))))
+            clouds.append(cloud_of(site.world(xy, height), quats, scales, np.array(RAIL_RGB) * shade))
             at.append(xy)
         posts = xy[:: max(1, round(4.0 / step))]
         foot = site.world(posts, 0.0)
-        clouds.append(rods(foot, foot + np.array([0, 0, 0.62]), 0.06, np.tile([0.45, 0.46, 0.47], (len(posts), 1)), 0.7))
+        clouds.append(rods(foot, foot + np.array([0, 0, 0.62]), 0.06, POST_RGB, 0.7))
         at.append(posts)
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(at)))
     return items
@@ -121,7 +120,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
     for cell_m, count in ((0.25, 520), (0.36, 170), (0.8, 48), (1.8, 14)):
         crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
         top = foot + np.column_stack([np.zeros(m), np.zeros(m), stem + 0.5 * crown])
-        trunks = rods(foot, top, 0.13, np.tile([0.30, 0.24, 0.19], (m, 1)), 0.5 if count > 100 else 4.0)
+        trunks = rods(foot, top, 0.13, TRUNK_RGB, 0.5 if count > 100 else 4.0)
         trunk_owner = _nearest(trunks.means.astype(np.float64), foot)
         items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), at[np.concatenate([owner, trunk_owner])]))
     return items
@@ -206,11 +205,9 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
     items: list[Item] = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         length = np.linalg.norm(end - start, axis=1)
-        poles = rods(start, end, 0.085, np.tile([0.36, 0.38, 0.38], (len(start), 1)), step)
+        poles = rods(start, end, 0.085, POLE_RGB, step)
         piece, _, _ = grid_cells(np.maximum(np.round(length / step), 1).astype(np.int64), np.ones(len(start), dtype=np.int64))
-        lamps = len(tip)
-        lamp_scales = np.tile([0.22, 0.22, 0.07], (lamps, 1))
-        lamp = cloud_of(tip, np.tile([1.0, 0, 0, 0], (lamps, 1)), lamp_scales, np.tile([0.85, 0.85, 0.80], (lamps, 1)))
+        lamp = cloud_of(tip, IDENTITY, (0.22, 0.22, 0.07), (0.85, 0.85, 0.80))
         items.append((cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at])))
     return items
 
@@ -246,7 +243,7 @@ def _signs(site: Site) -> list[Item]:
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
         clouds, where = [plates], [plan[owner]]
         if feet:
-            posts = rods(np.stack(feet), np.stack(tops), 0.04, np.tile([0.45, 0.46, 0.47], (len(feet), 1)), 3.0)
+            posts = rods(np.stack(feet), np.stack(tops), 0.04, POST_RGB, 3.0)
             clouds.append(posts)
             where.append(site.frame.to_ground(posts.means.astype(np.float64)))
         items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(where)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
@@ -11,9 +13,8 @@ from alpasim_plugin.gaussians.scene.build_actors import build_actors
 from alpasim_plugin.gaussians.scene.build_facades import build_facades, place_houses
 from alpasim_plugin.gaussians.scene.build_road import build_road
 from alpasim_plugin.gaussians.scene.build_street import build_street, lamp_posts
-from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.paint import paint_strokes
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneNode, nodes_by_tile, tile_numbers
 from alpasim_plugin.gaussians.scene.site import HeightAt, make_site
 from alpasim_plugin.gaussians.scene.sky import make_sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
@@ -60,8 +61,7 @@ def with_background(graph: SceneGraph, cloud: GaussianCloud, T_world_file: F64) 
         T_world_file: ``(4, 4)`` rotation, translation and one scale for all axes.
     """
     placed = placed_cloud(cloud, T_world_file)
-    tile = np.floor(placed.means[:, :2] / FILE_TILE_M).astype(np.int64)
-    nodes = nodes_by_tile("file", [(0.0, placed, tile[:, 1] * 1_000_003 + tile[:, 0])])
+    nodes = nodes_by_tile("file", [(0.0, placed, tile_numbers(placed.means[:, :2], FILE_TILE_M, 1_000_003))])
     return SceneGraph([*graph.background, *nodes], list(graph.actors.values()), graph.sky, graph.sh_frame, graph.cell_px)
 
 
@@ -71,11 +71,10 @@ def lit(node: SceneNode, light: F64) -> SceneNode:
         return node
     levels = []
     for level in node.levels:
-        c = level.cloud
-        sh = c.sh * light
+        sh = level.cloud.sh * light
         sh[:, 0] += dc_from_rgb(0.5 * light)  # colour is 0.5 + C0 dc: the half is lit as well
-        levels.append(Level(level.cell_m, GaussianCloud(c.means, c.quats, c.scales, c.opacities, sh.astype(np.float32))))
-    return SceneNode(node.name, node.kind, tuple(levels), node.far_m)
+        levels.append(replace(level, cloud=replace(level.cloud, sh=sh.astype(np.float32))))
+    return replace(node, levels=tuple(levels))
 
 
 def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
@@ -83,5 +82,4 @@ def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
     scale = float(np.cbrt(np.linalg.det(T_world_file[:3, :3])))
     rigid = np.asarray(T_world_file, dtype=np.float64).copy()
     rigid[:3, :3] /= scale
-    scaled = GaussianCloud(cloud.means * scale, cloud.quats, cloud.scales * scale, cloud.opacities, cloud.sh)
-    return scaled.transformed(rigid)
+    return replace(cloud, means=cloud.means * scale, scales=cloud.scales * scale).transformed(rigid)

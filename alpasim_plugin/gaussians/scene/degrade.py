@@ -15,6 +15,7 @@ Random numbers belong to (scene, seed, part of the scene), never to ``w``: movin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -27,7 +28,8 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, Degradation, Scenario
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.scene.log_views import LogView, LogViews
-from alpasim_plugin.gaussians.scene.nodes import SceneNode
+from alpasim_plugin.gaussians.scene.scene_graph import SceneNode
+from alpasim_plugin.gaussians.scene.site import left_of, unit
 from alpasim_plugin.gaussians.sh import C0, C1
 
 STEPS = 8
@@ -124,7 +126,7 @@ class Surrogate:
         unseen = ~seen & (draw[:, 2] < 0.95 * min(s, 1.0))
         keep = np.flatnonzero(~unseen)
         sh = ((np.clip(rgb + tint_on, 0, 1) - 0.5) / C0)[:, None, :].astype(np.float32)
-        flat = GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh)
+        flat = replace(cloud, sh=sh)
         columns = (
             ray,
             shift_on,
@@ -242,9 +244,8 @@ def _sway(scenario: Scenario, line: F64) -> F64:
     total = np.zeros(len(line))
     for _ in range(6):
         total += np.sin(2 * np.pi * s / rng.uniform(18.0, 50.0) + rng.uniform(0, 2 * np.pi))
-    d = np.gradient(line[:, :2], axis=0)
-    d /= np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
-    return np.asarray(SWAY_M / np.sqrt(3.0) * total[:, None] * np.column_stack([-d[:, 1], d[:, 0], np.zeros(len(d))]))
+    left = left_of(unit(np.gradient(line[:, :2], axis=0)))
+    return np.asarray(SWAY_M / np.sqrt(3.0) * total[:, None] * np.column_stack([left, np.zeros(len(left))]))
 
 
 def log_times(scenario: Scenario, spacing_m: float, most: int) -> list[int]:

@@ -1,13 +1,21 @@
-"""Depth seen by the log's cameras: which Gaussians a reconstruction could have learned."""
+"""What the log's cameras saw: which Gaussians a reconstruction could have learned, and where there was sky.
+
+A transparent pixel of a reconstruction is open sky or a hole; alpha alone cannot tell them apart. Pipelines on recorded drives fill the
+sky from segmented log images (OneFixer, App. A). Here the log views' own alpha is that segmentation. The sky is far away, so a view of
+it is carried to another camera by rotation alone; within half the views' spacing the skyline moves by less than a pixel of the small views
+beyond some 20 m.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numba
 import numpy as np
 
+from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F32, F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
@@ -31,20 +39,6 @@ class LogView:
         # The farthest surface of the neighbouring pixels: what shows beside an occluder's edge from a metre on counts as seen.
         farthest = cv2.dilate(depth, np.ones((3, 3), dtype=np.uint8))
         self.limit: F32 = np.where(alpha > 0.5, farthest * (1 + TOLERANCE) + MARGIN_M, np.inf).astype(np.float32)
-
-    def sees(self, points: F64, size_m: F64) -> Bool:
-        """Return which points ``(N, 3)`` of radius ``size_m (N,)`` lie in view and not behind what was seen."""
-        camera = self.camera
-        x, y, z = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).T
-        ahead = z > NEAR_M
-        safe = np.where(ahead, z, 1.0)
-        u = np.floor(camera.fx * x / safe + camera.cx)
-        v = np.floor(camera.fy * y / safe + camera.cy)
-        edge = EDGE_SHARE * camera.width
-        inside = ahead & (u >= -edge) & (u < camera.width + edge) & (v >= -edge) & (v < camera.height + edge)
-        row = np.clip(np.where(inside, v, 0), 0, camera.height - 1).astype(np.int64)
-        column = np.clip(np.where(inside, u, 0), 0, camera.width - 1).astype(np.int64)
-        return np.asarray(inside & (z < self.limit[row, column] + size_m))
 
 
 class LogViews:
@@ -98,3 +92,39 @@ def _see(points: F64, size_m: F64, T: F64, K: F64, size: I64, first: I64, limit:
                 seen[i] = True
                 latest = j
                 break
+
+
+@dataclass(frozen=True, eq=False)
+class SkyView:
+    """Where one logged camera saw sky: ``sky (H, W)`` float32, 1 where it did."""
+
+    camera: PinholeCamera
+    sky: F32
+
+
+class SkyMask:
+    """Sky mask from the nearest log view of a similar direction.
+
+    Args:
+        views: Of cameras that may look in different directions; without any, nothing is sky.
+    """
+
+    def __init__(self, views: Sequence[LogView | SkyView]) -> None:
+        self._views = tuple(views)
+        T = np.array([inverse(view.camera.T_camera_world) for view in views]).reshape(-1, 4, 4)
+        self._axes, self._eyes = T[:, :3, 2], T[:, :3, 3]  # (V, 3) world
+
+    def share(self, camera: PinholeCamera) -> F32:
+        """Return how much of every pixel ``(H, W)`` is sky, 0 to 1; beyond the view's border its outermost pixels go on."""
+        if not self._views:
+            return np.zeros((camera.height, camera.width), dtype=np.float32)
+        T = inverse(camera.T_camera_world)
+        R, eye = T[:3, :3], T[:3, 3]
+        turned_away = self._axes @ R[:, 2] < 0.5
+        nearest = int(np.argmin(np.linalg.norm(self._eyes - eye, axis=1) + 1e6 * turned_away))
+        view = self._views[nearest]
+        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # the warp counts from pixel centres, cameras from the corner
+        to_view = np.linalg.inv(half) @ view.camera.K @ view.camera.T_camera_world[:3, :3] @ R @ np.linalg.inv(camera.K) @ half
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        warped = cv2.warpPerspective(view.sky, to_view, (camera.width, camera.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(warped, dtype=np.float32)

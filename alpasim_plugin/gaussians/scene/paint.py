@@ -17,7 +17,7 @@ import scipy
 
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64, I64, Paint
-from alpasim_plugin.gaussians.scene.site import CELL_M, Site
+from alpasim_plugin.gaussians.scene.site import CELL_M, Site, left_of, unit
 
 LINE_M, GAP_M = 3.0, 9.0  # dash pattern
 LINE_WIDTH_M = 0.14
@@ -120,10 +120,9 @@ def _sample(edges: list[_Edge]) -> tuple[I64, F64, F64]:
         n = max(3, int(length / SAMPLE_M))
         s = (np.arange(n) + 0.5) / n * length
         a, b = resample(edge.line, s - 0.1), resample(edge.line, s + 0.1)
-        d = b - a
         owner.append(np.full(n, i))
         points.append((a + b) / 2)
-        headings.append(d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9))
+        headings.append(unit(b - a))
     return np.concatenate(owner), np.concatenate(points), np.concatenate(headings)
 
 
@@ -133,8 +132,7 @@ def _guess(edge: _Edge, neighbours: list[tuple[_Edge, float]], n: int) -> tuple[
     opposing = sum(other.side == edge.side and cosine < -0.8 for other, cosine in neighbours)
     if max(shared, opposing) < 0.4 * n:
         d = np.gradient(edge.line, axis=0)
-        d /= np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9)
-        inward = np.stack([d[:, 1], -d[:, 0]], axis=1) * edge.side
+        inward = -left_of(unit(d)) * edge.side
         return edge.line + INSET_M * inward, "solid_white"
     return edge.line, "dashed_white" if shared >= opposing else "double_yellow"
 
@@ -188,8 +186,7 @@ def _line_strokes(line: F64, paint: Paint, phase_m: float) -> Strokes:
     a, b = resample(line, s0[keep]), resample(line, s1[keep])
     if paint != "double_yellow":
         return _strokes(a, b, LINE_WIDTH_M, colour)
-    d = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1, keepdims=True), 1e-9)
-    side = DOUBLE_OFFSET_M * np.stack([-d[:, 1], d[:, 0]], axis=1)
+    side = DOUBLE_OFFSET_M * left_of(unit(b - a))
     return _strokes(np.concatenate([a + side, a - side]), np.concatenate([b + side, b - side]), 0.11, colour)
 
 

@@ -12,20 +12,84 @@ accumulated opacity of the scene *without* the sky (0 in the open sky), which is
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from alpasim_plugin.core.errors import RendererError
-from alpasim_plugin.core.types import F64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, ShFrame, prepare
-from alpasim_plugin.gaussians.raster.rasterize import Backend, rasterize
+from alpasim_plugin.gaussians.raster.rasterize import Backend, RasterOutput, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
-from alpasim_plugin.gaussians.scene.nodes import SceneNode
 from alpasim_plugin.gaussians.scene.sky import Sky
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of detail: Gaussians that stand for cells of about ``cell_m``."""
+
+    cell_m: float
+    cloud: GaussianCloud
+
+
+@dataclass(frozen=True, eq=False)
+class SceneNode:
+    """A part of a scene that is culled and drawn as a whole.
+
+    Attributes:
+        name: Unique within the scene; an actor's node bears the actor's id.
+        kind: ``background`` (world coordinates) or ``actor`` (box frame: origin at the box centre, x length, y width, z height).
+        levels: Finest first.
+        far_m: Beyond this distance the node is not drawn.
+    """
+
+    name: str
+    kind: str
+    levels: tuple[Level, ...]
+    far_m: float = 1.0e9
+
+    @cached_property
+    def sphere(self) -> tuple[F64, float]:
+        """Return a centre ``(3,)`` and radius around the three-sigma extent of all levels."""
+        clouds = [level.cloud for level in self.levels if len(level.cloud)]
+        if not clouds:
+            return np.zeros(3), 0.0
+        reach = [3 * c.scales.max(axis=1, keepdims=True) for c in clouds]
+        low = np.min([(c.means - r).min(axis=0) for c, r in zip(clouds, reach, strict=True)], axis=0)
+        high = np.max([(c.means + r).max(axis=0) for c, r in zip(clouds, reach, strict=True)], axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+
+
+def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
+    """Return the Gaussians of each tile; ``tile (N,)`` names the tile of each Gaussian."""
+    order = np.argsort(tile, kind="stable")
+    ids, first = np.unique(tile[order], return_index=True)
+    return {int(i): cloud.take(part) for i, part in zip(ids, np.split(order, first[1:]), strict=True)}
+
+
+def tile_numbers(xy: F64, size_m: float, row: int = 100_000) -> I64:
+    """Return the number ``(N,)`` of the square tile in which each point ``(N, 2)`` lies; ``row`` more from one row of tiles to the next."""
+    tile = np.floor(xy / size_m).astype(np.int64)
+    return np.asarray(tile[:, 1] * row + tile[:, 0])
+
+
+def nodes_by_tile(prefix: str, levels: list[tuple[float, GaussianCloud, I64]], far_m: float = 1.0e9) -> list[SceneNode]:
+    """Group clouds of several levels into one node per tile.
+
+    Args:
+        prefix: Start of the nodes' names.
+        levels: (cell size, cloud, tile of each Gaussian), finest first. A tile may lack its finest levels, not its coarser ones.
+        far_m: See `SceneNode`.
+    """
+    by_tile: dict[int, list[Level]] = {}
+    for cell_m, cloud, tile in levels:
+        for i, part in split_by_tile(cloud, tile).items():
+            by_tile.setdefault(i, []).append(Level(cell_m, part))
+    return [SceneNode(f"{prefix}/{i}", "background", tuple(by_tile[i]), far_m) for i in sorted(by_tile)]
+
 
 CELL_PX = 3.5
 Change = Callable[[SceneNode, int], GaussianCloud]  # (node, level index) -> the cloud to draw in its place

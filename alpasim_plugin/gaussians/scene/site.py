@@ -1,7 +1,8 @@
 """Rasterise a scenario's plan: where is road, how far is it to the road's edge, where have vehicles been.
 
 Maps come with very different content (lane edges or only centres, drivable areas or none), so everything that is built beside or on the
-road is derived from one raster of the plan, in a frame turned along the logged path.
+road is derived from one raster of the plan, in a frame turned along the logged path. Kerbs, trees, poles and facades stand along its level
+lines (`contours`).
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -230,3 +232,80 @@ def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
         return count
 
     return max((abreast(lane) for lane in near), default=1) >= 4
+
+
+SMOOTH = 9  # points of the moving average that takes the raster's steps out of a contour
+
+
+class Roadside(NamedTuple):
+    """Places along a line beside the road, ground coordinates."""
+
+    xy: F64  # (N, 2) metres
+    along: F64  # (N, 2) unit, road on the left
+    away: F64  # (N, 2) unit, from the road
+
+
+def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
+    """Return the lines ``(N, 2)`` where the distance to the road is ``beyond_m``, in ground coordinates, the road on their left.
+
+    Args:
+        site: What lies where.
+        beyond_m: Distance from the road's edge, metres.
+        within_path_m: Lines are cut where they are farther than this from the path.
+    """
+    off = site.off_road_m if beyond_m > 0 else site.off_road_m - site.inside_m
+    mask = (off > beyond_m).astype(np.uint8)
+    found, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    near = site.path_m < within_path_m
+    lines: list[F64] = []
+    for ring in found:
+        pixels = ring[:, 0, :]
+        if len(pixels) < 4 * SMOOTH:
+            continue
+        plan = site.low + (pixels + 0.5) * CELL_M
+        wrapped = np.concatenate([plan[-SMOOTH:], plan, plan[:SMOOTH]])
+        kernel = np.ones(SMOOTH) / SMOOTH
+        smooth = np.stack([np.convolve(wrapped[:, d], kernel, mode="same") for d in range(2)], axis=1)[SMOOTH:-SMOOTH]
+        h, w = mask.shape
+        inner = (pixels[:, 0] > 1) & (pixels[:, 0] < w - 2) & (pixels[:, 1] > 1) & (pixels[:, 1] < h - 2)
+        keep = inner & near[pixels[:, 1], pixels[:, 0]]
+        lines += [_road_on_left(site, part) for part in _runs(smooth, keep) if len(part) > 8]
+    return lines
+
+
+def _runs(points: F64, keep: Bool) -> list[F64]:
+    """Cut a closed line into the pieces where ``keep`` holds."""
+    if keep.all():
+        return [np.concatenate([points, points[:1]])]
+    start = int(np.argmin(keep))
+    points, keep = np.roll(points, -start, axis=0), np.roll(keep, -start)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))
+    return [points[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _road_on_left(site: Site, line: F64) -> F64:
+    """Turn a line so that the road lies to its left; which side it is on is voted by all points."""
+    d = np.gradient(line, axis=0)
+    left = left_of(unit(d))
+    signed = site.off_road_m - site.inside_m
+    nearer = site.look_up(signed, line + left).astype(np.float64) < site.look_up(signed, line - left).astype(np.float64)
+    return line if np.mean(nearer) >= 0.5 else line[::-1].copy()
+
+
+def places(line: F64, spacing_m: float, first_m: float = 0.0) -> Roadside:
+    """Return places every ``spacing_m`` along a line that has the road on its left."""
+    s = np.arange(first_m, float(arc_lengths(line)[-1]), spacing_m)
+    xy = resample(line, s)
+    d = resample(line, s + 0.5) - resample(line, s - 0.5)
+    along = unit(d)
+    return Roadside(xy, along, -left_of(along))
+
+
+def unit(vectors: F64) -> F64:
+    """Return rows ``(N, D)`` of length one; a row of zeros stays."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
+
+
+def left_of(along: F64) -> F64:
+    """Return rows ``(N, 2)`` turned to the left by a right angle."""
+    return np.stack([-along[:, 1], along[:, 0]], axis=1)

@@ -6,6 +6,8 @@ A rectangle is covered by a grid of flat Gaussians with a standard deviation of 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -17,21 +19,30 @@ from alpasim_plugin.gaussians.sh import C1, dc_from_rgb
 SPREAD = 0.64  # standard deviation per cell size
 THICKNESS = 0.08  # standard deviation across the surface, per cell size
 OPACITY = 0.985
+IDENTITY = (1.0, 0.0, 0.0, 0.0)  # a quaternion along the axes
 
 
-def cloud_of(means: F64, quats: F64, scales: F64, rgb: F64, opacity: float | F64 = OPACITY) -> GaussianCloud:
+def cloud_of(
+    means: F64, quats: npt.ArrayLike, scales: npt.ArrayLike, rgb: npt.ArrayLike, opacity: npt.ArrayLike = OPACITY
+) -> GaussianCloud:
     """Return Gaussians of one colour each.
 
     Args:
         means: ``(N, 3)`` metres.
-        quats: ``(N, 4)`` wxyz.
+        quats: ``(N, 4)`` wxyz; this and what follows may be one for all.
         scales: ``(N, 3)`` metres.
         rgb: ``(N, 3)`` 0..1.
-        opacity: One for all, or ``(N,)``.
+        opacity: ``(N,)``.
     """
-    opacities = np.broadcast_to(np.asarray(opacity, dtype=np.float32), (len(means),)).copy()
-    sh = dc_from_rgb(np.clip(rgb, 0.0, 1.0))[:, None, :].astype(np.float32)
-    return GaussianCloud(np.asarray(means, dtype=np.float64), quats.astype(np.float32), scales.astype(np.float32), opacities, sh)
+    n = len(means)
+    colours = np.clip(np.broadcast_to(rgb, (n, 3)), 0.0, 1.0)
+    return GaussianCloud(
+        np.asarray(means, dtype=np.float64),
+        np.array(np.broadcast_to(quats, (n, 4)), dtype=np.float32),
+        np.array(np.broadcast_to(scales, (n, 3)), dtype=np.float32),
+        np.array(np.broadcast_to(opacity, (n,)), dtype=np.float32),
+        dc_from_rgb(colours)[:, None, :].astype(np.float32),
+    )
 
 
 def with_sheen(cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: npt.ArrayLike) -> GaussianCloud:
@@ -50,7 +61,7 @@ def with_sheen(cloud: GaussianCloud, normals: F64, strength: F64, sky_rgb: npt.A
     sh[:, 0] = cloud.sh[:, 0] + dc_from_rgb(0.5 + add)
     for k, axis, sign in ((1, 1, -1.0), (2, 2, 1.0), (3, 0, -1.0)):
         sh[:, k] = sign * normals[:, axis, None] * add / C1
-    return GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh)
+    return replace(cloud, sh=sh)
 
 
 def upright_quats(normals: F64, yaw_rad: npt.ArrayLike) -> F64:
@@ -126,20 +137,21 @@ def quad_surfels(
     return cloud_of(means, quats[owner], scales[owner], colour), owner, normal
 
 
-def rods(start: F64, end: F64, radius_m: npt.ArrayLike, rgb: F64, step_m: float) -> GaussianCloud:
+def rods(start: F64, end: F64, radius_m: npt.ArrayLike, rgb: npt.ArrayLike, step_m: float) -> GaussianCloud:
     """Draw straight rods as chains of long Gaussians.
 
     Args:
         start: ``(M, 3)`` metres.
         end: ``(M, 3)`` metres.
         radius_m: One for all or ``(M,)``.
-        rgb: ``(M, 3)`` 0..1.
+        rgb: One for all or ``(M, 3)``, 0..1.
         step_m: Length of one link.
     """
     length = np.linalg.norm(end - start, axis=1)
     n = np.maximum(np.round(length / step_m), 1).astype(np.int64)
     owner, s, _ = grid_cells(n, np.ones_like(n))
-    radius = np.broadcast_to(np.asarray(radius_m, dtype=np.float64), (len(n),))[owner]
-    means = start[owner] + s[:, None] * (end - start)[owner]
-    scales = np.stack([SPREAD * (length / n)[owner], 0.75 * radius, 0.75 * radius], axis=1)
-    return cloud_of(means, quats_along((end - start)[owner]), scales, np.asarray(rgb, dtype=np.float64)[owner])
+    radius = 0.75 * np.broadcast_to(np.asarray(radius_m, dtype=np.float64), (len(n),))[owner]
+    along = (end - start)[owner]
+    scales = np.stack([SPREAD * (length / n)[owner], radius, radius], axis=1)
+    colours = np.broadcast_to(np.asarray(rgb, dtype=np.float64), (len(n), 3))[owner]
+    return cloud_of(start[owner] + s[:, None] * along, quats_along(along), scales, colours)

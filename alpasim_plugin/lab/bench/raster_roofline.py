@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.gaussians.raster.layout import GEO_SIZE, RECORD
+from alpasim_plugin.gaussians.constants import GEO_SIZE, RECORD
 
 # Operations of a blend: distance from the centre 2, in units of the ellipse 4, squared 3, exponential 13 (polynomial of degree 5, then its
 # eighth power), alpha 2, weight 1, three colours and depth 8, transmittance 1.

@@ -21,8 +21,7 @@ from alpasim_plugin.lab.training.pairs import PairRecipe, make_sequence
 from alpasim_plugin.lab.training.scenes import SPLITS
 from alpasim_plugin.renderers.cache import cache_root
 from alpasim_plugin.renderers.reconstruction import KIND, ensure
-from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
-from alpasim_plugin.renderers.reconstruction_recipe import recipe_of
+from alpasim_plugin.renderers.reconstruction_key import recipe_of, reconstruction_key
 from alpasim_plugin.runtime.parallel import parallel_map
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand

@@ -20,10 +20,10 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, logged_views, start_from_depth
 from alpasim_plugin.gaussians.fit.loop import fit
+from alpasim_plugin.gaussians.fit.photographs import read_views
 from alpasim_plugin.gaussians.fit.quality import Comparison, compare, summary, write_pictures
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
-from alpasim_plugin.gaussians.fit.view_files import read_views
-from alpasim_plugin.gaussians.raster.workers import thread_count
+from alpasim_plugin.gaussians.raster.rasterize_cpu import thread_count
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug

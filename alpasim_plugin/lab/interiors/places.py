@@ -9,8 +9,7 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.gaussians.scene.nodes import Level, SceneNode, nodes_by_tile
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneNode, nodes_by_tile
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky, make_sky
 from alpasim_plugin.lab.interiors import furniture as f
 from alpasim_plugin.lab.interiors.garden import daylight, garden_things

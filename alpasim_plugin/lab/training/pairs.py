@@ -16,8 +16,7 @@ from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import actor_boxes
-from alpasim_plugin.semantic_map.prepare import prepare_map
+from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.world.ground import ground_pose
 
 DOING = "making training pairs"

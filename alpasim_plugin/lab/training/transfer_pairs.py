@@ -11,14 +11,14 @@ import numpy as np
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView, seen_from
+from alpasim_plugin.gaussians.scene.log_views import SkyMask
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
-from alpasim_plugin.gaussians.scene.sky_mask import SkyMask
 from alpasim_plugin.lab.interiors.places import Place, build_place
 from alpasim_plugin.lab.training.hand_held import Hand, hand_held
 from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.lab.training.transfer_scenes import HEIGHT, WIDTH, TransferScene
 from alpasim_plugin.renderers.reconstruction_build import reconstruct
-from alpasim_plugin.renderers.reconstruction_recipe import recipe_for
+from alpasim_plugin.renderers.reconstruction_key import recipe_for
 
 PERIOD_S = 0.1
 RECORDED, SHOWN = "recording", "replay"  # takes of the same way: the reconstruction's, and the pairs'

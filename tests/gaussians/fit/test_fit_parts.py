@@ -14,11 +14,9 @@ from alpasim_plugin.core.image_metrics import C1, C2, SIGMA_PX, WINDOW_PX, psnr_
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit import SplatRecipe, Start, cloud_from_points, held_out, start_from_depth
-from alpasim_plugin.gaussians.fit.adam import RowAdam
-from alpasim_plugin.gaussians.fit.density import ScreenGradients, densify, reset_opacities
-from alpasim_plugin.gaussians.fit.model import SplatModel
-from alpasim_plugin.gaussians.fit.panorama import sky_of
-from alpasim_plugin.gaussians.fit.similarity import SsimTarget
+from alpasim_plugin.gaussians.fit.model import RowAdam, ScreenGradients, SplatModel, densify, reset_opacities
+from alpasim_plugin.gaussians.fit.quality import SsimTarget
+from alpasim_plugin.gaussians.fit.reconstruction import sky_of
 from alpasim_plugin.gaussians.fit.start import start_in_boxes
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 from tests.gaussians.fit.conftest import BOX, FAR, HEIGHT, WIDTH, Posed, actor_pose

@@ -11,8 +11,7 @@ import torch
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.fit import PosedView, Reconstruction, SplatRecipe, Start, held_out, loop
-from alpasim_plugin.gaussians.fit.checkpoint import STATE_FILE
-from alpasim_plugin.gaussians.fit.loop import fit
+from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
 from alpasim_plugin.gaussians.fit.quality import compare, summary
 from tests.gaussians.fit.conftest import BOX, Posed, actor_pose, at, camera_at
 

@@ -12,7 +12,8 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit.photographs import Match, read_photographs, triangulated
+from alpasim_plugin.gaussians.fit.photographs import read_photographs, read_views
+from alpasim_plugin.gaussians.fit.start import Match, triangulated
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 LENS = {"fl_x": 300.0, "fl_y": 302.0, "cx": 158.0, "cy": 121.0, "w": 320, "h": 240, "k1": -0.12, "k2": 0.03, "p1": 0.002, "p2": -0.001}
@@ -61,6 +62,20 @@ def test_a_bent_lens_is_straightened_and_a_missing_photograph_is_named(tmp_path:
                 y, x = np.indices(patch.shape) + 0.5
                 centre = np.array([(x * patch).sum(), (y * patch).sum()]) / patch.sum() + [round(u) - 4, round(v) - 4]
                 assert np.abs(centre - [u, v]).max() < 0.4
+
+
+def test_views_for_a_scenario_and_photographs_of_a_place_are_straightened_alike(tmp_path: Path) -> None:
+    path = write(tmp_path, np.array([[-1.6, -1.2, 4.0], [1.5, 1.1, 4.0], [0.2, -0.9, 4.0]])) / "transforms.json"
+    document = json.loads(path.read_text())
+    frames = [{**frame, "sky_path": frame["file_path"]} for frame in document["frames"][:2]]
+    path.write_text(json.dumps({**document, "axes": "opengl", "frames": frames}))
+    views, start = read_views(tmp_path)
+    assert start is None
+    for view, photograph in zip(views, read_photographs(tmp_path, 320).views, strict=True):
+        assert np.array_equal(view.rgb, photograph.rgb)
+        assert np.array_equal(view.camera.K, photograph.camera.K)
+        assert view.camera.cx != LENS["cx"]
+        assert np.array_equal(view.sky, view.rgb[..., 0] > 127)  # what lies over the picture is straightened with it
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.gaussians.fit.view_files import FILE, read_points, read_views, write_views
+from alpasim_plugin.gaussians.fit.photographs import FILE, read_points, read_views, write_views
 from tests.gaussians.fit.conftest import Posed
 
 
@@ -91,11 +91,11 @@ def test_points_to_start_from_keep_place_and_colour(posed: Posed, tmp_path: Path
         ({"axes": None}, "opengl"),
         ({"axes": "nerf"}, "'nerf'"),
         ({"frames": []}, "no frames"),
-        ({"k1": 0.1}, "undistort"),
+        ({"k4": 0.1}, "undistort"),
         ({"frame": {"transform_matrix": [[1, 2], [3, 4]]}}, "frame 0"),
         ({"frame": {"file_path": "gone.png"}}, "gone.png"),
         ({"frame": {"fl_x": "wide"}}, "frame 0"),
-        ({"frame": {"w": 47}}, "the camera has"),
+        ({"frame": {"w": 47}}, "the file says 47x32"),
         ({"ply_file_path": "gone.ply"}, "gone.ply"),
     ],
 )

@@ -17,8 +17,7 @@ from alpasim_plugin.lab.bench.paper import Compared, black_map, findings, groupe
 from alpasim_plugin.lab.paper import wrong_map
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.semantic_map.draw import draw_map
-from alpasim_plugin.semantic_map.layers import actor_boxes
-from alpasim_plugin.semantic_map.prepare import prepare_map
+from alpasim_plugin.semantic_map.prepare import actor_boxes, prepare_map
 from tests.gaussians.scene_maps import parked, straight, with_camera
 
 

@@ -12,7 +12,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import read_ply, write_ply
 from alpasim_plugin.gaussians.fit import Reconstruction, logged_views, start_from_depth
-from alpasim_plugin.gaussians.fit.view_files import write_views
+from alpasim_plugin.gaussians.fit.photographs import write_views
 from alpasim_plugin.renderers.gaussian import scene_of
 from scenarios.load import load_scenario
 

@@ -16,7 +16,7 @@ from alpasim_plugin.core.geometry import inverse, resample, transform_points
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap, Scenario
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.learned_metrics.types import FORWARD_M, NEAREST_CORNER_M, Cuboid, Lane3D, hull_pixels
-from alpasim_plugin.semantic_map.layers import lane_lines
+from alpasim_plugin.semantic_map.prepare import lane_lines
 
 VEHICLES = ("car", "truck", "bus")
 FARTHEST_M = 60.0  # of a labelled vehicle

@@ -1,7 +1,8 @@
-"""Read SPZ, the quantised and compressed Gaussian container: versions 2 and 3 (gzip) and 4 (zstd streams).
+"""Read the quantised forms of a Gaussian model: SuperSplat's compressed PLY, ``.splat`` and SPZ; write ``.splat``.
 
-Coordinates in the file are right-up-back (y up), those of a 3DGS PLY right-down-front. The reader turns the model into PLY axes by
-default, so that one model in both files lies in one place.
+A compressed PLY holds 16 bytes a Gaussian, quantised within chunks of 256. ``.splat`` holds 32 bytes a Gaussian without a header, constant
+colour only. SPZ (versions 2 and 3 by gzip, 4 by zstd streams) has coordinates right-up-back (y up) where those of a 3DGS PLY are
+right-down-front; its reader turns the model into PLY axes by default, so that one model in both files lies in one place.
 """
 
 from __future__ import annotations
@@ -16,10 +17,165 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians.arrays import GaussianArrays
+from alpasim_plugin.gaussians.cloud import GaussianArrays, GaussianCloud
+from alpasim_plugin.gaussians.files.ply import PlyHeader, read_ply_element, read_ply_header
+from alpasim_plugin.gaussians.sh import C0
+from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.io.limits import GAUSSIANS
 from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.io.reading.packed import unzstd
+
+CHUNK = 256
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_MAX_LOG_SCALE = 20.0
+
+
+def is_compressed_ply(header: PlyHeader) -> bool:
+    """Return whether a PLY header announces the packed layout."""
+    return any("packed_position" in element.properties for element in header.elements)
+
+
+def read_compressed_ply(path: Path | str) -> GaussianArrays:
+    """Read a compressed PLY file.
+
+    Returns:
+        The Gaussians in the axes of the file, ``N`` rows in file order (Morton order, as the writer sorts them).
+
+    Raises:
+        InputError: Truncated file, missing properties, or fewer chunks than the Gaussians need.
+    """
+    header = read_ply_header(path)
+    chunk_rows, rows = read_ply_element(header, "chunk"), read_ply_element(header, "vertex")
+    _check(header, chunk_rows, rows)
+    chunk = np.arange(len(rows)) // CHUNK
+    bounds = {name: chunk_rows[name].astype(np.float64) for name in chunk_rows.dtype.names or ()}
+
+    def spread(fractions: NDArray[np.float64], names: tuple[str, ...]) -> NDArray[np.float64]:
+        low = np.stack([bounds[f"min_{name}"] for name in names], axis=1)[chunk]
+        high = np.stack([bounds[f"max_{name}"] for name in names], axis=1)[chunk]
+        return low * (1 - fractions) + high * fractions
+
+    means = spread(_unpack_11_10_11(rows["packed_position"]), ("x", "y", "z"))
+    log_scales = spread(_unpack_11_10_11(rows["packed_scale"]), ("scale_x", "scale_y", "scale_z"))
+    rgba = _unpack_8888(rows["packed_color"])
+    # Files from before the colour bounds were introduced store colours over 0..1.
+    rgb = spread(rgba[:, :3], ("r", "g", "b")) if "min_r" in bounds else rgba[:, :3]
+    dc = (rgb - 0.5) / C0
+    return GaussianArrays(
+        means=means.astype(np.float32),
+        quats=unpack_rotation(rows["packed_rotation"]).astype(np.float32),
+        scales=np.exp(np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE)),
+        opacities=rgba[:, 3],
+        sh=np.concatenate([dc[:, None, :], _read_sh(header, len(rows))], axis=1).astype(np.float32),
+    )
+
+
+def unpack_rotation(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return unit quaternions ``(N, 4)`` wxyz from 2 + 3 x 10 bits.
+
+    The top two bits say which of w, x, y, z is the largest and left out; the others follow in order as ``0.5 + q / sqrt(2)``.
+    """
+    fractions = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1) / 1023.0
+    others = (fractions - 0.5) * np.sqrt(2.0)
+    largest = (packed >> 30).astype(np.intp)
+    quats = np.empty((len(packed), 4))
+    slots = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    np.put_along_axis(quats, slots, others, axis=1)
+    # Rounding can bring the three slightly above length 1.
+    left_out = np.sqrt(np.maximum(1.0 - np.sum(others**2, axis=1), 0.0))
+    np.put_along_axis(quats, largest[:, None], left_out[:, None], axis=1)
+    return quats
+
+
+def _unpack_11_10_11(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return fractions ``(N, 3)`` in 0..1."""
+    return np.stack([(packed >> 21) / 2047.0, ((packed >> 11) & 1023) / 1023.0, (packed & 2047) / 2047.0], axis=1)
+
+
+def _unpack_8888(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Return fractions ``(N, 4)`` in 0..1."""
+    return np.stack([(packed >> shift) & 255 for shift in (24, 16, 8, 0)], axis=1) / 255.0
+
+
+def _read_sh(header: PlyHeader, n: int) -> NDArray[np.float64]:
+    """Return the higher bands ``(N, K - 1, 3)``: bytes at the centres of 256 bins over -4..4, channel-major as in a plain PLY."""
+    if all(element.name != "sh" for element in header.elements):
+        return np.zeros((n, 0, 3))
+    rows = read_ply_element(header, "sh")
+    n_rest = len(rows.dtype.names or ())
+    if n_rest not in (9, 24, 45, 72) or len(rows) != n:
+        raise InputError(
+            "reading a compressed PLY file",
+            f"{header.path}, element 'sh'",
+            f"{len(rows)} rows of {n_rest} values for {n} Gaussians",
+            "export the file again",
+        )
+    table = np.stack([rows[f"f_rest_{i}"] for i in range(n_rest)], axis=1).astype(np.float64)
+    # The two end bytes stand for the ends of the range, so that clipped values keep their size.
+    fractions = np.where(table == 0, 0.0, np.where(table == 255, 1.0, (table + 0.5) / 256.0))
+    return np.swapaxes(((fractions - 0.5) * 8.0).reshape(n, 3, n_rest // 3), 1, 2)
+
+
+def _check(header: PlyHeader, chunks: NDArray[np.void], rows: NDArray[np.void]) -> None:
+    missing = [name for name in _PACKED if name not in (rows.dtype.names or ())]
+    bounds = [f"{end}_{name}" for end in ("min", "max") for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")]
+    missing += [name for name in bounds if name not in (chunks.dtype.names or ())]
+    need = -(-len(rows) // CHUNK)
+    if missing or len(chunks) < need:
+        found = f"missing properties {missing}" if missing else f"{len(chunks)} chunks where {need} are needed"
+        raise InputError("reading a compressed PLY file", str(header.path), found, "export the file again")
+
+
+_ROW = np.dtype(
+    [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)],
+)
+
+
+def read_splat(path: Path | str) -> GaussianArrays:
+    """Read a ``.splat`` file.
+
+    Raises:
+        InputError: Missing or empty file, or a size that is not a multiple of 32 bytes.
+    """
+    path = Path(path)
+    data = read_bytes(path, "reading a .splat file")
+    if not data or len(data) % _ROW.itemsize:
+        raise InputError(
+            "reading a .splat file",
+            str(path),
+            f"{len(data)} bytes, not a whole number of {_ROW.itemsize}-byte rows",
+            "copy or export the file again; it has no header, so a cut file shows only in its size",
+        )
+    GAUSSIANS.check(len(data) // _ROW.itemsize, "reading a .splat file", path)
+    rows = np.frombuffer(data, dtype=_ROW)
+    rgba = rows["rgba"].astype(np.float64) / 255.0
+    return GaussianArrays(
+        means=rows["position"].copy(),
+        quats=(rows["rotation"].astype(np.float32) - 128.0) / 128.0,
+        scales=rows["scale"].copy(),
+        opacities=rgba[:, 3],
+        sh=((rgba[:, None, :3] - 0.5) / C0).astype(np.float32),
+    )
+
+
+def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
+    """Write a cloud as ``.splat``; bands above the constant colour are lost and colours are clipped to 0..1.
+
+    Rotations keep 7 bits and sign, colours and opacity 8 bits; positions and scales are exact in float32.
+
+    Raises:
+        InfrastructureError: The folder is missing or not writable, or the disk is full.
+    """
+    rows = np.zeros(len(cloud.means), dtype=_ROW)
+    rows["position"] = cloud.means
+    rows["scale"] = cloud.scales
+    rgb = 0.5 + C0 * np.asarray(cloud.sh, dtype=np.float64)[:, 0, :]
+    rgba = np.concatenate([rgb, np.asarray(cloud.opacities, dtype=np.float64)[:, None]], axis=1)
+    rows["rgba"] = np.rint(np.clip(rgba, 0.0, 1.0) * 255.0)
+    rows["rotation"] = np.clip(np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128.0 + 128.0), 0, 255)
+    with atomic_file(path, "writing a .splat file") as partial:
+        partial.write_bytes(rows.tobytes())
+
 
 MAGIC = 0x5053474E  # "NGSP" in file order
 _GZIP = b"\x1f\x8b"
