@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import interpolate, rectangle_corners, yaw_from_quat, yaw_of
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import interpolate, lane_polygon, rectangle_corners, yaw_from_quat, yaw_of
 from alpasim_plugin.core.types import F64, Actor, Lane, RolloutLog, Scene
 from evaluators.footprint import origin_of
 from evaluators.presets import Preset

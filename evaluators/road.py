@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry_lanes import lane_polygons, ring_area
+from alpasim_plugin.core.geometry import lane_polygons, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.border import Borders
 from evaluators.footprint import Geometries

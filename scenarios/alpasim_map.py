@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.geometry_lanes import HALF_WIDTH_M
+from alpasim_plugin.core.geometry import HALF_WIDTH_M, arc_lengths
 from alpasim_plugin.core.types import F64, Lane, LaneMap
 from scenarios.vertices import with_vertices
 

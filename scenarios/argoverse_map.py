@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import wrap_angle
-from alpasim_plugin.core.geometry_lanes import centre_line
+from alpasim_plugin.core.geometry import centre_line, wrap_angle
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Paint
 from alpasim_plugin.world.ground import from_points
 from scenarios.reading import SourceFiles

@@ -8,8 +8,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import interpolate, lane_polygon
 from alpasim_plugin.core.types import F64, I64, Actor, LaneMap, Trajectory, Vehicle
 
 MIN_GAP_M = 0.3

@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry_lanes import centre_line, lane_polygon
+from alpasim_plugin.core.geometry import centre_line, lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from scenarios.reading import SourceFiles
 from scenarios.road_edges import border_lines, merge_areas

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import quat_from_matrix
-from alpasim_plugin.core.geometry_lanes import densify
+from alpasim_plugin.core.geometry import densify, quat_from_matrix
 from alpasim_plugin.core.types import F64, LaneMap, Marking, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.cosmos_camera import FRONT_WIDE, front_camera, read_lenses

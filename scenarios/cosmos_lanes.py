@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import wrap_angle, yaw_from_quat
-from alpasim_plugin.core.geometry_lanes import centre_line, lane_polygon
+from alpasim_plugin.core.geometry import centre_line, lane_polygon, wrap_angle, yaw_from_quat
 from alpasim_plugin.core.types import F64, Lane, Trajectory
 from scenarios.cosmos_layers import Label, paint_of
 from scenarios.reading import SourceFiles

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import transform_points
-from alpasim_plugin.core.geometry_lanes import densify, lane_polygon
+from alpasim_plugin.core.geometry import densify, lane_polygon, transform_points
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from alpasim_plugin.io.limits import ASIDE_M
 from scenarios.opendrive_geometry import beside, cubics_at, reference_line

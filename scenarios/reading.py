@@ -19,8 +19,8 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.io import reading
 from alpasim_plugin.io.limits import COORDINATE_M, MEMBERS, SOURCE_BYTES
 from alpasim_plugin.io.reading.arrays import parse_npy
+from alpasim_plugin.io.reading.files import parse_xml
 from alpasim_plugin.io.reading.tables import Kind, check_columns
-from alpasim_plugin.io.reading.xml_files import parse_xml
 
 MAX_REACH_M = COORDINATE_M.high
 

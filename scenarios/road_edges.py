@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 import shapely
 
-from alpasim_plugin.core.geometry_lanes import densify
+from alpasim_plugin.core.geometry import densify
 from alpasim_plugin.core.types import F64
 
 SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface

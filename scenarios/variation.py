@@ -9,8 +9,7 @@ import json
 from typing import Any
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.io.config import Document, apply_overrides
-from alpasim_plugin.io.config_validate import dotted
+from alpasim_plugin.io.config import Document, apply_overrides, dotted
 from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
 from scenarios.schema_base import Part
 

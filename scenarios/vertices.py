@@ -12,7 +12,7 @@ MAX_STEP_M = 2.0
 def with_vertices(line: F64) -> F64:
     """Put ``floor(length / 2 m)`` equally spaced points into every segment of a polyline ``(N, 3)``; lengths are measured in 3-D.
 
-    Unlike `alpasim_plugin.core.geometry_lanes.densify` it also splits a segment of exactly 2 m. Vertices stay as they are, and a new point is
+    Unlike `alpasim_plugin.core.geometry.densify` it also splits a segment of exactly 2 m. Vertices stay as they are, and a new point is
     ``start + step * k`` with ``step = segment / pieces``, rounded in that order: neighbouring lanes share edges but not vertices, and
     rounding decides whether their union has a crack there, which a distance to its border sees.
     """

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import os
 import sys
 import traceback
 from importlib import import_module
@@ -168,13 +167,8 @@ def run_command(args: list[str]) -> int:
 
 
 def main() -> None:
-    """Run the process's command line and exit with its code.
-
-    The working directory is searched for ``--policy package.module:Class`` last, after everything that is installed.
-    """
+    """Run the process's command line and exit with its code."""
     leave_at_once()
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
     sys.exit(run_command(sys.argv[1:]))
 
 

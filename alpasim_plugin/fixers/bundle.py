@@ -19,7 +19,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import LatentFixerSettings
 from alpasim_plugin.io.atomic import write_safetensors
-from alpasim_plugin.io.reading.json_files import kind_of, parse_json
+from alpasim_plugin.io.reading.files import kind_of, parse_json
 from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
 from alpasim_plugin.nets.tiny_vae import TinyVAE

@@ -1,6 +1,6 @@
-"""Files that vouch for files, so that damage is noticed before anything is trusted.
+"""Checksums of files, in files with a seal, so that damage is noticed before anything is trusted.
 
-A sealed JSON file ends with the SHA-256 of everything before it; it states size, time and SHA-256 of the files that it vouches for. A file
+A sealed JSON file ends with the SHA-256 of everything before it; it states size, time and SHA-256 of other files. A file
 with the stated size and time is taken as it is, since reading gigabytes before every command would cost more than it finds; any other is
 read in full. A copy has other times: they are set back once its content is found to be the same.
 """
@@ -43,7 +43,7 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def vouch(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
+def checksums_of(folder: Path, names: Iterable[str]) -> dict[str, FileFacts]:
     """Return the facts of those of the named files that are there."""
     found: dict[str, FileFacts] = {}
     for name in names:

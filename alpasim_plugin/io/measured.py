@@ -16,7 +16,7 @@ from typing import Any
 
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.lock import one_writer
-from alpasim_plugin.io.reading.json_files import read_json_object
+from alpasim_plugin.io.reading.files import read_json_object
 
 DOING = "measuring the machine"
 KEPT_S = 7 * 86400.0  # a folder of an earlier run, which nobody else removes

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.plugins.extras import require_library
+from alpasim_plugin.core.lazy import require_library
 
 Library = Literal["pandas", "polars"]
 LIBRARIES: tuple[Library, ...] = ("pandas", "polars")

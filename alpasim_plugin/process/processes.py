@@ -1,23 +1,17 @@
-"""Name a process so that another can tell whether it still runs; end workers with the process that started them; this one's memory."""
+"""Name a process so that another can tell whether it still runs; this one's memory."""
 
 from __future__ import annotations
 
-import ctypes
-import multiprocessing
 import os
-import signal
 import socket
 import subprocess
 import sys
-import threading
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
 ENDED = ("Z", "X")  # states of a process that runs no more
-ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
 
 Life = Literal["running", "gone", "elsewhere"]
 
@@ -96,28 +90,6 @@ def _said_by(*command: str) -> str:
         return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     except OSError:
         return ""
-
-
-def end_with_parent() -> None:
-    """End this worker process as soon as its parent is gone, by whatever signal; call it first, in the worker's main thread.
-
-    A thread waits for the end of a pipe that only the parent holds open, which works on every system. Linux kills the worker as well, so
-    that one inside a long call that never returns to Python ends too. A parent that died before the request was made is noticed by the
-    change of the parent's number.
-    """
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent.pid:
-        os._exit(ORPHANED)
-
-    def watch() -> None:
-        parent.join()
-        os._exit(ORPHANED)
-
-    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 def resident_mb(key: str) -> float | None:

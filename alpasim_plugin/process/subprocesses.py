@@ -1,28 +1,105 @@
-"""A command of the user's as a child process: its output is passed on, its last lines are kept, and it never outlives this process."""
+"""Child processes: workers of our own, and a command of the user's, whose output is passed on. None outlives this process."""
 
 from __future__ import annotations
 
 import atexit
+import ctypes
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
 
-GUARDIAN = Path(__file__).with_name("supervisor.py")
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
+SAFE_PATH, OURS = "PYTHONSAFEPATH", "simrun"  # variable that keeps Python from importing from the working directory; our value of it
+SUPERVISOR = Path(__file__).with_name("supervisor.py")
 GRACE_S = 5.0  # between asking the command to end and ending it
 LAST_LINES = 20
 LINE_BYTES = 8192  # longer lines are cut into several
 DOING = "starting a command"
 
 
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """Let Python processes that are started during the block import nothing from the working directory.
+
+    ``python -c`` and ``python -m``, by which workers are started, would look for the standard library there first. The process that was
+    started calls `own_path_only`, so that a user's command that it starts is not concerned.
+    """
+    if SAFE_PATH in os.environ:
+        yield
+        return
+    os.environ[SAFE_PATH] = OURS
+    try:
+        yield
+    finally:
+        del os.environ[SAFE_PATH]
+
+
+def own_path_only() -> None:
+    """Take the working directory off this worker's import path, unless the user's ``PYTHONPATH`` names it; undo `safe_path`."""
+    if os.environ.get(SAFE_PATH) == OURS:
+        del os.environ[SAFE_PATH]
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    here = os.path.realpath(os.getcwd())
+    sys.path[:] = [folder for folder in sys.path if folder in given or os.path.realpath(folder) != here]
+
+
+class _Process(SpawnProcess):
+    def start(self) -> None:
+        with safe_path():
+            resource_tracker.ensure_running()
+            super().start()
+
+    def run(self) -> None:
+        if os.environ.get(SAFE_PATH) == OURS:
+            del os.environ[SAFE_PATH]
+        super().run()
+
+
+class _Context(SpawnContext):
+    Process = _Process
+
+
+def spawn_context() -> SpawnContext:
+    """Return how worker processes are started: anew, by a Python that imports nothing from the working directory."""
+    return _Context()
+
+
+def end_with_parent() -> None:
+    """End this worker process as soon as its parent is gone, by whatever signal; call it first, in the worker's main thread.
+
+    A thread waits for the end of a pipe that only the parent holds open, which works on every system. Linux kills the worker as well, so
+    that one inside a long call that never returns to Python ends too. A parent that died before the request was made is noticed by the
+    change of the parent's number.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent.pid:
+        os._exit(ORPHANED)
+
+    def watch() -> None:
+        parent.join()
+        os._exit(ORPHANED)
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+
 class Child:
-    """A running command, in a process group of its own under a guardian (`alpasim_plugin.process.supervisor`).
+    """A running command, in a process group of its own under a supervisor (`alpasim_plugin.process.supervisor`).
 
     Args:
         command: Program and arguments; no shell reads them.
@@ -45,7 +122,7 @@ class Child:
         self.last: deque[str] = deque(maxlen=LAST_LINES)
         self._heard, self._ended = heard, ended
         self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", str(GUARDIAN), str(GRACE_S), *command],
+            [sys.executable, "-I", "-S", str(SUPERVISOR), str(GRACE_S), *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -99,11 +176,11 @@ def end_children() -> None:
 atexit.register(end_children)
 
 
-def fate(code: int) -> str:
+def exit_reason(code: int) -> str:
     """Say how a command ended.
 
     Example:
-        >>> fate(3), fate(137)
+        >>> exit_reason(3), exit_reason(137)
         ('exit code 3', 'exit code 137 (SIGKILL)')
     """
     names = {128 + int(one): one.name for one in signal.Signals}

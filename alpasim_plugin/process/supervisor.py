@@ -1,4 +1,4 @@
-"""Start a command and end it with whoever asked: ``python guardian.py GRACE_S COMMAND...``; the standard library alone, run as a script.
+"""Start a command and end it with whoever asked: ``python supervisor.py GRACE_S COMMAND...``; the standard library alone, run as a script.
 
 Standard input is a pipe that only the asking process holds open. When it ends, by whatever signal that process died, the command and all
 that it started get SIGTERM (which a container's client hands on to its container), and SIGKILL after the grace time. The exit code is the

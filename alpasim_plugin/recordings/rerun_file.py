@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.geometry import quat_from_matrix
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.io.atomic import atomic_file
-from alpasim_plugin.plugins.extras import require_library
 from alpasim_plugin.recordings.colors import MAP, ROAD_USER, Rgba, as_bytes, fainter, of_renderer
 from alpasim_plugin.recordings.content import DOING, Camera, Drive, Recording, present
 

@@ -14,8 +14,8 @@ from typing import Any, cast
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.checksums import FileFacts, problem_of, read_sealed, vouch, write_sealed
-from alpasim_plugin.io.reading.json_files import as_shape
+from alpasim_plugin.io.checksums import FileFacts, checksums_of, problem_of, read_sealed, write_sealed
+from alpasim_plugin.io.reading.files import as_shape
 from alpasim_plugin.runtime.manifests import Damage
 
 CONTENTS, RUN_INFO, SCENES, AGGREGATE = "contents.json", "run.json", "scenes", "aggregate"
@@ -61,7 +61,7 @@ def write_contents(root: Path, rollouts: Mapping[str, str]) -> None:
     """
     more = sorted(path.relative_to(root).as_posix() for name in (SCENES, AGGREGATE) for path in (root / name).glob("*.*"))
     run, _ = read_sealed(root / RUN_INFO, DOING, AGAIN)
-    stated = {"files": vouch(root, [*TABLES, *more]), "rollouts": dict(rollouts), "run": run}
+    stated = {"files": checksums_of(root, [*TABLES, *more]), "rollouts": dict(rollouts), "run": run}
     write_sealed(root / CONTENTS, stated, "writing the contents of a run")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import signal
 import traceback
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, Protocol, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.process.processes import end_with_parent
+from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 from alpasim_plugin.runtime.workers import GRACE_S, thread_environment
 
 Say = Callable[[Any], None]
@@ -84,7 +83,7 @@ def _check_order(tasks: Sequence[Task]) -> None:
 
 
 def _start(work: Callable[[T, Say], None], task: T) -> _Running:
-    context = multiprocessing.get_context("spawn")
+    context = spawn_context()
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(theirs, work, task))
     with thread_environment(1):

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.checksums import FileFacts, problem_of, read_sealed, vouch, write_sealed
-from alpasim_plugin.io.reading.json_files import as_shape
+from alpasim_plugin.io.checksums import FileFacts, checksums_of, problem_of, read_sealed, write_sealed
+from alpasim_plugin.io.reading.files import as_shape
 from alpasim_plugin.runtime.pictures import STRIP_NAME, VIDEO_NAME
 from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, OUTPUT_NAME
 
@@ -78,7 +78,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     Raises:
         InfrastructureError: The disk refuses.
     """
-    files = vouch(folder, [*DRIVEN, *DERIVED]) if manifest.get("status") == "ok" else {}
+    files = checksums_of(folder, [*DRIVEN, *DERIVED]) if manifest.get("status") == "ok" else {}
     write_sealed(folder / MANIFEST, {**manifest, "files": files}, "writing a rollout's manifest")
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.json_files import as_shape
+from alpasim_plugin.io.reading.files import as_shape
 from alpasim_plugin.runtime.certificate import Certify
 from alpasim_plugin.runtime.check import Inspection, inspect_run
 from alpasim_plugin.runtime.contents import CONTENTS, DOING, REPORTS, RUN_INFO, TABLES, write_run_json

@@ -5,7 +5,6 @@ Parent and worker talk over one pipe each. There is nothing else to share, so no
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import time
@@ -19,7 +18,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.process.processes import end_with_parent
+from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -110,7 +109,7 @@ class _Result:
 
 
 def _start(work: Callable[[A], R], threads: int) -> _Worker[A]:
-    context = multiprocessing.get_context("spawn")
+    context = spawn_context()
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, work), daemon=False)
     with thread_environment(threads):

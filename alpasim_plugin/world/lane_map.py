@@ -9,8 +9,7 @@ import scipy
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths, project, resample, wrap_angle
-from alpasim_plugin.core.geometry_lanes import HALF_WIDTH_M, densify, lane_polygon
+from alpasim_plugin.core.geometry import HALF_WIDTH_M, arc_lengths, densify, lane_polygon, project, resample, wrap_angle
 from alpasim_plugin.core.types import F64, I64, LaneMap
 
 VERTEX_STEP_M = 1.0  # the KD-trees hold a centre vertex at least this often

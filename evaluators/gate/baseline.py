@@ -10,7 +10,7 @@ from typing import Any
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.reading import read_json_object
-from alpasim_plugin.io.reading.json_files import as_shape, kind_of
+from alpasim_plugin.io.reading.files import as_shape, kind_of
 from evaluators.aggregate.rows import Row
 from evaluators.gate.rows import rows_of_run
 from evaluators.report.run_folder import Run, read_run

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.checksums import read_sealed
 from alpasim_plugin.io.lock import holder_of
-from alpasim_plugin.io.reading.json_files import as_shape, read_json_as
+from alpasim_plugin.io.reading.files import as_shape, read_json_as
 from evaluators.report.shapes import RunInfo, Summary
 
 RUN_INFO, SUMMARY, ROLLOUTS = "run.json", "summary.json", "rollouts.parquet"

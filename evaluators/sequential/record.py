@@ -9,7 +9,7 @@ from typing import Any, NotRequired
 from typing_extensions import TypedDict
 
 from alpasim_plugin.io.checksums import read_sealed, write_sealed
-from alpasim_plugin.io.reading.json_files import as_shape
+from alpasim_plugin.io.reading.files import as_shape
 from evaluators.sequential.decision import State
 from evaluators.sequential.question import METHOD_NAMES, Question
 

@@ -25,7 +25,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.process import subprocesses as children
 from alpasim_plugin.process.stdout import MOST_BYTES, parts_print_to_stderr, say
-from alpasim_plugin.process.subprocesses import Child, end_children, fate
+from alpasim_plugin.process.subprocesses import Child, end_children, exit_reason
 from policies.conformance import STRAIGHT, canned_scenario, observations
 
 REPO = Path(__file__).resolve().parents[2]
@@ -227,7 +227,7 @@ def test_commands_are_read_as_a_shell_would_and_refused_before_a_run() -> None:
             resolve("policy", f"exec:{text}")
     assert resolve("policy", "exec:sh a.sh").digest is None
     assert split_policies("clean,exec:sh a.sh --size '5,3', learned") == ["clean", "exec:sh a.sh --size '5,3'", "learned"]
-    assert (fate(0), fate(143)) == ("exit code 0", "exit code 143 (SIGTERM)")
+    assert (exit_reason(0), exit_reason(143)) == ("exit code 0", "exit code 143 (SIGTERM)")
 
 
 def test_output_of_parts_goes_to_a_file_that_has_an_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.geometry import rectangle_corners
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import lane_polygon, rectangle_corners
 from alpasim_plugin.core.types import Lane, LaneMap
 from evaluators import PRESETS, reduce_rollout, score, surface
 from evaluators.surface import MARGIN_M, Region, Surface, closed_union

@@ -23,9 +23,11 @@ def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, mon
             parcel = pickle.loads(pickle.dumps(mission))(plan.cells[0], Node("n1", contents.read))
             assert isinstance(parcel, Parcel)
             assert (parcel.manifest["status"], parcel.manifest["node"]) == ("ok", "n1")
-            assert measured._folder == measured_folder(run)
+            folder = measured_folder(run)
+            assert folder is not None
+            assert measured._folder == folder
             measured.measured("speed", lambda: {"ms": 1.0})
-            assert (measured_folder(run) / "speed.json").exists()
+            assert (folder / "speed.json").exists()
     finally:
         measured.share_measurements(None)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.io.atomic import temporary_path
-from alpasim_plugin.runtime.executors.scratch import scratch_root, sweep
+from alpasim_plugin.runtime.executors.scratch import measured_folder, scratch_root, sweep
 
 NO_PROCESS = 2**22 + 1  # above the most that Linux gives
 LATER_S = 4_102_444_800.0  # of a file system whose clock is far ahead of this machine's
@@ -34,3 +34,15 @@ def test_only_what_gone_processes_of_this_machine_have_left_is_removed(tmp_path:
     assert not gone.exists()
     assert running.exists()
     assert of_another.exists()
+
+
+def test_measurements_are_shared_in_a_folder_of_this_user_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SIMRUN_SCRATCH", str(tmp_path))
+    assert measured_folder("run") == scratch_root() / "measured" / "run"
+    assert scratch_root().stat().st_mode & 0o777 == 0o700
+    scratch_root().chmod(0o777)
+    assert measured_folder("run") is None, "others may write there"
+    scratch_root().rename(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").chmod(0o700)
+    scratch_root().symlink_to(tmp_path / "elsewhere")
+    assert measured_folder("run") is None, "a link, which whoever made it can turn"

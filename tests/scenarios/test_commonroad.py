@@ -7,8 +7,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate, se3, yaw_from_quat
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import interpolate, lane_polygon, se3, yaw_from_quat
 from alpasim_plugin.core.types import HeightField
 from alpasim_plugin.world.lane_map import LaneIndex
 from alpasim_plugin.world.route import route_from_log

@@ -10,8 +10,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, se3, transform_points, wrap_angle, yaw_from_quat
-from alpasim_plugin.core.geometry_lanes import densify, lane_polygon
+from alpasim_plugin.core.geometry import densify, inverse, lane_polygon, se3, transform_points, wrap_angle, yaw_from_quat
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.lane_map import LaneIndex
 from alpasim_plugin.world.route import route_from_log

@@ -13,8 +13,7 @@ import shapely
 from scipy.integrate import quad
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import arc_lengths, lane_polygon
 from scenarios.opendrive import lane_map_of
 from scenarios.opendrive_alpasim import alpasim_map
 from scenarios.opendrive_geometry import Cubic, Geometry, cubics_at, reference_line

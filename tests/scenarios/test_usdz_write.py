@@ -15,7 +15,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import lane_polygon
 from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
 from scenarios.alpasim_map import alpasim_view, rails
 from scenarios.load import load_scenario

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.core.geometry_lanes import centre_line
+from alpasim_plugin.core.geometry import centre_line
 from alpasim_plugin.core.types import Lane, LaneMap
 
 FAR = np.array([512_345.0, 5_412_678.0, 640.0])  # UTM-sized

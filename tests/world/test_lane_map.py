@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.geometry_lanes import centre_line, densify, lane_polygon
+from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify, lane_polygon
 from alpasim_plugin.core.types import Lane, LaneMap
 from alpasim_plugin.world.lane_map import LaneIndex
 from tests.examples import examples

@@ -24,7 +24,7 @@ from alpasim_plugin.alpasim.client.listening import LoopbackPort, SocketFile
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.process.stdout import say
-from alpasim_plugin.process.subprocesses import Child, fate
+from alpasim_plugin.process.subprocesses import Child, exit_reason
 
 DOING = "starting a policy's command"
 DRIVING = "driving by a policy's command"
@@ -115,7 +115,7 @@ class Served:
         code = self._child.end_within(wait_s)
         if code is not None:
             self.stop()
-            raise PolicyError(DRIVING, self._name, f"it ended with {fate(code)}{self._said()}", "see output.log of the rollout")
+            raise PolicyError(DRIVING, self._name, f"it ended with {exit_reason(code)}{self._said()}", "see output.log of the rollout")
 
     def is_running(self) -> bool:
         """Tell whether the command still runs."""

@@ -28,7 +28,7 @@ from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradien
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.checkpoints import START_ANEW, read_checkpoint
+from alpasim_plugin.io.reading.arrays import START_ANEW, read_checkpoint
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
 SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves

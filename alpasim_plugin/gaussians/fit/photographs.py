@@ -35,8 +35,8 @@ from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.limits import SOURCE_BYTES
 from alpasim_plugin.io.reading import read_bytes, read_json_object
+from alpasim_plugin.io.reading.files import as_shape
 from alpasim_plugin.io.reading.images import decode_image
-from alpasim_plugin.io.reading.json_files import as_shape
 
 FILE = "transforms.json"
 DOING = "reading photographs"

@@ -2,10 +2,9 @@
 
 Anything that a parser raises becomes an `InputError` that names the file (`parsing`). Which module reads what:
 
-- `files`: bytes and text, and the check of a path that a library opens itself.
-- `json_files`: JSON with limits on size and depth, and JSON of a stated shape.
+- `files`: bytes, text, JSON (with limits, and of a stated shape), XML, and the check of a path that a library opens itself.
 - `packed`: gzip, zstd and zip, decompressed to a stated size at most.
-- `arrays`: NumPy files, by their header against the file's size.
+- `arrays`: NumPy files, by their header against the file's size, and checkpoints.
 - `images`: pictures, by their header before they are decoded.
 - `tables`: parquet and Arrow tables with typed columns.
 
@@ -14,8 +13,18 @@ Light modules only are imported here; `arrays`, `images` and `tables` are import
 
 from __future__ import annotations
 
-from alpasim_plugin.io.reading.files import check_regular, exists, parsing, read_bytes, read_text
-from alpasim_plugin.io.reading.json_files import parse_json, read_json, read_json_as, read_json_lines, read_json_object
+from alpasim_plugin.io.reading.files import (  # fmt: skip
+    check_regular,
+    exists,
+    parse_json,
+    parsing,
+    read_bytes,
+    read_json,
+    read_json_as,
+    read_json_lines,
+    read_json_object,
+    read_text,
+)
 
 __all__ = [
     "check_regular", "exists", "parse_json", "parsing", "read_bytes", "read_json", "read_json_as", "read_json_lines", "read_json_object",

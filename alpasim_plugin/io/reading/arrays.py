@@ -1,17 +1,21 @@
-"""NumPy files: the header is compared with the file's size before memory is taken; pickles are never read."""
+"""NumPy files, whose header is compared with their size before memory is taken (pickles are never read), and checkpoints of training."""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib import format as npy_format
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io.limits import FILE_BYTES, Bound
-from alpasim_plugin.io.reading.files import FETCH_AGAIN, open_regular, parsing
+from alpasim_plugin.io.limits import FILE_BYTES, WEIGHT_BYTES, Bound
+from alpasim_plugin.io.reading.files import FETCH_AGAIN, check_regular, open_regular, parsing
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
 
 Array = np.ndarray[Any, Any]
 
@@ -54,3 +58,31 @@ def _check_header(stream: IO[bytes], size: int, where: Path | str, doing: str, d
     if dtype.hasobject or min(shape, default=0) < 0 or need > present:
         found = "an array of Python objects" if dtype.hasobject else f"{present} bytes for {dtype} {shape} of {need}"
         raise InputError(doing, str(where), f"no readable NumPy array: {found}", do_this)
+
+
+START_ANEW = "remove the folder and start again, or put a whole copy of the file there"
+
+
+def read_checkpoint(path: Path, doing: str, facts: str) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Return a checkpoint's header entries and its tensors.
+
+    Args:
+        path: The file.
+        doing: What the caller is doing, for messages.
+        facts: What the run is made of; the entry ``facts`` of the header must equal it.
+
+    Raises:
+        InputError: No file, a damaged one, or one of another run.
+    """
+    from safetensors import safe_open
+    from safetensors.torch import load_file
+
+    check_regular(path, doing, WEIGHT_BYTES)
+    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+        with safe_open(str(path), "np") as file:
+            meta = dict(file.metadata() or {})
+        begun = meta["facts"]
+    if begun != facts:
+        raise InputError(doing, str(path), f"it was begun as {begun}, this is {facts}", "choose another folder")
+    with parsing(doing, path, START_ANEW, "not a whole checkpoint"):
+        return meta, load_file(str(path))

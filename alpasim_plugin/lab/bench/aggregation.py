@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import tempfile
 import time
 from collections.abc import Mapping
@@ -16,7 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import alpasim_plugin.lab.video_metrics.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
-from alpasim_plugin.process.processes import end_with_parent, resident_mb
+from alpasim_plugin.process.processes import resident_mb
+from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.summary import aggregate, aggregate_sides
 from evaluators.metrics import METRICS
@@ -45,7 +45,7 @@ def bench_table(rollouts: int = 100_000, scenes: int = 1_000) -> TableRow:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rollouts.parquet"
         write_random_table(path, rollouts, scenes)
-        with multiprocessing.get_context("spawn").Pool(1, end_with_parent) as pool:
+        with spawn_context().Pool(1, end_with_parent) as pool:
             read_s, aggregate_s, rows_s, peak_mb, found = pool.apply(_measured, (path,))
         mean_error, count_errors = compared(found, path)
     return TableRow(rollouts, scenes, len(METRICS), read_s, aggregate_s, rows_s, peak_mb, mean_error, count_errors)

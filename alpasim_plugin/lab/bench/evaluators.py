@@ -19,8 +19,7 @@ import numpy as np
 import shapely
 from scipy.spatial import cKDTree
 
-from alpasim_plugin.core.geometry import arc_lengths, inverse, offset_trajectory, quat_from_yaw
-from alpasim_plugin.core.geometry_lanes import lane_polygon
+from alpasim_plugin.core.geometry import arc_lengths, inverse, lane_polygon, offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
 from evaluators.base import score
 from evaluators.collision import SIDES

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.plugins.extras import require_library
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.runtime.executors.assignment import assignment_as_here
 from alpasim_plugin.runtime.executors.base import Node, Resources
 from alpasim_plugin.runtime.executors.choice import Executor, kept_open, opened_pool

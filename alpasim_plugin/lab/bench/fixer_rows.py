@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -15,7 +14,7 @@ from alpasim_plugin.core.errors import FixerError
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers.refine import Difference
 from alpasim_plugin.lab.bench.fixer_speed import Timing
-from alpasim_plugin.process.processes import end_with_parent
+from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 
 Weights = Literal["stand-in", "identity", "random"]
 SCENE = "bench-fixer"  # key of the noise
@@ -145,7 +144,7 @@ def in_own_process(name: str, run: Callable[..., Timing], *arguments: object) ->
     Raises:
         FixerError: The process ended early.
     """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
+    with ProcessPoolExecutor(1, spawn_context(), end_with_parent) as pool:
         try:
             return pool.submit(run, *arguments).result()
         except BrokenProcessPool as error:

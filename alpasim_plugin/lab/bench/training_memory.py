@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import resource
 import time
 from collections.abc import Sequence
@@ -15,7 +14,8 @@ from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
 from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.process.processes import end_with_parent, resident_mb
+from alpasim_plugin.process.processes import resident_mb
+from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 
 KIB_OF_MIB, MB_OF_MIB = 1024.0, 2**20 / 1e6
 
@@ -46,7 +46,7 @@ def measure_memory(
         clips: Clips side by side.
         rows, columns: Size in latents.
     """
-    context = multiprocessing.get_context("spawn")
+    context = spawn_context()
     cells = []
     for n in latents:
         for k in (k for k in horizons if k <= n):

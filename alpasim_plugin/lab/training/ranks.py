@@ -6,7 +6,6 @@ first writes files. The number of ranks is no part of a run: a checkpoint contin
 
 from __future__ import annotations
 
-import multiprocessing
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
-from alpasim_plugin.process.processes import end_with_parent
+from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 
 T = TypeVar("T")
 Report = Callable[[int, Mapping[str, float]], None]
@@ -117,7 +116,7 @@ def in_ranks(work: Callable[[Ranks, Report | None], T], count: int, report: Repo
     """
     if count == 1:
         return work(ALONE, report)
-    context = multiprocessing.get_context("spawn")
+    context = spawn_context()
     with tempfile.TemporaryDirectory(prefix="simrun-ranks-") as folder:
         meeting = Path(folder) / "meeting"
         failures = context.SimpleQueue()

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.io.atomic import atomic_file, disk_error, write_safetensors, write_text
 from alpasim_plugin.io.reading import parse_json, parsing, read_text
-from alpasim_plugin.io.reading.checkpoints import START_ANEW, read_checkpoint
+from alpasim_plugin.io.reading.arrays import START_ANEW, read_checkpoint
 from alpasim_plugin.lab.training.ranks import ALONE, Ranks
 from alpasim_plugin.nets.checkpoints import listed, load_weights
 

@@ -71,7 +71,7 @@ def reached(file: str | Path) -> set[str]:
         path = todo.pop()
         if path not in seen:
             seen.add(path)
-            todo += _imported(path, root)
+            todo += imported_files(path, root)
     return seen
 
 
@@ -118,7 +118,7 @@ def _names(text: bytes) -> Iterator[str]:
             yield item.split(" as ")[0].strip()
 
 
-def _imported(path: str, root: str) -> Iterable[str]:
+def imported_files(path: str, root: str) -> Iterable[str]:
     """Return the files that a module imports; of our own modules once, because our files do not come and go while a process runs."""
     if root != OWN_ROOT:
         return _find_imported(path, root)
@@ -144,7 +144,7 @@ def _find_imported(path: str, root: str) -> Iterator[str]:
         if not parts or not (own or parts[0] == top or not is_shared):
             continue
         for depth in range(1, len(parts) + 1):
-            found = _own_file(tuple(parts[:depth])) if own else _module_file(root, parts[:depth])
+            found = _own_file(tuple(parts[:depth])) if own else module_file(root, parts[:depth])
             if found is not None:
                 yield found
         face = _own_file(tuple(parts[:-1])) if own and len(parts) > 1 else None
@@ -156,10 +156,11 @@ def _find_imported(path: str, root: str) -> Iterator[str]:
 
 @lru_cache(maxsize=8192)
 def _own_file(parts: tuple[str, ...]) -> str | None:
-    return _module_file(OWN_ROOT, parts)
+    return module_file(OWN_ROOT, parts)
 
 
-def _module_file(root: str, parts: Sequence[str]) -> str | None:
+def module_file(root: str, parts: Sequence[str]) -> str | None:
+    """Return the file of a module below a folder, ``__init__.py`` of a package; None where there is none."""
     path = os.path.join(root, *parts)
     package = os.path.join(path, "__init__.py")
     if os.path.isfile(package):

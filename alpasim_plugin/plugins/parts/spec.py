@@ -1,20 +1,55 @@
-"""What a run knows of a part: enough to build it anywhere, and to tell whether it is still the same."""
+"""The kinds of parts, and what a run knows of a part: enough to build it anywhere, and to tell whether it is still the same."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.plugins import interfaces
 from alpasim_plugin.plugins.interfaces import MetricInfo
-from alpasim_plugin.plugins.parts.kinds import KindName
+from alpasim_plugin.plugins.parts.loading import make_importable
 from alpasim_plugin.plugins.parts.source import code_digest
+
+KindName = Literal["renderer", "fixer", "policy", "controller", "evaluator", "source"]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of part.
+
+    Attributes:
+        name: Singular word for messages and specs.
+        group: Entry-point group through which other packages add parts.
+        interface: What a built part is.
+        arguments: Parameters by which a factory may ask for what is known when a part is built.
+    """
+
+    name: KindName
+    group: str
+    interface: Any
+    arguments: tuple[str, ...]
+
+
+SESSION = ("seed", "device", "threads")
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind("renderer", "simrun.renderers", interfaces.Renderer, ("scenario", *SESSION, "address")),
+        Kind("fixer", "simrun.fixers", interfaces.Fixer, ("settings", "scene_id", *SESSION)),
+        Kind("policy", "simrun.policies", interfaces.Policy, ("scenario", "address")),
+        Kind("controller", "simrun.controllers", interfaces.Controller, ("vehicle", "address", "scene_id")),
+        Kind("evaluator", "simrun.evaluators", interfaces.Evaluator, ("preset",)),
+        Kind("source", "simrun.sources", interfaces.Source, ()),
+    )
+}
 
 
 @dataclass(frozen=True)
@@ -66,6 +101,15 @@ class PartSpec:
             "files": dict(self.files),
             "settings": None if self.settings is None else self.settings.model_dump(mode="json"),
         }
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the target before the rest: settings may be objects of a module that only `make_importable` lets be found."""
+        return _restored, (self.target, pickle.dumps(dict(vars(self))))
+
+
+def _restored(target: str, rest: bytes) -> PartSpec:
+    make_importable(target)
+    return PartSpec(**pickle.loads(rest))
 
 
 def digest(value: object) -> str:

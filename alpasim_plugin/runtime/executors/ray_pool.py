@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.plugins.extras import require_library
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
 from alpasim_plugin.runtime.executors.scratch import sweep

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,9 +24,20 @@ def scratch_root() -> Path:
     return Path(os.environ.get("SIMRUN_SCRATCH") or tempfile.gettempdir(), f"simrun-{os.getuid()}-{socket.gethostname()}")
 
 
-def measured_folder(run: str) -> Path:
-    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.measured`)."""
-    return scratch_root() / "measured" / run
+def measured_folder(run: str) -> Path | None:
+    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.measured`).
+
+    None: nowhere, since `scratch_root` cannot be made, belongs to another user, or others may write there. Its name can be guessed, so
+    whoever was there first could decide what this run takes for its machine's speed.
+    """
+    root = scratch_root()
+    try:
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        state = root.lstat()
+    except OSError:
+        return None
+    is_private = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o022
+    return root / "measured" / run if is_private else None
 
 
 def sweep(pids: Sequence[int] = ()) -> None:

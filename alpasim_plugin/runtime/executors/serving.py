@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.process.subprocesses import own_path_only
 from alpasim_plugin.runtime.executors.base import Node
 from alpasim_plugin.runtime.workers import THREAD_VARIABLES
 
@@ -30,6 +31,7 @@ class Serving:
     """
 
     def __init__(self, node: str, threads: int, expected: Mapping[str, str], targets: Sequence[str]) -> None:
+        own_path_only()  # Ray adds the driver's working directory
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
         self._node, self._expected, self._targets = node, expected, targets
         self._work: Any = None
@@ -84,6 +86,7 @@ def serve_job(
         keys: One per item.
         expected, targets, threads: As `Serving` takes them.
     """
+    own_path_only()
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
     from alpasim_plugin.runtime.executors.identity import differences, identity_of
     from alpasim_plugin.runtime.executors.scratch import sweep

@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.io.atomic import write_bytes
-from alpasim_plugin.plugins.extras import require_library
 from alpasim_plugin.process.processes import is_running, started_of
+from alpasim_plugin.process.subprocesses import safe_path
 from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.base import Faulty
 from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
@@ -91,16 +92,17 @@ class SlurmPool(Generic[A]):
         for sha256 in dict.fromkeys(one for item in items for one in self._given.work.needs(item)):
             self._placed(sha256)
         keys = [self._given.work.key(item) for item in items]
-        job = self._executor.submit(
-            serve_job,
-            str(self._session),
-            self._blob.name,
-            pickle.dumps(list(items)),
-            keys,
-            dict(self._given.expected),
-            self._given.targets,
-            self._given.resources.cores,
-        )
+        with safe_path():
+            job = self._executor.submit(
+                serve_job,
+                str(self._session),
+                self._blob.name,
+                pickle.dumps(list(items)),
+                keys,
+                dict(self._given.expected),
+                self._given.targets,
+                self._given.resources.cores,
+            )
         self._jobs[worker] = job
         with (self._session / "jobs").open("a") as file:
             file.write(f"{job.job_id} {started_of(int(job.job_id)) if self._is_local else ''}\n")

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.io.atomic import disk_error, temporary_path, write_bytes
-from alpasim_plugin.plugins.extras import require_library
 
 T = TypeVar("T")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.io import checksums as vouched
-from alpasim_plugin.io.checksums import problem_of, read_sealed, vouch, write_sealed
+from alpasim_plugin.io import checksums
+from alpasim_plugin.io.checksums import checksums_of, problem_of, read_sealed, write_sealed
 
 CONTENT = {"metrics": {"progress": 0.5}, "files": [1, 2], "name": "é"}
 
@@ -56,7 +56,7 @@ def test_an_object_that_has_no_room_for_a_seal_is_a_mistake_of_the_caller(tmp_pa
 def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"0123456789")
-    facts = vouch(tmp_path, ["a", "absent"])
+    facts = checksums_of(tmp_path, ["a", "absent"])
     assert list(facts) == ["a"]
     assert problem_of(path, facts["a"]) is None
     path.write_bytes(b"01234")
@@ -73,7 +73,7 @@ def test_missing_cut_and_changed_files_are_told_apart(tmp_path: Path) -> None:
 def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"0123456789")
-    facts = vouch(tmp_path, ["a"])["a"]
+    facts = checksums_of(tmp_path, ["a"])["a"]
     path.write_bytes(b"x123456789")
     os.utime(path, ns=(0, facts["mtime_ns"]))
     assert problem_of(path, facts) is None
@@ -82,12 +82,12 @@ def test_content_that_rots_under_the_same_size_and_time_is_found_when_everything
 
 def test_a_copy_is_read_once_and_then_taken_by_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_bytes(b"0123456789")
-    facts = vouch(tmp_path, ["a"])["a"]
+    facts = checksums_of(tmp_path, ["a"])["a"]
     copy = tmp_path / "copy"
     shutil.copyfile(tmp_path / "a", copy)
     os.utime(copy, ns=(0, facts["mtime_ns"] + 5 * 10**9))
     read_in_full: list[Path] = []
-    digest = vouched.sha256_of
-    monkeypatch.setattr(vouched, "sha256_of", lambda path: (read_in_full.append(path), digest(path))[1])
+    digest = checksums.sha256_of
+    monkeypatch.setattr(checksums, "sha256_of", lambda path: (read_in_full.append(path), digest(path))[1])
     assert [problem_of(copy, facts) for _ in range(3)] == [None, None, None]
     assert read_in_full == [copy]
