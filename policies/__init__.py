@@ -12,34 +12,26 @@ if TYPE_CHECKING:
     from policies.conformance import Report as Report
     from policies.conformance import canned_scenario as canned_scenario
     from policies.conformance import check_policy as check_policy
-    from policies.constant_velocity import ConstantVelocity as ConstantVelocity
     from policies.lane_camera import LaneCamera as LaneCamera
     from policies.learned import Learned as Learned
-    from policies.log_replay import LogReplay as LogReplay
-    from policies.pure_pursuit import PurePursuit as PurePursuit
+    from policies.simple import ConstantVelocity as ConstantVelocity
+    from policies.simple import LogReplay as LogReplay
+    from policies.simple import PurePursuit as PurePursuit
 
 __all__ = [
-    "Check",
-    "ConstantVelocity",
-    "LaneCamera",
-    "Learned",
-    "LogReplay",
-    "PurePursuit",
-    "Report",
-    "canned_scenario",
-    "check_policy",
-    "make_policy",
-]
+    "Check", "ConstantVelocity", "LaneCamera", "Learned", "LogReplay", "PurePursuit", "Report",
+    "canned_scenario", "check_policy", "make_policy",
+]  # fmt: skip
 
 __getattr__ = lazy_names(
     __name__,
     {
         "Check": ".conformance",
-        "ConstantVelocity": ".constant_velocity",
+        "ConstantVelocity": ".simple",
         "LaneCamera": ".lane_camera",
         "Learned": ".learned",
-        "LogReplay": ".log_replay",
-        "PurePursuit": ".pure_pursuit",
+        "LogReplay": ".simple",
+        "PurePursuit": ".simple",
         "Report": ".conformance",
         "canned_scenario": ".conformance",
         "check_policy": ".conformance",

@@ -1,10 +1,11 @@
-"""Policies by name, and what policies share."""
+"""Policies by name, and what policies share: the times of a plan, the camera to look through and its newest frame."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, Policy, Scenario
+from alpasim_plugin.core.errors import InputError, PolicyError
+from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Policy, Scenario
 from alpasim_plugin.plugins.parts import build, unidentified
 
 PLAN_HORIZON_S = 5.0  # AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four metrics
@@ -35,3 +36,44 @@ def plan_times(t_us: int, horizon_s: float = PLAN_HORIZON_S) -> I64:
 def seconds(times_us: I64) -> F64:
     """Return the seconds ``(T,)`` from the first of the times; the difference is taken in integers."""
     return np.asarray((times_us - times_us[0]).astype(np.float64) * 1e-6)
+
+
+def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
+    """Return the camera to look through: the first one with "front" in its name, else the first one that looks ahead.
+
+    Raises:
+        InputError: No camera looks ahead.
+    """
+    ahead = [camera for camera in scenario.cameras if camera.T_rig_camera[0, 2] > 0.7]
+    for camera in sorted(ahead, key=lambda c: "front" not in c.name):
+        return camera
+    raise InputError(
+        f"making the policy {policy!r}",
+        f"scene {scenario.scene_id!r}",
+        f"no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
+        "add a front camera to the scenario or choose another policy",
+    )
+
+
+def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> Frame:
+    """Return the newest frame of a camera.
+
+    Args:
+        observation: What the policy is given.
+        camera: Which camera, and at which size.
+        policy: Name of the policy, for the error.
+
+    Raises:
+        PolicyError: The observation has no frame of the camera, or one of another size.
+    """
+    frame = observation.frames.get(camera.name)
+    expected = (camera.height, camera.width, 3)
+    if frame is None or frame.rgb.shape != expected:
+        found = f"frames of {sorted(observation.frames)}" if frame is None else f"a frame of shape {frame.rgb.shape}"
+        raise PolicyError(
+            "planning by camera",
+            f"policy {policy!r} at {observation.t_us} us",
+            f"{found}; needed is {camera.name!r} of shape {expected}",
+            "render the cameras that the policy names in `sensors`, at the scenario's size",
+        )
+    return frame

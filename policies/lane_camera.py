@@ -8,19 +8,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, CameraSpec, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec
-from policies.base import plan_times, seconds
-from policies.camera_frame import camera_frame
-from policies.ground_grid import GroundGrid, make_grid
+from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from policies.base import camera_frame, front_camera, plan_times, seconds
 from policies.lane_filter import LaneState, predict, search, shift, update
 from policies.lane_plan import NOISE_SPEED, Blend, RoutePrior, blend, correlated_noise, idm_progress, route_prior, sample_sigma_m, sampled
-from policies.lane_vision import PaintPoints, RidgeFilter, find_paint
 from policies.obstacle_vision import ObstacleTrack, RoadColour, anomaly, find_foot, learn_road, track_obstacle
-from policies.paths import beside, curve_speeds, follow, smooth_line
-from policies.pure_pursuit import has_route, route_points
+from policies.paths import Path, curve_speeds, follow, has_route, route_points, shifted, smooth_line
+from policies.road_vision import GroundGrid, PaintPoints, RidgeFilter, find_paint, make_grid
 
 NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = 0.7, 1.0  # a satellite receiver knows the lane, not the place in it
 MIN_CRUISE_MPS = 8.0
@@ -33,23 +29,6 @@ SAME_HEADING_RAD, TURN_OFF_RAD = 0.25, 0.3
 CHOOSE_AT_M, CHOOSE_AT_S = 12.0, 1.2
 SIGMA_AT_M = 10.0
 OBSTACLE_RANGE_M = 48.0
-
-
-def front_camera(scenario: Scenario, policy: str = "lane-camera") -> CameraSpec:
-    """Return the camera to look through: the first one with "front" in its name, else the first one that looks ahead.
-
-    Raises:
-        InputError: No camera looks ahead.
-    """
-    ahead = [camera for camera in scenario.cameras if camera.T_rig_camera[0, 2] > 0.7]
-    for camera in sorted(ahead, key=lambda c: "front" not in c.name):
-        return camera
-    raise InputError(
-        f"making the policy {policy!r}",
-        f"scene {scenario.scene_id!r}",
-        f"no camera looks ahead among {[camera.name for camera in scenario.cameras]}",
-        "add a front camera to the scenario or choose another policy",
-    )
 
 
 class LaneCamera(Policy):
@@ -92,7 +71,12 @@ class LaneCamera(Policy):
             PolicyError: The observation has no frame of the camera, or one of another size.
         """
         frame = camera_frame(observation, self.camera, "lane-camera")
-        route = self._navigation(smooth_line(route_points(observation.route_rig))) if has_route(observation.route_rig) else None
+        route = None
+        if has_route(observation.route_rig):  # with a lateral navigation error that is constant over the drive
+            line = smooth_line(route_points(observation.route_rig))
+            step = np.gradient(line, axis=0)
+            normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+            route = line + self.navigation_error_m * normal
         speed = observation.ego.speed_mps
         if self.cruise_mps is None:
             self.cruise_mps = max(speed, MIN_CRUISE_MPS)
@@ -106,26 +90,15 @@ class LaneCamera(Policy):
         self.step, self.acted_us = self.step + 1, observation.t_us
         wanted_mps = self.cruise_mps * (1.0 + NOISE_SPEED * float(self.noise[0, 1]))
         times = plan_times(observation.t_us)
-        progress = idm_progress(
-            speed,
-            curve_speeds(blended.path, wanted_mps),
-            seconds(times),
-            self._obstacle_now(observation),
-            self.bumper_m,
-            wanted_mps,
-        )
+        limits, obstacle = curve_speeds(blended.path, wanted_mps), self._obstacle_now(observation)
+        progress = idm_progress(speed, limits, seconds(times), obstacle, self.bumper_m, wanted_mps)
         lane_sigma_m = 0.0 if lane is None else float(lane.sigma(np.array([SIGMA_AT_M]))[0])
         sigma_m = sample_sigma_m(lane_sigma_m)
-        xy, yaw = follow(beside(blended.path, sigma_m * float(self.noise[0, 0])), progress, max(speed, 0.0))
+        line = shifted(blended.path.xy, sigma_m * float(self.noise[0, 0]))
+        xy, yaw = follow(Path(line, blended.path.curvature), progress, max(speed, 0.0))
         others = sampled(xy, yaw, self.noise, sigma_m)[1:]
         debug = self._debug(lane, route, blended)
         return Plan(observation.t_us, times, xy, yaw, tuple(others), debug)
-
-    def _navigation(self, route: F64) -> F64:
-        """Return the route ``(M, 2)`` with a lateral navigation error that is constant over the drive."""
-        step = np.gradient(route, axis=0)
-        normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
-        return np.asarray(route + self.navigation_error_m * normal)
 
     def _look(self, frame: Frame, pose: F64, route: F64 | None, pose_now: F64, speed: float) -> None:
         """Update lane, road colour and obstacle from a new frame."""
@@ -153,18 +126,15 @@ class LaneCamera(Policy):
     def _look_for_lane(self, points: PaintPoints, route: F64 | None, speed: float) -> None:
         row_m = np.interp(points.x_m, self.grid.x_m, self.grid.row_m)
         guess = route_prior(np.array([[0.0, 0.0], [20.0, 0.0]]) if route is None else route)
-        if self.lane is not None:
-            self.lane = update(self.lane, points, row_m)
-            if self._is_lost(self.lane, guess if route is not None else None):
-                self.lane = None
-        if self.lane is None:
-            self.lane = search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm)
-            if self.lane is not None:
-                self.lane = update(self.lane, points, row_m)
-                if self._is_lost(self.lane, guess if route is not None else None):
-                    self.lane = None
-        if self.lane is not None and route is not None:
-            self.lane = self._choose_lane(self.lane, route, points, row_m, speed)
+
+        def seen(lane: LaneState | None) -> LaneState | None:
+            updated = None if lane is None else update(lane, points, row_m)
+            return None if updated is None or self._is_lost(updated, None if route is None else guess) else updated
+
+        lane = seen(self.lane)
+        if lane is None:
+            lane = seen(search(points, row_m, guess.offset_m, guess.heading_rad, guess.curvature_1pm))
+        self.lane = lane if lane is None or route is None else self._choose_lane(lane, route, points, row_m, speed)
 
     def _choose_lane(self, lane: LaneState, route: F64, points: PaintPoints, row_m: F64, speed: float) -> LaneState | None:
         """Change to the lane that the route is in, once it has run beside the present one over several frames.

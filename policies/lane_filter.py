@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alpasim_plugin.core.types import F64, Bool
-from policies.lane_vision import PaintPoints
+from policies.road_vision import PaintPoints
 
 OFFSET, HEADING, CURVATURE, BEND, WIDTH = range(5)
 MEAN_WIDTH_M = 3.5

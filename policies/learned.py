@@ -12,13 +12,10 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, Observation, Plan, Policy, Route, Scenario, SensorSpec
-from policies.base import plan_times, seconds
-from policies.camera_frame import camera_frame
-from policies.lane_camera import front_camera
+from policies.base import camera_frame, front_camera, plan_times, seconds
 from policies.lane_plan import N_SAMPLES, NOISE_SPEED, correlated_noise, sampled
-from policies.learned_command import COMMANDS, route_command
-from policies.learned_view import level_view, network_input
-from policies.pure_pursuit import MIN_CRUISE_MPS
+from policies.learned_input import COMMANDS, level_view, network_input, route_command
+from policies.paths import MIN_CRUISE_MPS
 
 WEIGHTS = Path(__file__).parent / "weights" / "learned.safetensors"
 EARLIER_US = 500_000  # age of the earlier frame, which shows motion
@@ -31,7 +28,7 @@ class Learned(Policy):
     """Predict a path and a speed profile with a network, and drive a sample of the prediction.
 
     It reads two frames of one camera, 0.5 s apart, the car's speed, the initial speed of the drive as the desired speed, and one of five
-    commands computed from the route (`policies.learned_command`). It gets no other information on the route: the position in the lane
+    commands computed from the route (`policies.learned_input`). It gets no other information on the route: the position in the lane
     comes from the image. It was trained on frames of the renderer ``clean`` only.
 
     Args:

@@ -14,8 +14,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.io.reading import check_regular, parsing
-from policies.learned_command import COMMANDS
-from policies.learned_view import CHANNELS, HEIGHT, WIDTH
+from policies.learned_input import CHANNELS, COMMANDS, HEIGHT, WIDTH
 
 KNOTS_M = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0, 42.0, 60.0)  # distances along the path of the predicted headings
 TIMES_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)  # times of the predicted speeds

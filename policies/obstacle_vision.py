@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.types import F64, U8
-from policies.ground_grid import CELL_M, GroundGrid
+from policies.road_vision import CELL_M, GroundGrid
 
 STRIPS = 4
 CORRIDOR_HALF_M = 1.05  # half the ego's width: what stands outside can be passed

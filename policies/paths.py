@@ -11,6 +11,7 @@ import scipy
 from alpasim_plugin.core.geometry import arc_lengths, resample
 from alpasim_plugin.core.types import F64
 
+MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
 MAX_LATERAL_MPS2 = 2.5  # comfort in curves
 MIN_LOOKAHEAD_M = 3.0
 CUT_M = 0.15
@@ -28,6 +29,24 @@ class Path:
 
     xy: F64  # (N, 2) metres
     curvature: F64  # (N,) 1/m, left positive
+
+
+def has_route(route_rig: F64) -> bool:
+    """Return whether at least half a metre of the route ``(20, 3)`` is left."""
+    points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    return len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5
+
+
+def route_points(route_rig: F64) -> F64:
+    """Return the route's points ``(M, 2)`` before its NaN rows; straight ahead where no route is left.
+
+    The route begins at the ego's projection, so the first point may lie beside the ego.
+    """
+    points = np.asarray(route_rig[np.isfinite(route_rig).all(axis=1), :2])
+    if has_route(route_rig):
+        return points
+    start = points[0] if len(points) else np.zeros(2)
+    return np.stack([start, start + np.array([1.0, 0.0])])
 
 
 def smooth_line(points: F64, spacing_m: float = 1.0) -> F64:
@@ -69,11 +88,11 @@ def make_path(points: F64, length_m: float = 120.0, speed_mps: float = 0.0) -> P
     return Path(xy, np.gradient(smooth, Path.SPACING_M))
 
 
-def beside(path: Path, left_m: float) -> Path:
-    """Return the path shifted to the left."""
-    step = np.gradient(path.xy, axis=0)
+def shifted(line: F64, left_m: float) -> F64:
+    """Return a line ``(M, 2)`` shifted to the left."""
+    step = np.gradient(line, axis=0)
     normal = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
-    return Path(path.xy + left_m * normal, path.curvature)
+    return np.asarray(line + left_m * normal)
 
 
 def curve_speeds(path: Path, cruise_mps: float, brake_mps2: float = 2.0, lateral_mps2: float = MAX_LATERAL_MPS2) -> F64:

@@ -9,7 +9,7 @@ length, trees and walls by the surroundings.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, Actor, Box, CameraSpec, Environment, LaneMap, Scenario, Trajectory
 from alpasim_plugin.io import limits as b
 from scenarios.recorded import RecordedLog
-from scenarios.schema import ScenarioSpec
-from scenarios.schema_actors import IdmActor, ParkedActor
-from scenarios.schema_road import NarrowGapSegment
+from scenarios.schema_parts import IdmActor, NarrowGapSegment, ParkedActor
+from scenarios.variation import Drawn
 
 DOING = "checking what a scenario costs"
 REACH_M = 110.0  # the surroundings are built so far from the drive
@@ -37,21 +36,22 @@ GAUSSIANS = b.Bound("Gaussians", "", 0, 20_000_000, "they would take more than 4
 PLAN_CELLS = b.Bound("cells of the ground plan", "", 0, 50_000_000, "a square of 1.7 km at 0.25 m takes about 1 GB")
 BUDGETS = (ACTORS, REACTIVE, LANES, VERTICES, POSES, GAUSSIANS, PLAN_CELLS)
 
-Loc = tuple[str | int, ...]
-Fail = Callable[[Loc, str, str], InputError]
 
-
-def check_specification(spec: ScenarioSpec, fail: Fail) -> None:
+def check_specification(drawn: Drawn) -> None:
     """Check a built road's file before it is built.
 
     Args:
-        spec: Validated file, with ``road``.
-        fail: Makes the error at a key path, of what was found and what to do.
+        drawn: Specification with ``road``.
 
     Raises:
         InputError: The road, its actors or their number are more than a scenario may have; the number is named.
     """
+    spec = drawn.spec
     assert spec.road is not None
+
+    def fail(key: tuple[str, ...], found: str, do_this: str) -> InputError:
+        return drawn.document.error("reading a scenario", key, found, do_this)
+
     lengths = [getattr(segment, "length_m", 2 * getattr(segment, "arm_length_m", 0.0)) for segment in spec.road.segments]
     if not b.ROAD_M.holds(sum(lengths)):
         raise fail(("road", "segments"), _found(b.ROAD_M, sum(lengths)), "shorten segments, or make several scenarios")
@@ -61,8 +61,7 @@ def check_specification(spec: ScenarioSpec, fail: Fail) -> None:
     for bound, value in ((ACTORS, actors), (REACTIVE, reactive)):
         if not bound.holds(value):
             raise fail(("actors",), _found(bound, value), "leave out those that the ego never meets")
-    end_us = spec.timing.start_us + (spec.timing.duration_us or 8_000_000)
-    driven_m = min(end_us * 1e-6 * max(spec.ego.cruise_mps, spec.ego.speed_mps), sum(lengths))
+    driven_m = min(spec.built_until_us * 1e-6 * max(spec.ego.cruise_mps, spec.ego.speed_mps), sum(lengths))
     if spec.background is None:
         count = gaussians(spec.environment, driven_m, driven_m, 0.0)
         if not GAUSSIANS.holds(count):

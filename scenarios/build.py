@@ -1,21 +1,23 @@
-"""A built road: from the validated file to map, expert log and actors."""
+"""A built road: from the specification to map, expert log and actors, and the check that the drive is on the road and clear of all."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
+import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Actor, LaneMap, Route, Trajectory, Vehicle
-from alpasim_plugin.world.path import Path
-from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneTaper, Profile
-from alpasim_plugin.world.roads import build_road
-from scenarios.check import check_drive
+from alpasim_plugin.core.geometry import interpolate, lane_polygon
+from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
+from alpasim_plugin.world.ground import flat
+from alpasim_plugin.world.road_strip import Curve, Element, Intersection, LaneTaper, Profile
+from alpasim_plugin.world.roads import Road, build_road
+from scenarios.budget import check_specification
 from scenarios.ego_path import EgoPath, LaneChange, LateralShift, make_ego_path
-from scenarios.expert import Drive, ExpertStyle, drive
+from scenarios.recorded import RecordedLog
 from scenarios.schema import ScenarioSpec
-from scenarios.schema_road import (
+from scenarios.schema_parts import (
     ArcSegment,
     ClothoidSegment,
     IntersectionSegment,
@@ -25,70 +27,69 @@ from scenarios.schema_road import (
     SplitSegment,
     StraightSegment,
 )
-from scenarios.traffic import Fail, Traffic, place_actors
+from scenarios.traffic import place_actors
+from scenarios.variation import Drawn
 
+MIN_GAP_M = 0.3
+STEP_US = 50_000
+SEAM_M = 1e-3  # lanes that share an edge are joined over rounding
 TAIL_US = 4_000_000  # scripts go on for so long after the end, so that the expert's lookahead does not see them stop
-DEFAULT_DURATION_US = 8_000_000
 
 
-@dataclass(frozen=True)
-class BuiltRoad:
-    """A built road with its traffic."""
-
-    lane_map: LaneMap
-    ego_log: Trajectory
-    route: Route
-    actors: tuple[Actor, ...]
-
-
-def build(spec: ScenarioSpec, vehicle: Vehicle, fail: Fail) -> BuiltRoad:
+def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     """Build the road, place the actors and let the expert drive.
 
     Args:
-        spec: Validated and jittered file, with ``road``.
+        drawn: Specification with ``road``.
         vehicle: Ego vehicle.
-        fail: Puts the position of a key path into an error.
 
     Raises:
-        InputError: A road, an actor or a drive that cannot be built.
+        InputError: A road, an actor or a drive that cannot be built, with the position of its key.
     """
+    spec = drawn.spec
     assert spec.road is not None
-    try:
+    check_specification(drawn)
+    with drawn.at("road", "segments"):
         road = build_road(elements(spec.road), profile(spec.road), (0.0, 0.0, np.deg2rad(spec.road.heading_deg)))
-    except InputError as e:
-        raise fail(("road", "segments"), e) from e
-    try:
-        changes = [LaneChange(spec.ego.start_m + c.at_m, c.to_lane, c.length_m) for c in spec.ego.lane_changes]
-        plain = make_ego_path(road, spec.ego.lane, changes)
-        ego_path = make_ego_path(road, spec.ego.lane, changes, _lateral_shifts(spec.road, plain))
-    except InputError as e:
-        raise fail(("ego",), e) from e
-    end_us = last_us(spec)
-    if spec.ego.start_m >= ego_path.path.length_m:
-        raise fail(("ego", "start_m"), _too_short(ego_path.path.length_m, spec.ego.start_m))
-    traffic = place_actors(spec, road, ego_path, vehicle, end_us + TAIL_US, fail)
-    run = _drive(spec, ego_path, vehicle, traffic, end_us, fail)
+    with drawn.at("ego"):
+        ego_path = _ego_path(spec, spec.road, road)
+    length_m = ego_path.path.length_m
+    if spec.ego.start_m >= length_m:
+        with drawn.at("ego", "start_m"):
+            raise _too_short(length_m, spec.ego.start_m)
+    end_us = spec.built_until_us
+    traffic = place_actors(drawn, road, ego_path, vehicle, end_us + TAIL_US)
+    run = traffic.drive(spec.ego, ego_path, vehicle, end_us)
+    reached_us = int(run.ego_log.t_us[-1])
+    if reached_us < end_us:
+        driven_m, _ = ego_path.path.project(run.ego_log.xyz[-1:, :2])
+        with drawn.at("road", "segments"):
+            raise _too_short(length_m, float(driven_m[0]), f" after {reached_us / 1e6:.1f} s of {end_us / 1e6:.1f} s")
     actors = traffic.actors(run)
-    try:
-        check_drive(road.lane_map, run.ego_log, vehicle, actors, end_us)
-    except InputError as e:
-        raise fail(_blame(spec, e.with_what), e) from e
-    return BuiltRoad(road.lane_map, run.ego_log, Route(ego_path.path.xyz[::4], ego_path.lane_ids), actors)
+    _check_drive(drawn, road.lane_map, run.ego_log, vehicle, actors)
+    route = Route(ego_path.path.xyz[::4], ego_path.lane_ids)
+    origin = (0.0, 0.0, 0.0)
+    return RecordedLog(drawn.scene_id, "yaml", road.lane_map, flat(0.0), run.ego_log, vehicle, actors, (), origin, "", route=route)
 
 
-def _blame(spec: ScenarioSpec, with_what: str) -> tuple[str | int, ...]:
-    """Return the key path of the actor that an error names."""
-    name = with_what.removeprefix("actor ")
-    for i, actor in enumerate(spec.actors):
-        if name == actor.id or name.startswith(f"{actor.id}-"):
-            return ("actors", i)
-    return ("road", "segments")
+def _ego_path(spec: ScenarioSpec, written: RoadSpec, road: Road) -> EgoPath:
+    """Return the ego's line, moved aside in narrow gaps."""
+    ego = spec.ego
+    changes = [LaneChange(ego.start_m + change.at_m, change.to_lane, change.length_m) for change in ego.lane_changes]
+    plain = make_ego_path(road, ego.lane, changes)
+    shifts = []
+    for i, segment in enumerate(written.segments):
+        if isinstance(segment, NarrowGapSegment) and segment.shift_m:
+            begin, end = plain.stretch_s[i], plain.stretch_s[i + 1]
+            quarter = (end - begin) / 4
+            shifts.append(LateralShift(begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m))
+    return make_ego_path(road, ego.lane, changes, shifts)
 
 
-def last_us(spec: ScenarioSpec) -> int:
-    """Return the end of the scenario after the log's first pose."""
-    duration = spec.timing.duration_us
-    return spec.timing.start_us + (DEFAULT_DURATION_US if duration is None else duration)
+def _too_short(length_m: float, s_m: float, when: str = "") -> InputError:
+    found = f"the road is {length_m:.0f} m long and the ego stands at {s_m:.0f} m{when}"
+    do_this = "add or lengthen a segment, shorten timing.duration_us, or lower ego.cruise_mps"
+    return InputError("driving the expert", "road", found, do_this)
 
 
 def elements(spec: RoadSpec) -> list[Element]:
@@ -105,10 +106,7 @@ def elements(spec: RoadSpec) -> list[Element]:
             case MergeSegment() | SplitSegment():
                 out.append(LaneTaper(segment.kind, segment.length_m))
             case IntersectionSegment():
-                out.append(
-                    Intersection(segment.turn, segment.arms, segment.cross_lanes, segment.arm_length_m, segment.corner_radius_m,
-                                 segment.crosswalks, segment.guide_lines)
-                )  # fmt: skip
+                out.append(Intersection(**segment.model_dump(exclude={"kind"})))
     return out
 
 
@@ -120,33 +118,52 @@ def profile(spec: RoadSpec) -> Profile:
     )  # fmt: skip
 
 
-def _lateral_shifts(spec: RoadSpec, ego_path: EgoPath) -> list[LateralShift]:
-    out = []
-    for i, segment in enumerate(spec.segments):
-        if isinstance(segment, NarrowGapSegment) and segment.shift_m:
-            begin, end = ego_path.stretch_s[i], ego_path.stretch_s[i + 1]
-            quarter = (end - begin) / 4
-            out.append(LateralShift(begin + quarter, end - quarter, max(2 * quarter, 12.0), segment.shift_m))
-    return out
+def _check_drive(drawn: Drawn, lane_map: LaneMap, ego_log: Trajectory, vehicle: Vehicle, actors: Sequence[Actor]) -> None:
+    """Check that the ego's footprint stays on the vehicle lanes and `MIN_GAP_M` clear of all actors.
+
+    Raises:
+        InputError: It does not, with the position of the road or of the actor.
+    """
+    doing, last_us = "checking the expert's drive", min(drawn.spec.built_until_us, int(ego_log.t_us[-1]))
+    t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US, dtype=np.int64)
+    ego = _footprints(interpolate(ego_log, t_us), vehicle.box, vehicle.rear_axle_to_centre_m)
+    lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
+    road = shapely.union_all([shapely.buffer(lane_polygon(lane), SEAM_M) for lane in lanes])
+    shapely.prepare(road)
+    off = np.flatnonzero(~shapely.covers(road, ego))
+    if len(off):
+        outside_m2 = shapely.area(shapely.difference(ego[off[0]], road))
+        found = f"at {t_us[off[0]] / 1e6:.2f} s {outside_m2:.2f} m2 of the ego leave the lanes"
+        with drawn.at("road", "segments"):
+            raise InputError(doing, "the road", found, "use wider lanes, gentler bends, a larger corner_radius_m, or a smaller shift_m")
+    gap, when, who = min(((*_least_gap(ego, t_us, actor), actor.actor_id) for actor in actors), default=(np.inf, 0, ""))
+    if gap < MIN_GAP_M:
+        found = f"at {when / 1e6:.2f} s the gap to the ego is {gap:.2f} m (least allowed {MIN_GAP_M} m)"
+        with drawn.at(*_key_of(drawn.spec, who)):
+            raise InputError(doing, f"actor {who}", found, "start the actor farther away, change its timing, or slow the ego down")
 
 
-def _drive(spec: ScenarioSpec, ego_path: EgoPath, vehicle: Vehicle, traffic: Traffic, end_us: int, fail: Fail) -> Drive:
-    style = ExpertStyle(spec.ego.speed_mps, spec.ego.cruise_mps, spec.ego.max_lateral_accel_mps2, spec.ego.headway_s)
-    run = drive(ego_path.path, spec.ego.start_m, vehicle, style, traffic.scripts(), traffic.followers, end_us)
-    reached = int(run.ego_log.t_us[-1])
-    if reached < end_us:
-        raise fail(("road", "segments"), _too_short(ego_path.path.length_m, _driven(ego_path.path, run.ego_log), reached, end_us))
-    return run
+def _key_of(spec: ScenarioSpec, name: str) -> tuple[str | int, ...]:
+    """Return the key path of an actor; cars of a narrow gap belong to the road."""
+    for i, actor in enumerate(spec.actors):
+        if name == actor.id or name.startswith(f"{actor.id}-"):
+            return ("actors", i)
+    return ("road", "segments")
 
 
-def _driven(path: Path, log: Trajectory) -> float:
-    s, _ = path.project(log.xyz[-1:, :2])
-    return float(s[0])
+def _footprints(poses: F64, box: Box, ahead_m: float = 0.0) -> F64:
+    """Return rectangles (object array of polygons) of bodies at poses ``(T, 4, 4)``, their middle ``ahead_m`` in front of the pose."""
+    x, y = box.length_m / 2, box.width_m / 2
+    corners = np.array([[ahead_m + x, y, 0, 1], [ahead_m - x, y, 0, 1], [ahead_m - x, -y, 0, 1], [ahead_m + x, -y, 0, 1]])
+    rings: F64 = shapely.polygons((corners @ np.swapaxes(poses, -1, -2))[..., :2])
+    return rings
 
 
-def _too_short(length_m: float, s_m: float, reached_us: int = 0, end_us: int = 0) -> InputError:
-    when = f" after {reached_us / 1e6:.1f} s of {end_us / 1e6:.1f} s" if end_us else ""
-    return InputError(
-        "driving the expert", "road", f"the road is {length_m:.0f} m long and the ego stands at {s_m:.0f} m{when}",
-        "add or lengthen a segment, shorten timing.duration_us, or lower ego.cruise_mps",
-    )  # fmt: skip
+def _least_gap(ego: F64, t_us: I64, actor: Actor) -> tuple[float, int]:
+    """Return the least distance of an actor to the ego's footprints ``(T,)`` and when it is; infinite where they never meet in time."""
+    there = np.flatnonzero((t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1]))
+    if len(there) == 0:
+        return float("inf"), 0
+    distance = shapely.distance(ego[there], _footprints(interpolate(actor.track, t_us[there]), actor.box))
+    k = int(np.argmin(distance))
+    return float(distance[k]), int(t_us[there[k]])

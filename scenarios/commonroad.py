@@ -6,6 +6,9 @@ ego: its planning problem asks for one. Here a recorded vehicle takes that role,
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -13,16 +16,142 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import lane_polygon, offset_trajectory, rectangle_corners
-from alpasim_plugin.core.types import F64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
-from alpasim_plugin.io.limits import TIME_STEP_S
+from alpasim_plugin.core.geometry import lane_polygon, offset_trajectory, quat_from_yaw, rectangle_corners
+from alpasim_plugin.core.types import F64, I64, Actor, Box, HeightField, LaneMap, Trajectory, Vehicle
+from alpasim_plugin.io.limits import STEP, TIME_STEP_S
 from alpasim_plugin.world.ground import flat, from_points
-from scenarios.commonroad_map import read_lanelets
-from scenarios.commonroad_obstacles import Obstacle, read_obstacles
+from scenarios.commonroad_map import number, point, read_lanelets
+from scenarios.map_lines import lane_edges, merge_areas, predecessors
 from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog
-from scenarios.road_edges import merge_areas
-from scenarios.tracks import actors_of_track
+from scenarios.recorded import RecordedLog, actors_of_track, checked_trajectory
+
+LABELS = {
+    "car": "car",
+    "taxi": "car",
+    "parkedVehicle": "car",
+    "priorityVehicle": "car",
+    "truck": "truck",
+    "bus": "bus",
+    "bicycle": "cyclist",
+    "motorcycle": "motorcycle",
+    "pedestrian": "pedestrian",
+}  # all else (train, pillar, constructionZone, building, ...) is "other"
+HEIGHTS_M = {"car": 1.5, "truck": 3.2, "bus": 3.2, "pedestrian": 1.75, "cyclist": 1.75, "motorcycle": 1.5, "other": 1.5}
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """One recorded obstacle as a box: the format's positions are centres of shapes."""
+
+    obstacle_id: str
+    label: str
+    static: bool
+    box: Box
+    steps: I64  # (T,) time steps
+    centre: F64  # (T, 3) metres, local; z of the ground
+    yaw: F64  # (T,) radians
+    speed_mps: F64  # (T,); NaN where the file gives none
+
+    def trajectory(self, files: SourceFiles, path: Path, dt_s: float) -> Trajectory:
+        """Return the poses of the box centre, time in integer microseconds."""
+        t_us = np.round(self.steps * (dt_s * 1e6)).astype(np.int64)
+        xyz = self.centre + np.array([0.0, 0.0, self.box.height_m / 2])
+        return checked_trajectory(files, f"{path}, obstacle {self.obstacle_id}", t_us, xyz, quat_from_yaw(self.yaw))
+
+
+def read_obstacles(files: SourceFiles, path: Path, root: Element, origin: F64) -> tuple[tuple[Obstacle, ...], tuple[str, ...]]:
+    """Read static and dynamic obstacles in file order, with notes on those that are not recorded tracks.
+
+    Raises:
+        InputError: A number is missing or broken, an id occurs twice, or a state has no time.
+    """
+    obstacles: list[Obstacle] = []
+    skipped: Counter[str] = Counter()
+    for element in (e for e in root if e.tag in ("obstacle", "staticObstacle", "dynamicObstacle")):
+        where = f"{path}, obstacle {element.get('id')}"
+        static = element.tag == "staticObstacle" or element.findtext("role") == "static"
+        states = [s for s in (element.find("initialState"), *element.findall("trajectory/state")) if s is not None]
+        places = [place for s in states if (place := s.find("position/point")) is not None]
+        if not states or len(places) < len(states) or any(s.find("orientation/exact") is None for s in states):
+            skipped["have states without an exact position and orientation"] += 1
+            continue
+        if element.find("occupancySet") is not None or (static and len(states) > 1):
+            skipped["are predicted as occupied areas, not as states"] += 1
+            continue
+        shape = element.find("shape")
+        if shape is None or len(shape) == 0:
+            raise files.fail(where, "no shape", "give a rectangle, circle or polygon")
+        size, offset, turn = _bounding_box(files, where, shape)
+        label = LABELS.get(str(element.findtext("type")), "other")
+        yaw = np.array([number(files, where, s.find("orientation/exact"), "orientation") for s in states])
+        centre = np.array([point(files, where, place) for place in places]) - origin
+        c, s = np.cos(yaw), np.sin(yaw)
+        centre[:, :2] += np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]], axis=1)
+        times = [number(files, where, s.find("time/exact"), "time") for s in states]
+        for time in times:
+            STEP.check(time, files.doing, where, "time step")
+        steps = np.array([round(time) for time in times], dtype=np.int64)
+        speeds = [s.find("velocity/exact") for s in states]
+        speed = np.array([np.nan if v is None else number(files, where, v, "velocity") for v in speeds])
+        box = Box(size[0], size[1], HEIGHTS_M[label])
+        obstacles.append(Obstacle(str(element.get("id")), label, static, box, steps, centre, yaw + turn, speed))
+    ids = Counter(o.obstacle_id for o in obstacles)
+    if ids and max(ids.values()) > 1:
+        raise files.fail(path, f"obstacle id {ids.most_common(1)[0][0]} twice", "give each obstacle its own id")
+    notes = [f"{n} obstacles {why} and were left out" for why, n in sorted(skipped.items())]
+    notes += [
+        f"{len(found)} {tag} elements were left out" for tag in ("environmentObstacle", "phantomObstacle") if (found := root.findall(tag))
+    ]
+    return tuple(obstacles), tuple(notes)
+
+
+def _bounding_box(files: SourceFiles, where: str, shape: Element) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Return (length, width), the box centre in the obstacle's frame, and the box's turn against it.
+
+    A single rectangle is kept as it is; circles, polygons and groups of shapes become the box around them.
+    """
+    parts = list(shape)
+    if len(parts) == 1 and parts[0].tag == "rectangle":
+        corners, turn, centre = _rectangle(files, where, parts[0])
+        return corners, centre, turn
+    clouds: list[F64] = []
+    for part in parts:
+        if part.tag == "circle":
+            radius = number(files, where, part.find("radius"), "radius")
+            middle = np.array(_centre(files, where, part))
+            clouds.append(np.array([middle - radius, middle + radius]))
+        elif part.tag == "polygon":
+            clouds.append(np.array([point(files, where, p)[:2] for p in part.findall("point")]).reshape(-1, 2))
+        elif part.tag == "rectangle":
+            (length, width), turn, centre = _rectangle(files, where, part)
+            half = np.array([[length, width], [length, -width]]) / 2
+            c, s = np.cos(turn), np.sin(turn)
+            turned = half @ np.array([[c, s], [-s, c]])
+            clouds.append(np.concatenate([turned, -turned]) + np.array(centre))
+        else:
+            raise files.fail(where, f"shape {part.tag!r}", "give a rectangle, circle or polygon")
+    points = np.concatenate(clouds)
+    if len(points) < 2:
+        raise files.fail(where, "a shape without extent", "give a rectangle, circle or polygon")
+    low, high = points.min(axis=0), points.max(axis=0)
+    size, middle = high - low, (low + high) / 2
+    if not (size > 0).all():
+        raise files.fail(where, f"a shape of {size[0]} x {size[1]} m", "give positive sizes")
+    return (float(size[0]), float(size[1])), (float(middle[0]), float(middle[1])), 0.0
+
+
+def _rectangle(files: SourceFiles, where: str, part: Element) -> tuple[tuple[float, float], float, tuple[float, float]]:
+    length, width = (number(files, where, part.find(k), k) for k in ("length", "width"))
+    if length <= 0 or width <= 0:
+        raise files.fail(where, f"a shape of {length} x {width} m", "give positive sizes")
+    turn = part.find("orientation")
+    return (length, width), 0.0 if turn is None else number(files, where, turn, "orientation"), _centre(files, where, part)
+
+
+def _centre(files: SourceFiles, where: str, part: Element) -> tuple[float, float]:
+    centre = part.find("center")
+    return (0.0, 0.0) if centre is None else point(files, where, centre)[:2]
+
 
 VERSIONS = ("2018b", "2020a")
 DEFAULT = Vehicle()
@@ -52,18 +181,20 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     if not obstacles:
         raise files.fail(file, "no recorded traffic, so no drive to take the ego from", "use a scenario with dynamic obstacles")
     origin = np.array([*np.round(obstacles[0].centre[0, :2]), 0.0])  # whole metres: the subtraction loses nothing
-    obstacles = tuple(_moved(o, -origin) for o in obstacles)
+    obstacles = tuple(replace(o, centre=o.centre - origin) for o in obstacles)
     for obstacle in obstacles:
         files.near(f"{file}, obstacle {obstacle.obstacle_id}", obstacle.centre)
     lane_map, map_notes = read_lanelets(files, file, root, origin)
     chosen, why = _choose_ego(files, file, obstacles, lane_map, ego)
-    vehicle = _vehicle(chosen.box)
+    scale = chosen.box.length_m / DEFAULT.box.length_m  # the file has sizes and no axles: the default chassis in proportion
+    vehicle = Vehicle(chosen.box, DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale)
     centre_log = chosen.trajectory(files, file, dt_s)
     if len(centre_log) < 2:
         raise files.fail(f"{file}, obstacle {chosen.obstacle_id}", "1 state", "choose an ego with a trajectory")
     T_centre_rig = np.eye(4)
     T_centre_rig[:3, 3] = (-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
-    first, last = _time_range(obstacles, dt_s)
+    steps = _step_range([o for o in obstacles if not o.static] or obstacles)
+    first, last = (round(step * dt_s * 1e6) for step in steps)
     actors = [actor for o in obstacles if o is not chosen for actor in _actors(files, file, o, dt_s, first, last)]
     notes = (
         why,
@@ -98,20 +229,9 @@ def _time_step(files: SourceFiles, path: Path, root: Element) -> float:
     return dt_s
 
 
-def _moved(obstacle: Obstacle, by: F64) -> Obstacle:
-    return Obstacle(**{**vars(obstacle), "centre": obstacle.centre + by})
-
-
-def _vehicle(box: Box) -> Vehicle:
-    """Scale the default chassis to the recorded length: the file has sizes and no axles."""
-    scale = box.length_m / DEFAULT.box.length_m
-    return Vehicle(box=box, rear_axle_to_centre_m=DEFAULT.rear_axle_to_centre_m * scale, wheelbase_m=DEFAULT.wheelbase_m * scale)
-
-
-def _time_range(obstacles: tuple[Obstacle, ...], dt_s: float) -> tuple[int, int]:
-    moving = [o for o in obstacles if not o.static] or list(obstacles)
-    first, last = min(int(o.steps[0]) for o in moving), max(int(o.steps[-1]) for o in moving)
-    return round(first * dt_s * 1e6), round(last * dt_s * 1e6)
+def _step_range(obstacles: Sequence[Obstacle]) -> tuple[int, int]:
+    """Return the first and the last time step at which any of the obstacles is seen."""
+    return min((int(o.steps[0]) for o in obstacles), default=0), max((int(o.steps[-1]) for o in obstacles), default=0)
 
 
 def _actors(files: SourceFiles, path: Path, obstacle: Obstacle, dt_s: float, first_us: int, last_us: int) -> list[Actor]:
@@ -132,28 +252,23 @@ def _choose_ego(
         if ego not in moving:
             raise files.fail(path, f"no moving obstacle {ego!r}", f"choose the ego among {', '.join(sorted(moving)) or 'none'}")
         return moving[ego], f"ego is the recorded vehicle {ego}, as asked"
-    first = min((int(o.steps[0]) for o in moving.values()), default=0)
-    last = max((int(o.steps[-1]) for o in moving.values()), default=0)
+    first, last = _step_range(list(moving.values()))
     always = [o for o in moving.values() if o.label == "car" and (o.steps[0], o.steps[-1], len(o.steps)) == (first, last, last - first + 1)]
     always.sort(key=lambda o: (-_driven_m(o), len(o.obstacle_id), o.obstacle_id))
     surface = merge_areas([lane_polygon(lane) for lane in lane_map.lanes.values()])
     corridors = _corridors(lane_map)
-    on_road: list[Obstacle] = []
+    best, manner = None, "stay on the lanelets and touch nobody (none keeps inside one lane)"
     for candidate in always:
         footprints = _rectangles(candidate, least=DEFAULT.box)
         if not shapely.covers(surface, footprints).all() or _touches(candidate, footprints, obstacles):
             continue
-        on_road.append(candidate)
+        best = best or candidate
         if shapely.covers(corridors[:, None], footprints[None, :]).any(axis=0).all():
-            return candidate, (
-                f"ego is the recorded car {candidate.obstacle_id}: the longest drive ({_driven_m(candidate):.1f} m) among cars that are "
-                "present all the time, keep inside one lane and touch nobody; choose another with ego=ID"
-            )
-    if on_road:
-        return on_road[0], (
-            f"ego is the recorded car {on_road[0].obstacle_id}: the longest drive ({_driven_m(on_road[0]):.1f} m) among cars that are "
-            "present all the time, stay on the lanelets and touch nobody (none keeps inside one lane); choose another with ego=ID"
-        )
+            best, manner = candidate, "keep inside one lane and touch nobody"
+            break
+    if best is not None:
+        drive = f"ego is the recorded car {best.obstacle_id}: the longest drive ({_driven_m(best):.1f} m)"
+        return best, f"{drive} among cars that are present all the time, {manner}; choose another with ego=ID"
     found = f"{len(moving)} moving obstacles, none a car that is present all the time, stays on the lanelets and touches nobody"
     raise files.fail(path, found, "name the recorded vehicle that shall be the ego")
 
@@ -164,16 +279,11 @@ def _driven_m(obstacle: Obstacle) -> float:
 
 def _corridors(lane_map: LaneMap) -> Any:
     """Return each lane's area joined with its predecessors and successors ``(L,)``: where a car is that keeps its lane."""
-    lanes = lane_map.lanes
-    before: dict[str, list[str]] = {key: [] for key in lanes}
+    lanes, before = lane_map.lanes, predecessors(lane_map.lanes)
+    joined = []
     for key, lane in lanes.items():
-        for follower in lane.successors:
-            if follower in before:
-                before[follower].append(key)
-    joined = [
-        merge_areas([lane_polygon(lanes[k]) for k in (key, *before[key], *(s for s in lane.successors if s in lanes))])
-        for key, lane in lanes.items()
-    ]
+        after = [successor for successor in lane.successors if successor in lanes]
+        joined.append(merge_areas([lane_polygon(lanes[one]) for one in (key, *before[key], *after)]))
     return np.array(joined, dtype=object)
 
 
@@ -203,5 +313,5 @@ def _touches(ego: Obstacle, footprints: Any, obstacles: tuple[Obstacle, ...]) ->
 
 def _ground(lane_map: LaneMap, drive: F64) -> HeightField:
     """Return a level ground for planar files, a fitted one where points have heights."""
-    points = np.concatenate([e for lane in lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None])
+    points = np.concatenate(lane_edges(lane_map.lanes))
     return flat(0.0) if np.ptp(points[:, 2]) == 0 and points[0, 2] == 0 else from_points(points, drive=drive)

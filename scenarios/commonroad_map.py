@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -11,8 +12,8 @@ import shapely
 
 from alpasim_plugin.core.geometry import centre_line, lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
+from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
 from scenarios.reading import SourceFiles
-from scenarios.road_edges import border_lines, merge_areas
 
 # Line markings of version 2020a; the format has no colour, so lines are white.
 PAINTS: dict[str, Paint] = {
@@ -60,7 +61,7 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
             if "crosswalk" in types:
                 crosswalks.append(np.concatenate([left, right[::-1], left[:1]]))
             continue
-        if _is_left_of(right, left):  # bounds exchanged
+        if is_left_of(right, left):  # bounds exchanged
             left, right, swapped = right, left, swapped + 1
         stop_lines += _stop_line(files, where, element, left, right, origin)
         beside = {side: n for side in ("left", "right") if (n := element.find(f"adjacent{side.capitalize()}")) is not None}
@@ -88,7 +89,7 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
     if root.find("lanelet/leftBound/lineMarking") is None and root.find("lanelet/rightBound/lineMarking") is None:
         notes.append("the file has no line markings: the paint of all lane edges is unknown")
     surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
-    edges = border_lines(surface, np.concatenate([e for lane in lanes.values() for e in (lane.left, lane.right) if e is not None]))
+    edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
     notes.append(
         "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
     )
@@ -97,14 +98,9 @@ def read_lanelets(files: SourceFiles, path: Path, root: Element, origin: F64) ->
 
 def point(files: SourceFiles, where: str, element: Element) -> tuple[float, float, float]:
     """Read ``x``, ``y`` and, where given, ``z`` of a point element in metres."""
-    values = []
-    for axis in ("x", "y", "z"):
-        child = element.find(axis)
-        if child is None and axis == "z":
-            values.append(0.0)
-            continue
-        values.append(number(files, where, child, axis))
-    return values[0], values[1], values[2]
+    x, y = (number(files, where, element.find(axis), axis) for axis in ("x", "y"))
+    height = element.find("z")
+    return x, y, 0.0 if height is None else number(files, where, height, "z")
 
 
 def number(files: SourceFiles, where: str, element: Element | None, what: str) -> float:
@@ -130,12 +126,6 @@ def _bound(files: SourceFiles, where: str, element: Element, side: str, origin: 
     if len(points) < 2:
         raise files.fail(where, f"{side} with {len(points)} points", "give each lanelet two bounds of at least 2 points")
     return files.near(f"{where}, {side}", np.array(points, dtype=np.float64) - origin)
-
-
-def _is_left_of(one: F64, other: F64) -> bool:
-    """Return whether ``one`` runs on the left of ``other``: the ring one + reversed other is clockwise."""
-    x, y = np.concatenate([one[:, :2], other[::-1, :2]]).T
-    return bool(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
 
 
 def _marking(element: Element, side: str) -> Paint:
@@ -178,13 +168,12 @@ def _mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
     ids = list(lanes)
     polygons = [lane_polygon(lanes[i]) for i in ids]
     tree = shapely.STRtree(polygons)
+    before = predecessors(lanes)
     marked: dict[str, Lane] = {}
-    for n, key in enumerate(ids):
-        lane = lanes[key]
-        friends = {key, *lane.successors, lane.left_neighbour, lane.right_neighbour}
-        friends |= {other for other in ids if key in lanes[other].successors}
+    for n, (key, lane) in enumerate(lanes.items()):
+        friends = {key, *lane.successors, *before[key], lane.left_neighbour, lane.right_neighbour}
         covered = [polygons[m] for m in tree.query(polygons[n], predicate="intersects") if ids[m] not in friends]
         shared = shapely.area(shapely.intersection(polygons[n], shapely.union_all(covered))) if covered else 0.0
-        crossing = lane.is_intersection or shared > CROSSING_SHARE * polygons[n].area
-        marked[key] = lane if crossing == lane.is_intersection else Lane(**{**vars(lane), "is_intersection": True})
+        crossing = lane.is_intersection or bool(shared > CROSSING_SHARE * polygons[n].area)
+        marked[key] = replace(lane, is_intersection=crossing)
     return marked

@@ -44,7 +44,7 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
     they map angle to radius.
 
     Raises:
-        InputError: The tar is missing or damaged, or an array is no lens.
+        InputError: The tar is missing or damaged, or an array is not a lens.
     """
     path = files.only(folder / "ftheta_intrinsic", ("*.tar",), "the f-theta intrinsics")
     lenses: dict[str, RecordedLens] = {}
@@ -54,7 +54,7 @@ def read_lenses(files: SourceFiles, folder: Path) -> dict[str, RecordedLens]:
         where = f"{path}, {name}"
         values = np.asarray(files.parse_npy(data, where), dtype=np.float64)
         if values.shape != (11,) or not np.isfinite(values).all() or values[2] < 1 or values[3] < 1 or values[10] not in (0.0, 1.0):
-            found = f"an array of shape {values.shape} that is no f-theta lens"
+            found = f"an array of shape {values.shape} that is not an f-theta lens"
             raise files.fail(where, found, "give cx, cy, width, height, 6 coefficients, flag")
         lenses[name.rsplit(".", 2)[-2]] = lens_of(values)
     return lenses

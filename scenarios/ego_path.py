@@ -10,8 +10,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.world.curves import smoothstep
-from alpasim_plugin.world.path import Path, smooth_path
+from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 from alpasim_plugin.world.roads import Road
 
 
@@ -42,6 +41,11 @@ class EgoPath:
     lane_ids: tuple[str, ...]
     stretch_s: tuple[float, ...]  # arc length at which each stretch begins, one more at the end
 
+    def stretch_at(self, s_m: float) -> int:
+        """Return the number of the road's stretch at an arc length; the first or the last one beyond the ends."""
+        i = np.searchsorted(self.stretch_s, s_m, side="right") - 1
+        return int(np.clip(i, 0, len(self.stretch_s) - 2))
+
 
 def make_ego_path(road: Road, lane: int, changes: Sequence[LaneChange] = (), shifts: Sequence[LateralShift] = ()) -> EgoPath:
     """Return the rear axle's line from forward lane ``lane`` at the road's beginning.
@@ -56,12 +60,8 @@ def make_ego_path(road: Road, lane: int, changes: Sequence[LaneChange] = (), shi
     for change in changes:
         parts, chain = _change(road, parts, chain, change)
     if len(chain) < len(road.stretches):
-        raise InputError(
-            "placing the ego",
-            f"lane {lane}",
-            f"that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})",
-            "start in a lane that goes on, or change lanes before",
-        )
+        found = f"that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})"
+        raise InputError("placing the ego", f"lane {lane}", found, "start in a lane that goes on, or change lanes before")
     line = np.concatenate([parts[0]] + [p[1:] for p in parts[1:]])
     s = arc_lengths(line)
     begins = np.cumsum([0] + [len(p) - 1 for p in parts])
@@ -80,32 +80,20 @@ def _change(road: Road, parts: list[F64], chain: list[tuple[str, int]], change: 
     stretch = road.stretches[first]
     if change.to_lane >= len(stretch.forward) or stretch.forward[change.to_lane] is None:
         raise InputError("placing the ego", where, f"element {first} has no such lane", "choose a lane that exists there")
-    target = _lanes_from(road, first, change.to_lane)
+    target = road.forward_chain(change.to_lane, first)
     out, new_chain = parts[:first], chain[:first]
     for n, (lane_id, k) in enumerate(target):
         i = first + n
         goal = road.lane_map.lanes[lane_id].centre
         if begin[min(i, len(begin) - 1)] < change.at_m + change.length_m:
             if i >= len(parts) or len(parts[i]) != len(goal):
-                raise InputError(
-                    "placing the ego", where, f"the lanes part at element {i}", "change lanes earlier or within a shorter length"
-                )
+                do_this = "change lanes earlier or within a shorter length"
+                raise InputError("placing the ego", where, f"the lanes part at element {i}", do_this)
             share = smoothstep((begin[i] + arc_lengths(parts[i]) - change.at_m) / change.length_m)[:, None]
             goal = (1 - share) * parts[i] + share * goal
         out.append(goal)
         new_chain.append((lane_id, k))
     return out, new_chain
-
-
-def _lanes_from(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:
-    out: list[tuple[str, int]] = []
-    at: int | None = lane
-    for part in road.stretches[stretch:]:
-        if at is None or at >= len(part.forward) or part.forward[at] is None:
-            break
-        out.append((str(part.forward[at]), at))
-        at = part.forward_next[at]
-    return out
 
 
 def _shift(line: F64, s: F64, shift: LateralShift) -> F64:
@@ -131,18 +119,17 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
     """
     if isinstance(lane, str):
         return tuple(_follow(road, lane))
-    i = int(np.clip(np.searchsorted(ego_path.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
+    i = ego_path.stretch_at(at_s_m)
     stretch = road.stretches[i]
     ids: list[str] = []
     if lane >= 0 and lane < len(stretch.forward) and stretch.forward[lane] is not None:
-        ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [lane_id for lane_id, _ in _lanes_from(road, i, lane)]
+        ids = [lane_id for lane_id, _ in _back(road, i, lane)] + [lane_id for lane_id, _ in road.forward_chain(lane, i)]
     elif lane < 0 and -lane - 1 < len(stretch.backward) and stretch.backward[-lane - 1] is not None:
         ids = road.backward_chain(-lane - 1)
     if not ids:
         n = sum(f is not None for f in stretch.forward), sum(b is not None for b in stretch.backward)
-        raise InputError(
-            "placing an actor", f"lane {lane}", f"{n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m", "choose one that exists"
-        )
+        found = f"{n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m"
+        raise InputError("placing an actor", f"lane {lane}", found, "choose one that exists")
     return tuple(ids)
 
 

@@ -1,20 +1,20 @@
-"""One door for every source: a path or a shipped name becomes a `Scenario`."""
+"""From a path or a shipped name to a `Scenario`, read from top to bottom: document, specification, recording, scenario."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import (  # fmt: skip
+from alpasim_plugin.core.types import (
+    F64,
+    Actor,
     BackgroundFile,
     Behaviour,
     Box,
@@ -26,24 +26,24 @@ from alpasim_plugin.core.types import (  # fmt: skip
     Scenario,
     Vehicle,
 )
-from alpasim_plugin.io.config import Document, apply_overrides, load_yaml, validate
-from alpasim_plugin.io.reading import check_regular, exists, parsing
+from alpasim_plugin.io.reading import check_regular
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.plugins.parts.spec import digest
-from alpasim_plugin.world.ground import flat
-from scenarios.alpasim_map import alpasim_view
-from scenarios.budget import check_record, check_scenario, check_specification
-from scenarios.build import build, last_us
-from scenarios.cameras import camera_spec
-from scenarios.library import shipped_names
-from scenarios.schema import ScenarioSpec, VehicleSpec
-from scenarios.schema_road import SHIPPED
-from scenarios.sources import detect, read_log, source_digest
-from scenarios.variation import differences, draw, jitter
+from alpasim_plugin.world.ego import speeds
+from alpasim_plugin.world.route import route_from_log
+from scenarios.budget import check_scenario
+from scenarios.build import built_drive
+from scenarios.library import find
+from scenarios.map_lines import alpasim_view
+from scenarios.recorded import RecordedLog
+from scenarios.schema import CameraModel, VehicleSpec
+from scenarios.sources import open_document, recorded_drive, source_digest
+from scenarios.variation import Drawn, draw
 
 DOING = "reading a scenario"
-AS_WRITTEN = 0  # the scene seed that jitters nothing
 ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
+# Columns: camera x (right), y (down), z (forward) seen in the rig's axes (x forward, y left, z up).
+_RIG_FROM_FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: Sequence[str] = (), source: str | None = None) -> Scenario:
@@ -63,210 +63,16 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
     Raises:
         InputError: Anything wrong with the input, with file, line and column where there is one.
     """
-    path = find(path_or_name)
-    document = _document(path, source)
-    if isinstance(document.data, dict) and "scenarios" in document.data:
-        raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "use load_suite, or run it with simrun")
-    document = apply_overrides(document, overrides, DOING)
-    own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
-    if seed is not None:
-        document = apply_overrides(document, [f"seed={int(seed)}"], DOING)
-    written = spec = validate(ScenarioSpec, document, DOING)
-    scene_id = spec.scene_id or _default_id(path)
-    fixed = tuple(text.partition("=")[0].strip() for text in overrides)
-    document = draw(document, spec, scene_id, spec.seed, fixed)
-    spec = validate(ScenarioSpec, document, DOING)
-    _check_actors(document, spec)
-    spec = jitter(spec, scene_id, spec.seed, fixed) if spec.seed != AS_WRITTEN else spec
-    scenario = _from_log(document, spec, scene_id) if spec.log is not None else _from_road(document, spec, scene_id)
-    scenario = replace(scenario, varied=differences(written, spec))
-    if spec.seed != own_seed:
-        scenario = replace(scenario, scene_id=f"{scenario.scene_id}-seed{spec.seed}")
-    check_scenario(scenario, document.path)
+    document = open_document(find(path_or_name), source)
+    drawn = draw(document, seed, overrides)
+    default = drawn.spec.vehicle or VehicleSpec()
+    drive = built_drive(drawn, _vehicle(default)) if drawn.spec.log is None else recorded_drive(drawn)
+    scenario = _scenario(drawn, drive)
+    check_scenario(scenario, drawn.document.path)
     if scenario.source != "usdz":  # the map of an AlpaSim scene is in its form already
         scenario = replace(scenario, alpasim_map=alpasim_view(scenario.lane_map))
-    return _timed(document, spec, scenario)
-
-
-def find(path_or_name: str | Path) -> Path:
-    """Return the path of an existing file or folder, or of a shipped scenario's file.
-
-    Raises:
-        InputError: Neither exists; the nearest shipped names are given.
-    """
-    path = Path(path_or_name)
-    if exists(path):
-        return path
-    shipped = shipped_names()
-    name = str(path_or_name).removesuffix(".yaml")
-    if name in shipped:
-        return shipped[name]
-    near = difflib.get_close_matches(name, list(shipped), n=3, cutoff=0.5) or difflib.get_close_matches(
-        name.rsplit("/", 1)[-1], [n.rsplit("/", 1)[-1] for n in shipped], n=3, cutoff=0.5
-    )
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise InputError(
-        DOING, str(path_or_name), "no such file or folder, and no shipped scenario has that name",
-        f"{hint}give a path, or a name that 'simrun list scenarios' shows",
-    )  # fmt: skip
-
-
-def _document(path: Path, source: str | None) -> Document:
-    kind = source or detect(path)
-    if kind == "yaml":
-        return load_yaml(path, DOING)
-    log = {kind: str(path.resolve())} if kind in SHIPPED else {"source": kind, "path": str(path.resolve())}
-    return Document({"version": 1, "log": log}, {}, str(path))
-
-
-def _default_id(path: Path) -> str:
-    resolved = path.resolve()
-    if path.suffix in (".yaml", ".yml"):
-        return f"{resolved.parent.name}-{resolved.stem}"
-    return resolved.stem if resolved.is_file() else resolved.name
-
-
-def _check_actors(document: Document, spec: ScenarioSpec) -> None:
-    seen: dict[str, int] = {}
-    for i, actor in enumerate(spec.actors):
-        if actor.id in seen:
-            first = document.mark(("actors", seen[actor.id], "id"))
-            raise document.error(DOING, ("actors", i, "id"), f"duplicate actor id {actor.id!r}, first at {first}", "give it another id")
-        seen[actor.id] = i
-    names = [c.name for c in spec.cameras or ()]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            raise document.error(DOING, ("cameras", i, "name"), f"duplicate camera name {name!r}", "give it another name")
-    if spec.log is not None and spec.actors:
-        raise document.error(DOING, ("actors",), "actors beside a recorded log", "remove actors; log.actors chooses the recorded traffic")
-
-
-def _from_road(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario:
-    vehicle = _vehicle(spec.vehicle or VehicleSpec())
-
-    def fail(loc: tuple[str | int, ...], e: InputError) -> InputError:
-        return InputError(e.doing, f"{document.mark(loc)} ({e.with_what})", e.found, e.do_this)
-
-    check_specification(spec, lambda loc, found, do_this: document.error(DOING, loc, found, do_this))
-    built = build(spec, vehicle, fail)
-    start, warmup = spec.timing.start_us + spec.timing.start_time_offset_us, _warmup_us(spec)
-    cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else (camera_spec(),)
-    return Scenario(
-        scene_id, "yaml", spec.seed, built.lane_map, flat(0.0), built.ego_log, vehicle, built.route, built.actors, cameras,
-        _rates(spec), start, last_us(spec), warmup, Latency(**spec.latency.model_dump()),
-        _environment(spec), _degradation(spec), _background(document, spec), content_hash=_hash(document, spec, scene_id),
-        stop_at_path_end=spec.timing.stop_at_path_end,
-    )  # fmt: skip
-
-
-def _from_log(document: Document, spec: ScenarioSpec, scene_id: str) -> Scenario:
-    from alpasim_plugin.world.route import route_from_log
-
-    assert spec.log is not None
-    kind, text, key = spec.log.recorded
-    path = document.folder_of(("log", key)) / text if document.marks else Path(text)
-    if not path.exists():
-        raise document.error(DOING, ("log", key), f"{path} does not exist", "correct the path; it is relative to the scenario file")
-    with parsing(DOING, path, "repair this log, or use another one"):
-        record = read_log(kind, path, spec.log.ego)
-        check_record(record, str(path))
-    behaviour = Behaviour("idm") if spec.log.actors == "idm" else Behaviour("replay")
-    actors = () if spec.log.actors == "none" else tuple(
-        a if a.is_static or behaviour.kind == "replay" else replace(a, behaviour=_idm(a)) for a in record.actors
-    )  # fmt: skip
-    cameras: tuple[CameraSpec, ...]
-    cameras = tuple(camera_spec(c) for c in spec.cameras) if spec.cameras else record.cameras or (camera_spec(),)
-    first, last = int(record.ego_log.t_us[0]), int(record.ego_log.t_us[-1])
-    start = first + spec.timing.start_us
-    if spec.timing.timeline == "alpasim" and record.first_frame_us is not None:
-        start = record.first_frame_us
-    start += spec.timing.start_time_offset_us
-    end = last if spec.timing.duration_us is None else start + spec.timing.duration_us
-    if end > last:
-        raise document.error(
-            DOING, ("timing", "duration_us"), f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long",
-            "shorten timing.duration_us or leave it out",
-        )  # fmt: skip
-    is_file = Path(document.path).suffix in (".yaml", ".yml")
-    chosen_id = spec.scene_id or (scene_id if is_file else record.scene_id)  # a bare log keeps its id whatever is overridden
-    return Scenario(
-        chosen_id, record.source, spec.seed, record.lane_map, record.ground, record.ego_log,
-        _vehicle(spec.vehicle) if spec.vehicle else record.vehicle, route_from_log(record.lane_map, record.ego_log), actors, cameras,
-        _rates(spec), start, end, _warmup_us(spec), Latency(**spec.latency.model_dump()), _environment(spec),
-        _degradation(spec), _background(document, spec), record.world_origin,
-        _hash(document, spec, chosen_id, record.content_hash), record.notes, record.alpasim_map, kind,
-        stop_at_path_end=spec.timing.stop_at_path_end,
-    )  # fmt: skip
-
-
-def _idm(actor: Any) -> Behaviour:
-    from alpasim_plugin.world.state import speeds
-
-    if actor.label in ("pedestrian", "other"):
-        return Behaviour("replay")
-    return Behaviour("idm", {"desired_speed_mps": max(float(np.max(speeds(actor.track))), 2.0)})
-
-
-def _timed(document: Document, spec: ScenarioSpec, scenario: Scenario) -> Scenario:
-    """Check the periods and the length with the loop's own clock."""
-    try:
-        clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
-    except InputError as e:
-        key = next((k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what), None)
-        loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
-        raise document.error(DOING, loc, f"{e.with_what}: {e.found}", e.do_this) from e
-    if spec.timing.timeline == "alpasim" and scenario.warmup_us % scenario.rates.control_us:
-        found = f"a control period of {scenario.rates.control_us} us, of which {scenario.warmup_us} us is no multiple"
-        raise document.error(DOING, ("timing", "timeline"), found, "choose a rates.control_us that divides AlpaSim's 1.7 s")
-    if spec.timing.start_time_offset_us and spec.timing.timeline != "alpasim":
-        found = f"an offset of {spec.timing.start_time_offset_us} us in the scenario's own time line"
-        raise document.error(DOING, ("timing", "start_time_offset_us"), found, "set timing.start_us, or timing.timeline: alpasim")
-    length = clock.n_steps * scenario.rates.control_us
-    if scenario.warmup_us >= length:
-        raise document.error(
-            DOING, ("timing", "warmup_us"), f"warmup_us = {scenario.warmup_us} of a scene of {length} us: nothing is left to drive",
-            "shorten timing.warmup_us or lengthen timing.duration_us",
-        )  # fmt: skip
+    _check_timing(drawn, scenario)
     return scenario
-
-
-def _vehicle(v: VehicleSpec) -> Vehicle:
-    return Vehicle(
-        Box(v.length_m, v.width_m, v.height_m), v.rear_axle_to_centre_m, v.wheelbase_m, v.max_steer_rad, v.max_steer_rate_radps,
-        v.max_accel_mps2, v.max_brake_mps2,
-    )  # fmt: skip
-
-
-def _warmup_us(spec: ScenarioSpec) -> int:
-    return ALPASIM_WARMUP_US if spec.timing.timeline == "alpasim" else spec.timing.warmup_us
-
-
-def _rates(spec: ScenarioSpec) -> Rates:
-    return Rates(spec.rates.control_us, spec.rates.camera_us, spec.rates.policy_us)
-
-
-def _environment(spec: ScenarioSpec) -> Environment:
-    e = spec.environment
-    return Environment(e.buildings, e.building_height_m, e.trees_per_100m, e.poles_spacing_m, e.sky, e.texture)
-
-
-def _degradation(spec: ScenarioSpec) -> Degradation:
-    d = spec.degradation
-    return Degradation(d.kind, d.share, d.shift_m, d.severity, d.onset_m, d.full_m, d.views_per_s, d.depth_error, d.pose_error_m)
-
-
-def _background(document: Document, spec: ScenarioSpec) -> BackgroundFile | None:
-    if spec.background is None:
-        return None
-    path = document.folder_of(("background", "file")) / spec.background.file
-    if not path.is_file():
-        raise document.error(DOING, ("background", "file"), f"{path} does not exist", "correct the path")
-    matrix = np.eye(4) if spec.background.transform is None else np.array(spec.background.transform)
-    if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise document.error(
-            DOING, ("background", "transform"), "no inverse, or a last row other than 0 0 0 1", "give rotation, scale and shift"
-        )
-    return BackgroundFile(str(path), matrix, spec.background.keep_road)
 
 
 def code_digest_of(scenario: Scenario) -> str | None:
@@ -278,24 +84,153 @@ def code_digest_of(scenario: Scenario) -> str | None:
     return None if source is None else digest([own, source])
 
 
-def _hash(document: Document, spec: ScenarioSpec, scene_id: str, source_hash: str = "") -> str:
+def _scenario(drawn: Drawn, drive: RecordedLog) -> Scenario:
+    """Put the settings of the specification beside a map, a drive and its traffic."""
+    spec, timing, kind = drawn.spec, drawn.spec.timing, None if drawn.spec.log is None else drawn.spec.log.recorded[0]
+    is_file = Path(drawn.document.path).suffix in (".yaml", ".yml")
+    scene_id = spec.scene_id or (drawn.scene_id if is_file else drive.scene_id)  # a bare log keeps its id whatever is overridden
+    cameras = tuple(camera_spec(camera) for camera in spec.cameras or ()) or drive.cameras or (camera_spec(),)
+    start, end = _window(drawn, drive)
+    return Scenario(
+        scene_id=f"{scene_id}-seed{spec.seed}" if drawn.reseeded else scene_id,
+        source=drive.source,
+        seed=spec.seed,
+        lane_map=drive.lane_map,
+        ground=drive.ground,
+        ego_log=drive.ego_log,
+        vehicle=_vehicle(spec.vehicle) if spec.vehicle else drive.vehicle,
+        route=drive.route or route_from_log(drive.lane_map, drive.ego_log),
+        actors=_actors(drawn, drive),
+        cameras=cameras,
+        rates=Rates(**spec.rates.model_dump()),
+        start_us=start,
+        end_us=end,
+        warmup_us=ALPASIM_WARMUP_US if timing.timeline == "alpasim" else timing.warmup_us,
+        latency=Latency(**spec.latency.model_dump()),
+        environment=Environment(**spec.environment.model_dump()),
+        degradation=Degradation(**spec.degradation.model_dump()),
+        background=_background(drawn),
+        world_origin=drive.world_origin,
+        content_hash=_hash(drawn, scene_id, drive.content_hash),
+        notes=drive.notes,
+        alpasim_map=drive.alpasim_map,
+        source_part=kind,
+        varied=drawn.varied,
+        stop_at_path_end=timing.stop_at_path_end,
+    )
+
+
+def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:
+    """Return the times of the first frame and of the end."""
+    timing, first, last = drawn.spec.timing, int(drive.ego_log.t_us[0]), int(drive.ego_log.t_us[-1])
+    start = first + timing.start_us
+    if drawn.spec.log is None:
+        return start + timing.start_time_offset_us, drawn.spec.built_until_us
+    if timing.timeline == "alpasim" and drive.first_frame_us is not None:
+        start = drive.first_frame_us
+    start += timing.start_time_offset_us
+    end = last if timing.duration_us is None else start + timing.duration_us
+    if end > last:
+        found = f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long"
+        raise drawn.document.error(DOING, ("timing", "duration_us"), found, "shorten timing.duration_us or leave it out")
+    return start, end
+
+
+def _actors(drawn: Drawn, drive: RecordedLog) -> tuple[Actor, ...]:
+    """Return the traffic; that of a recorded log is replayed, reacts, or is left out, as ``log.actors`` says."""
+    log = drawn.spec.log
+    if log is None or log.actors == "replay":
+        return drive.actors
+    return () if log.actors == "none" else tuple(_reactive(actor) for actor in drive.actors)
+
+
+def _reactive(actor: Actor) -> Actor:
+    if actor.is_static:
+        return actor
+    if actor.label in ("pedestrian", "other"):
+        return replace(actor, behaviour=Behaviour("replay"))
+    top_mps = float(np.max(speeds(actor.track)))
+    return replace(actor, behaviour=Behaviour("idm", {"desired_speed_mps": max(top_mps, 2.0)}))
+
+
+def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
+    """Check the periods and the length with the loop's own clock."""
+    document, timing = drawn.document, drawn.spec.timing
+    control_us, warmup_us = scenario.rates.control_us, scenario.warmup_us
+    try:
+        clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+    except InputError as e:
+        key = next((k for k in ("control_us", "camera_us", "policy_us") if f"rates.{k}" in e.with_what), None)
+        loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
+        raise document.error(DOING, loc, f"{e.with_what}: {e.found}", e.do_this) from e
+    if timing.timeline == "alpasim" and warmup_us % control_us:
+        found = f"a control period of {control_us} us, of which {warmup_us} us is not a multiple"
+        raise document.error(DOING, ("timing", "timeline"), found, "choose a rates.control_us that divides AlpaSim's 1.7 s")
+    if timing.start_time_offset_us and timing.timeline != "alpasim":
+        found = f"an offset of {timing.start_time_offset_us} us in the scenario's own time line"
+        raise document.error(DOING, ("timing", "start_time_offset_us"), found, "set timing.start_us, or timing.timeline: alpasim")
+    length_us = clock.n_steps * control_us
+    if warmup_us >= length_us:
+        found = f"warmup_us = {warmup_us} of a scene of {length_us} us: nothing is left to drive"
+        raise document.error(DOING, ("timing", "warmup_us"), found, "shorten timing.warmup_us or lengthen timing.duration_us")
+
+
+def camera_spec(model: CameraModel | None = None) -> CameraSpec:
+    """Return the camera of a section; None gives the default front camera."""
+    m = model or CameraModel()
+    focal = 0.5 * m.width / np.tan(np.deg2rad(m.hfov_deg) / 2)
+    K = np.array([[focal, 0.0, m.width / 2], [0.0, focal, m.height / 2], [0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3] = _rotation(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg)) @ _RIG_FROM_FORWARD_CAMERA
+    T[:3, 3] = m.x_m, m.y_m, m.z_m
+    return CameraSpec(m.name, m.width, m.height, K, T, m.shutter_us)
+
+
+def _rotation(yaw: float, pitch_down: float) -> F64:
+    """Return Rz(yaw) Ry(pitch): positive pitch about y (left) turns x (forward) down."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch_down), np.sin(pitch_down)
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    return np.asarray(about_z @ about_y)
+
+
+def _vehicle(v: VehicleSpec) -> Vehicle:
+    chassis = v.model_dump(exclude={"length_m", "width_m", "height_m"})
+    return Vehicle(Box(v.length_m, v.width_m, v.height_m), **chassis)
+
+
+def _background(drawn: Drawn) -> BackgroundFile | None:
+    document, background = drawn.document, drawn.spec.background
+    if background is None:
+        return None
+    path = document.folder_of(("background", "file")) / background.file
+    if not path.is_file():
+        raise document.error(DOING, ("background", "file"), f"{path} does not exist", "correct the path")
+    matrix = np.eye(4) if background.transform is None else np.array(background.transform)
+    if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        found = "no inverse, or a last row other than 0 0 0 1"
+        raise document.error(DOING, ("background", "transform"), found, "give rotation, scale and shift")
+    return BackgroundFile(str(path), matrix, background.keep_road)
+
+
+def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
     """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of every data file.
 
     Words for people, the places where data files lie, and where a rollout ends do not matter: they do not change the scene.
     """
+    spec = drawn.spec
     content = spec.model_dump(mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}})
     if spec.log is not None:
-        _, _, key = spec.log.recorded
-        content["log"][key] = "given by its content"
+        content["log"][spec.log.recorded[2]] = "given by its content"
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
-    digest = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
+    scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
     if spec.background is not None:
-        file = document.folder_of(("background", "file")) / spec.background.file
+        file = drawn.document.folder_of(("background", "file")) / spec.background.file
         check_regular(file, DOING)
         with file.open("rb") as stream:
-            digest.update(hashlib.file_digest(stream, "sha256").digest())
-    return digest.hexdigest()
+            scene.update(hashlib.file_digest(stream, "sha256").digest())
+    return scene.hexdigest()
 
 
 __all__ = ["find", "load_scenario"]

@@ -1,4 +1,7 @@
-"""OpenDRIVE maps as lane maps: lanes of every section with edges, links and paint, and the border of the drivable surface.
+"""OpenDRIVE maps as lane maps: lanes of every section with edges, links and paint, the border of the drivable surface, and the place.
+
+Lanes follow one another along sections, from road to road, and through junctions. A map lies in a scene's local frame by its geographic
+origin and the scene's pose on the earth.
 
 Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.opendrive_alpasim` reads the same roads by AlpaSim's rule instead.
 """
@@ -6,6 +9,8 @@ Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.opendrive_alpasim` reads the same 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +18,114 @@ import numpy as np
 from alpasim_plugin.core.geometry import densify, lane_polygon, transform_points
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Paint
 from alpasim_plugin.io.limits import ASIDE_M
-from scenarios.opendrive_geometry import beside, cubics_at, reference_line
-from scenarios.opendrive_links import following
-from scenarios.opendrive_road import MAX_ROAD_M, OdrLane, OdrMap, Road, Section, curved, lane_key
+from scenarios.map_lines import border_lines, lane_edges, merge_areas
+from scenarios.opendrive_road import (
+    MAX_ROAD_M,
+    OdrLane,
+    OdrMap,
+    Road,
+    RoadLink,
+    Section,
+    beside,
+    cubics_at,
+    curved,
+    lane_key,
+    reference_line,
+)
 from scenarios.reading import SourceFiles
-from scenarios.road_edges import border_lines, merge_areas
+
+
+def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
+    """Return the lanes with their successors in driving direction; links to lanes that are not in ``lanes`` are left out."""
+    roads = {road.road_id: road for road in odr.roads}
+    turns: dict[tuple[str, int], list[tuple[str, bool, int]]] = {}
+    for connection in odr.connections:
+        for here, there in connection.lanes:
+            turns.setdefault((connection.incoming, here), []).append((connection.connecting, connection.at_start, there))
+    out = dict(lanes)
+    for road in odr.roads:
+        for index, section in enumerate(road.sections):
+            for lane in section.lanes:
+                key = lane_key(road, index, lane.lane_id)
+                if key in out:
+                    ahead = _ahead(road, index, lane, roads, turns)
+                    out[key] = replace(out[key], successors=tuple(dict.fromkeys(k for k in ahead if k in lanes)))
+    return out
+
+
+def _ahead(
+    road: Road, index: int, lane: OdrLane, roads: Mapping[str, Road], turns: Mapping[tuple[str, int], list[tuple[str, bool, int]]]
+) -> list[str]:
+    along = (lane.lane_id < 0) != road.left_hand
+    linked = lane.successors if along else lane.predecessors
+    next_section = index + (1 if along else -1)
+    if 0 <= next_section < len(road.sections):
+        return [lane_key(road, next_section, i) for i in linked or (lane.lane_id,)]
+    link: RoadLink | None = road.successor if along else road.predecessor
+    if link is None:
+        return []
+    if link.kind == "junction":
+        found = [(roads[r], at_start, i) for r, at_start, i in turns.get((road.road_id, lane.lane_id), ()) if r in roads]
+        return [lane_key(r, 0 if at_start else len(r.sections) - 1, i) for r, at_start, i in found]
+    target = roads.get(link.target)
+    if target is None:
+        return []
+    return [lane_key(target, 0 if link.at_start else len(target.sections) - 1, i) for i in linked]
+
+
+# WGS 84 ellipsoid (NIMA TR8350.2).
+SEMI_MAJOR_M = 6378137.0
+FLATTENING = 1.0 / 298.257223563
+
+
+def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
+    """Return the ``(4, 4)`` transform from map coordinates to the local frame, as AlpaSim places a map.
+
+    The map's coordinates are taken as east, north, up at the ``lat_0``, ``lon_0`` (and ``alt_0`` or ``h_0``) of its projection string;
+    the projection itself is not applied. Without a usable origin the map lies in the local frame as it is.
+
+    Args:
+        geo_reference: PROJ string of the map.
+        T_earth_local: ``(4, 4)`` pose of the local frame in earth-centred, earth-fixed coordinates.
+    """
+    origin = geographic_origin(geo_reference)
+    if origin is None:
+        return np.eye(4)
+    return np.asarray(np.linalg.inv(T_enu_earth(*origin) @ T_earth_local), dtype=np.float64)
+
+
+def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:
+    """Return latitude and longitude in degrees and height in metres of a PROJ string; None where it names none or an impossible one."""
+    values: dict[str, float] = {}
+    for word in geo_reference.split():
+        key, _, text = word.partition("=")
+        name = next((n for n in ("lat_0", "lon_0", "alt_0", "h_0") if key.startswith(f"+{n}")), None)
+        try:
+            if name is not None:
+                values["alt_0" if name == "h_0" else name] = float(text)
+        except ValueError:
+            continue  # AlpaSim passes over words it cannot read; real files hold some
+    if "lat_0" not in values or "lon_0" not in values or abs(values["lat_0"]) > 90 or abs(values["lon_0"]) > 180:
+        return None
+    return values["lat_0"], values["lon_0"], values.get("alt_0", 0.0)
+
+
+def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
+    """Return the ``(4, 4)`` transform from earth-centred coordinates to east, north, up at a place."""
+    lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
+    e2 = FLATTENING * (2.0 - FLATTENING)
+    n = SEMI_MAJOR_M / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
+    place = np.array(
+        [(n + height_m) * np.cos(lat) * np.cos(lon), (n + height_m) * np.cos(lat) * np.sin(lon), (n * (1.0 - e2) + height_m) * np.sin(lat)]
+    )
+    east = [-np.sin(lon), np.cos(lon), 0.0]
+    north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+    up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+    out = np.eye(4)
+    out[:3, :3] = [east, north, up]
+    out[:3, 3] = -out[:3, :3] @ place
+    return out
+
 
 STEP_M = 0.5  # stations on bends and where widths change
 STRAIGHT_STEP_M = 2.0
@@ -55,10 +163,9 @@ def lane_map_of(files: SourceFiles, where: Path | str, odr: OdrMap, T_local_map:
         raise files.fail(where, "a map without a lane for vehicles", "use a map with lanes of type driving")
     linked = following(odr, lanes)
     surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
-    heights = np.concatenate([e for lane in lanes.values() for e in (lane.left, lane.right) if e is not None])
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
     notes += [f"{odr.n_signals} signals and {odr.n_objects} objects of the map are not used"] if odr.n_signals + odr.n_objects else []
-    return LaneMap(linked, border_lines(surface, heights)), tuple(notes)
+    return LaneMap(linked, border_lines(surface, np.concatenate(lane_edges(lanes)))), tuple(notes)
 
 
 def _section(road: Road, index: int, section: Section, T_local_map: F64, left_out: Counter[str]) -> list[Lane] | None:

@@ -21,9 +21,8 @@ import shapely
 
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F64, Lane, LaneMap
-from scenarios.opendrive_geometry import Cubic, beside, cubics_at
-from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road
-from scenarios.vertices import with_vertices
+from scenarios.map_lines import with_vertices
+from scenarios.opendrive_road import MAX_ROAD_M, Cubic, OdrMap, Road, beside, cubics_at
 
 STEP_M = 0.5
 CROSSING_M = 0.2  # an edge nearer than this to a lane centre crosses it

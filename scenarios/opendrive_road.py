@@ -1,17 +1,125 @@
-"""OpenDRIVE roads as written: plan view, elevation, lane sections, links; nothing is interpreted here."""
+"""OpenDRIVE roads as written: plan view, elevation, lane sections and links, and their reference lines at any arc length.
+
+Reference lines are line, arc, spiral, poly3 and paramPoly3 records. Source: ASAM OpenDRIVE 1.4 to 1.8, chapter on geometry: x east, y
+north, heading from x towards y, ``s`` along the line, ``t`` to the left.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from alpasim_plugin.core.types import F64
 from alpasim_plugin.io.limits import MAP_CURVATURE_PER_M, MAP_ROAD_M
-from scenarios.opendrive_geometry import KINDS, Cubic, Geometry
 from scenarios.reading import SourceFiles
+
+Kind = Literal["line", "arc", "spiral", "poly3", "paramPoly3"]
+KINDS: tuple[Kind, ...] = ("line", "arc", "spiral", "poly3", "paramPoly3")
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+_TABLE = 257  # stations at which a cubic's arc length is tabulated before it is inverted
+
+
+@dataclass(frozen=True)
+class Cubic:
+    """``a + b ds + c ds^2 + d ds^3`` from ``s_m`` on, where ``ds = s - s_m``."""
+
+    s_m: float
+    a: float
+    b: float = 0.0
+    c: float = 0.0
+    d: float = 0.0
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """One record of a plan view."""
+
+    s_m: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    length_m: float
+    kind: Kind
+    # line: none; arc: curvature; spiral: start and end curvature; poly3: a b c d; paramPoly3: aU bU cU dU aV bV cV dV.
+    numbers: tuple[float, ...] = ()
+    normalised: bool = True  # paramPoly3: the parameter runs 0..1, else 0..length
+
+    def at(self, s_m: F64) -> F64:
+        """Return ``(N, 3)`` x, y and heading at arc lengths ``(N,)`` from the record's own start."""
+        if self.kind in ("line", "arc", "spiral"):
+            return self._clothoid(s_m)
+        u, v, heading = self._poly3(s_m) if self.kind == "poly3" else self._param_poly3(s_m)
+        c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        return np.column_stack([self.x_m + u * c - v * s, self.y_m + u * s + v * c, self.heading_rad + heading])
+
+    def _clothoid(self, s_m: F64) -> F64:
+        """Integrate the heading, which is quadratic in s; 32-point Gauss-Legendre is exact to rounding for any road's turn."""
+        start = self.numbers[0] if self.numbers else 0.0
+        rate = (self.numbers[1] - start) / self.length_m if self.kind == "spiral" else 0.0
+        at = 0.5 * s_m[:, None] * (1.0 + _NODES)  # (N, 32)
+        heading = self.heading_rad + at * (start + 0.5 * rate * at)
+        x = self.x_m + 0.5 * s_m * (np.cos(heading) @ _WEIGHTS)
+        y = self.y_m + 0.5 * s_m * (np.sin(heading) @ _WEIGHTS)
+        return np.column_stack([x, y, self.heading_rad + s_m * (start + 0.5 * rate * s_m)])
+
+    def _poly3(self, s_m: F64) -> tuple[F64, F64, F64]:
+        """Return u, v and heading of ``v = a + b u + c u^2 + d u^3``; u follows from the arc length."""
+        a, b, c, d = self.numbers
+        reach = max(self.length_m, 1e-9)
+        table_u = np.linspace(0.0, reach, _TABLE)  # an arc is never shorter than its u
+
+        def slope(u: F64) -> F64:
+            return np.asarray(b + u * (2 * c + 3 * d * u))
+
+        half = 0.5 * np.diff(table_u)[:, None]
+        nodes = 0.5 * (table_u[1:] + table_u[:-1])[:, None] + half * _NODES
+        lengths = np.concatenate([[0.0], np.cumsum(np.sum(half * _WEIGHTS * np.hypot(1.0, slope(nodes)), axis=1))])
+        u = np.interp(s_m, lengths, table_u)
+        for _ in range(3):  # Newton on the arc length from the table's station below
+            below = np.clip(np.searchsorted(table_u, u, side="right") - 1, 0, _TABLE - 1)
+            gap = 0.5 * (u - table_u[below])
+            part = gap * (np.hypot(1.0, slope(table_u[below][:, None] + gap[:, None] * (1.0 + _NODES))) @ _WEIGHTS)
+            u = u - (lengths[below] + part - s_m) / np.hypot(1.0, slope(u))
+        return u, a + u * (b + u * (c + d * u)), np.arctan(slope(u))
+
+    def _param_poly3(self, s_m: F64) -> tuple[F64, F64, F64]:
+        p = s_m / self.length_m if self.normalised and self.length_m > 0 else s_m
+        (au, bu, cu, du), (av, bv, cv, dv) = self.numbers[:4], self.numbers[4:]
+        u, v = au + p * (bu + p * (cu + du * p)), av + p * (bv + p * (cv + dv * p))
+        return u, v, np.arctan2(bv + p * (2 * cv + 3 * dv * p), bu + p * (2 * cu + 3 * du * p))
+
+
+def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
+    """Return ``(N, 3)`` x, y and heading (not wrapped) of a road's reference line at arc lengths ``(N,)``."""
+    starts = np.array([one.s_m for one in records])
+    owner = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(records) - 1)
+    out = np.empty((len(s_m), 3))
+    for i in np.unique(owner):
+        rows = owner == i
+        out[rows] = records[i].at(s_m[rows] - records[i].s_m)
+    return out
+
+
+def cubics_at(records: Sequence[Cubic], s_m: F64) -> F64:
+    """Return ``(N,)`` the value of the record in force at each arc length; before the first record that one is extended, none gives 0."""
+    if not records:
+        return np.zeros(len(s_m))
+    table = np.array([[one.s_m, one.a, one.b, one.c, one.d] for one in records])
+    s0, a, b, c, d = table[np.clip(np.searchsorted(table[:, 0], s_m, side="right") - 1, 0, len(records) - 1)].T
+    ds = s_m - s0
+    return np.asarray(a + ds * (b + ds * (c + d * ds)))
+
+
+def beside(line: F64, t_m: F64) -> F64:
+    """Return points ``(N, 2)`` at signed distances ``t_m (N,)``, left positive, across a line ``(N, 3)`` of x, y, heading."""
+    return np.column_stack([line[:, 0] - t_m * np.sin(line[:, 2]), line[:, 1] + t_m * np.cos(line[:, 2])])
+
 
 MAX_ROAD_M = MAP_ROAD_M.high
 _ABCD = ("a", "b", "c", "d")
@@ -103,7 +211,8 @@ def parse_map(files: SourceFiles, where: Path | str, root: Element) -> OdrMap:
     Raises:
         InputError: It is no OpenDRIVE, has no road, or a record lacks a number.
     """
-    _drop_namespaces(root)
+    for element in root.iter():  # without namespaces
+        element.tag = element.tag.rpartition("}")[2]
     if root.tag != "OpenDRIVE":
         raise files.fail(where, f"a document <{root.tag}>", "give an OpenDRIVE file, whose root is <OpenDRIVE>")
     roads = tuple(_road(files, where, element) for element in root.findall("road"))
@@ -168,20 +277,19 @@ def _road(files: SourceFiles, where: Path | str, element: Element) -> Road:
             None if mark is None else (mark.get("type", "none"), mark.get("color", "standard")),
         )  # fmt: skip
 
-    length = road_m
     lanes = element.find("lanes")
     elements = sorted(lanes.findall("laneSection") if lanes is not None else [], key=lambda e: number(e, "s", 0.0))
     starts = [number(e, "s", 0.0) for e in elements]
     sections = tuple(
         Section(start, end, tuple(lane(one, start) for side in ("left", "center", "right") for one in e.findall(f"{side}/lane")))
-        for e, start, end in zip(elements, starts, [*starts[1:], length], strict=True)
+        for e, start, end in zip(elements, starts, [*starts[1:], road_m], strict=True)
     )
-    if any(not 0 <= start <= length for start in starts):
-        raise files.fail(here, f"lane sections at {starts} of a road of {length} m", "start every section on the road")
+    if any(not 0 <= start <= road_m for start in starts):
+        raise files.fail(here, f"lane sections at {starts} of a road of {road_m} m", "start every section on the road")
     view = element.find("planView")
     records = tuple(geometry(r) for r in (view.findall("geometry") if view is not None else []))
     return Road(
-        str(element.get("id")), length, element.get("junction", "-1"), element.get("rule") == "LHT", records,
+        str(element.get("id")), road_m, element.get("junction", "-1"), element.get("rule") == "LHT", records,
         cubics(element.find("elevationProfile"), "elevation"), cubics(element.find("lateralProfile"), "superelevation"),
         cubics(lanes, "laneOffset"), sections, _link(element, "successor"), _link(element, "predecessor"),
     )  # fmt: skip
@@ -199,11 +307,6 @@ def _link(road: Element, tag: str) -> RoadLink | None:
     if found is None:
         return None
     return RoadLink(found.get("elementType", "road"), str(found.get("elementId")), found.get("contactPoint", "start") == "start")
-
-
-def _drop_namespaces(root: Element) -> None:
-    for element in root.iter():
-        element.tag = element.tag.rpartition("}")[2]
 
 
 def lane_key(road: Road, section: int, lane_id: int) -> str:

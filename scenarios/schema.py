@@ -5,39 +5,34 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
 from alpasim_plugin.io import limits as b
-from scenarios.schema_actors import ActorSpec
-from scenarios.schema_base import BuildingHeight, Part, within
-from scenarios.schema_road import LogSpec, RoadSpec
+from scenarios.schema_parts import ActorSpec, BuildingHeight, LogSpec, Part, RoadSpec, within
 
 SCHEMA_FILE = Path(__file__).with_name("schema.json")
+DEFAULT_DURATION_US = 8_000_000  # of the drive on a built road
 
 
 class LaneChangeSpec(Part):
     """A lane change of the ego."""
 
-    at_m: Annotated[float, within(b.DISTANCE_M)] = Field(
-        description="Start of the change, metres along the ego's path from where it starts."
-    )
-    to_lane: Annotated[int, within(b.LANE_INDEX)] = Field(description="Target forward lane; 0 is next to the centre line.")
-    length_m: Annotated[float, within(b.SEGMENT_M)] = Field(default=60.0, description="Length of the change along the road.")
+    at_m: float = within(b.DISTANCE_M, "Start of the change, metres along the ego's path from where it starts.")
+    to_lane: int = within(b.LANE_INDEX, "Target forward lane; 0 is next to the centre line.")
+    length_m: float = within(b.SEGMENT_M, "Length of the change along the road.", 60.0)
 
 
 class EgoSpec(Part):
     """How the expert that writes the ego's log drives. It follows the road, keeps its distance and slows down for bends."""
 
-    lane: Annotated[int, within(b.LANE_INDEX)] = Field(default=0, description="Forward lane at the start; 0 is next to the centre line.")
-    start_m: Annotated[float, within(b.DISTANCE_M)] = Field(
-        default=20.0, description="Distance of the rear axle from the road's beginning at the log's start."
-    )
-    speed_mps: Annotated[float, within(b.SPEED_MPS)] = Field(default=10.0, description="Speed at the log's start.")
-    cruise_mps: Annotated[float, within(b.CRUISE_MPS)] = Field(default=10.0, description="Desired speed on a free straight.")
-    max_lateral_accel_mps2: Annotated[float, within(b.ACCEL_MPS2)] = Field(default=2.0, description="Limit that slows the expert in bends.")
-    headway_s: Annotated[float, within(b.HEADWAY_S)] = Field(default=1.5, description="Time gap to a leader.")
+    lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line.", 0)
+    start_m: float = within(b.DISTANCE_M, "Distance of the rear axle from the road's beginning at the log's start.", 20.0)
+    speed_mps: float = within(b.SPEED_MPS, "Speed at the log's start.", 10.0)
+    cruise_mps: float = within(b.CRUISE_MPS, "Desired speed on a free straight.", 10.0)
+    max_lateral_accel_mps2: float = within(b.ACCEL_MPS2, "Limit that slows the expert in bends.", 2.0)
+    headway_s: float = within(b.HEADWAY_S, "Time gap to a leader.", 1.5)
     lane_changes: tuple[LaneChangeSpec, ...] = Field(
         default=(), max_length=int(b.ELEMENTS.high), description="Lane changes, in driving order."
     )
@@ -46,14 +41,14 @@ class EgoSpec(Part):
 class EnvironmentSpec(Part):
     """Surroundings generated beside the road."""
 
-    buildings: float = Field(default=0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
+    buildings: float = Field(0.7, ge=0, le=1, description="Share of free roadside frontage covered by facades.")
     building_height_m: tuple[BuildingHeight, BuildingHeight] = Field(
         default=(6.0, 18.0), description="Least and greatest height of facades."
     )
-    trees_per_100m: Annotated[float, within(b.TREES_PER_100M)] = Field(default=4.0, description="Trees per road side.")
-    poles_spacing_m: float = Field(default=30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none.")
-    sky: Literal["clear", "overcast", "dusk"] = Field(default="clear", description="Sky and light.")
-    texture: float = Field(default=1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
+    trees_per_100m: float = within(b.TREES_PER_100M, "Trees per road side.", 4.0)
+    poles_spacing_m: float = Field(30.0, ge=0, le=b.POLES_M.high, description="Distance between lamp posts; 0: none.")
+    sky: Literal["clear", "overcast", "dusk"] = Field("clear", description="Sky and light.")
+    texture: float = Field(1.0, ge=0, le=1, description="Contrast of ground and facade texture.")
 
     @model_validator(mode="after")
     def _ordered(self) -> EnvironmentSpec:
@@ -67,41 +62,37 @@ class EnvironmentSpec(Part):
 class CameraModel(Part):
     """A pinhole camera on the rig."""
 
-    name: str = Field(default="front", min_length=1, description="Name that policies request.")
-    width: Annotated[int, within(b.IMAGE_SIDE_PX)] = Field(default=256, description="Image width in pixels.")
-    height: Annotated[int, within(b.IMAGE_SIDE_PX)] = Field(default=144, description="Image height in pixels.")
-    hfov_deg: float = Field(default=75.0, gt=1, lt=170, description="Horizontal field of view.")
-    x_m: Annotated[float, within(b.MOUNT_M)] = Field(default=1.6, description="Mount, metres ahead of the rear axle.")
-    y_m: Annotated[float, within(b.MOUNT_M)] = Field(default=0.0, description="Mount, metres to the left.")
-    z_m: float = Field(default=1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground.")
-    yaw_deg: float = Field(default=0.0, ge=-180, le=180, description="Turned to the left.")
-    pitch_down_deg: float = Field(default=4.0, gt=-90, lt=90, description="Tilted downwards.")
-    shutter_us: Annotated[int, within(b.SHUTTER_US)] = Field(default=0, description="Exposure from shutter start to shutter end.")
+    name: str = Field("front", min_length=1, description="Name that policies request.")
+    width: int = within(b.IMAGE_SIDE_PX, "Image width in pixels.", 256)
+    height: int = within(b.IMAGE_SIDE_PX, "Image height in pixels.", 144)
+    hfov_deg: float = Field(75.0, gt=1, lt=170, description="Horizontal field of view.")
+    x_m: float = within(b.MOUNT_M, "Mount, metres ahead of the rear axle.", 1.6)
+    y_m: float = within(b.MOUNT_M, "Mount, metres to the left.", 0.0)
+    z_m: float = Field(1.5, gt=0, le=b.MOUNT_M.high, description="Mount, metres above the ground.")
+    yaw_deg: float = Field(0.0, ge=-180, le=180, description="Turned to the left.")
+    pitch_down_deg: float = Field(4.0, gt=-90, lt=90, description="Tilted downwards.")
+    shutter_us: int = within(b.SHUTTER_US, "Exposure from shutter start to shutter end.", 0)
 
 
 class RatesSpec(Part):
     """Integer periods; camera and policy periods are whole multiples of the control period."""
 
-    control_us: Annotated[int, within(b.PERIOD_US)] = Field(default=100_000, description="Control period.")
-    camera_us: Annotated[int, within(b.PERIOD_US)] = Field(default=100_000, description="Camera period.")
-    policy_us: Annotated[int, within(b.PERIOD_US)] = Field(default=100_000, description="Policy period.")
+    control_us: int = within(b.PERIOD_US, "Control period.", 100_000)
+    camera_us: int = within(b.PERIOD_US, "Camera period.", 100_000)
+    policy_us: int = within(b.PERIOD_US, "Policy period.", 100_000)
 
 
 class TimingSpec(Part):
     """Which part of the log is driven."""
 
-    start_us: Annotated[int, within(b.TIME_US)] = Field(
-        default=500_000, description="First frame, after the log's first pose; the log before it is context."
-    )
+    start_us: int = within(b.TIME_US, "First frame, after the log's first pose; the log before it is context.", 500_000)
     duration_us: int | None = Field(
         default=None,
         gt=0,
         le=b.TIME_US.high,
         description="Length from the first frame to the end; none: 8 s on a built road, to the end of a recorded log.",
     )
-    warmup_us: Annotated[int, within(b.TIME_US)] = Field(
-        default=500_000, description="The log is forced for so long after the first frame."
-    )
+    warmup_us: int = within(b.TIME_US, "The log is forced for so long after the first frame.", 500_000)
     stop_at_path_end: bool = Field(
         default=True, description="A rollout ends where the recorded path ends, unless the recorded car stands there."
     )
@@ -109,17 +100,17 @@ class TimingSpec(Part):
         default="scenario",
         description="alpasim: start at the recording's first camera frame, where it has any, and force 1.7 s, whatever the keys above say.",
     )
-    start_time_offset_us: Annotated[int, within(b.TIME_US)] = Field(
-        default=0, description="With timeline alpasim: skipped at the start, as by AlpaSim's field of that name (since wire 0.55)."
+    start_time_offset_us: int = within(
+        b.TIME_US, "With timeline alpasim: skipped at the start, as by AlpaSim's field of that name (since wire 0.55).", 0
     )
 
 
 class LatencySpec(Part):
     """Delay from observation to the plan taking effect."""
 
-    kind: Literal["none", "fixed", "measured"] = Field(default="none", description="No delay, a fixed one, or the measured one.")
-    fixed_us: Annotated[int, within(b.TIME_US)] = Field(default=0, description="Delay where kind is fixed.")
-    fixer: bool = Field(default=False, description="Where kind is measured: the policy also waits for the fixer of its frames.")
+    kind: Literal["none", "fixed", "measured"] = Field("none", description="No delay, a fixed one, or the measured one.")
+    fixed_us: int = within(b.TIME_US, "Delay where kind is fixed.", 0)
+    fixer: bool = Field(False, description="Where kind is measured: the policy also waits for the fixer of its frames.")
 
     @model_validator(mode="after")
     def _fitting(self) -> LatencySpec:
@@ -135,16 +126,14 @@ class DegradationSpec(Part):
         default="reconstruction",
         description="A model fitted to the logged drive and stopped early; one fitted to views beside it; seeded perturbations; none.",
     )
-    share: float = Field(default=0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
-    shift_m: float = Field(default=1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
-    views_per_s: float = Field(default=6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
-    depth_error: float = Field(default=0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
-    pose_error_m: float = Field(default=0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
-    severity: float = Field(default=1.5, ge=0, le=100, description="Surrogate: scales all terms; 0 leaves the scene as built.")
-    onset_m: Annotated[float, within(b.GAP_M)] = Field(
-        default=0.1, description="Surrogate: distance from the logged path where the error starts to grow."
-    )
-    full_m: float = Field(default=2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full.")
+    share: float = Field(0.15, gt=0, le=1, description="Reconstruction and cycle: share of the fit's whole schedule.")
+    shift_m: float = Field(1.0, ge=-10, le=10, description="Cycle: how far to the left the views lie that the model is fitted to.")
+    views_per_s: float = Field(6.0, gt=0, le=30, description="Reconstruction and cycle: views per second of log that are fitted.")
+    depth_error: float = Field(0.1, ge=0, le=0.5, description="Reconstruction and cycle: spread of the first points' depth, share.")
+    pose_error_m: float = Field(0.0, ge=0, le=1, description="Reconstruction and cycle: spread of the poses of these views.")
+    severity: float = Field(1.5, ge=0, le=100, description="Surrogate: scales all terms; 0 leaves the scene as built.")
+    onset_m: float = within(b.GAP_M, "Surrogate: distance from the logged path where the error starts to grow.", 0.1)
+    full_m: float = Field(2.0, gt=0, le=b.GAP_M.high, description="Surrogate: distance where it is full.")
 
     @model_validator(mode="after")
     def _fitting(self) -> DegradationSpec:
@@ -173,34 +162,32 @@ class BackgroundSpec(Part):
     transform: tuple[tuple[float, float, float, float], ...] | None = Field(
         default=None, min_length=4, max_length=4, description="4 x 4 matrix from the file's frame to the world, row by row; may scale."
     )
-    keep_road: bool = Field(default=False, description="Draw the built road with the file; otherwise the file replaces road and houses.")
+    keep_road: bool = Field(False, description="Draw the built road with the file; otherwise the file replaces road and houses.")
 
 
 class VehicleSpec(Part):
     """The ego's body and chassis."""
 
-    length_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=4.855, description="Body length.")
-    width_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=1.88, description="Body width.")
-    height_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=1.6, description="Body height.")
-    rear_axle_to_centre_m: Annotated[float, within(b.AXLE_M)] = Field(
-        default=1.4, description="From the rear axle forwards to the body's middle."
-    )
-    wheelbase_m: Annotated[float, within(b.VEHICLE_M)] = Field(default=2.85, description="Distance between the axles.")
-    max_steer_rad: float = Field(default=0.6, ge=b.STEER_RAD.low, lt=b.STEER_RAD.high, description="Largest road-wheel angle.")
-    max_steer_rate_radps: Annotated[float, within(b.STEER_RATE_RADPS)] = Field(default=0.8, description="Largest steering rate.")
-    max_accel_mps2: Annotated[float, within(b.ACCEL_MPS2)] = Field(default=3.5, description="Largest acceleration.")
-    max_brake_mps2: Annotated[float, within(b.ACCEL_MPS2)] = Field(default=8.0, description="Largest deceleration.")
+    length_m: float = within(b.VEHICLE_M, "Body length.", 4.855)
+    width_m: float = within(b.VEHICLE_M, "Body width.", 1.88)
+    height_m: float = within(b.VEHICLE_M, "Body height.", 1.6)
+    rear_axle_to_centre_m: float = within(b.AXLE_M, "From the rear axle forwards to the body's middle.", 1.4)
+    wheelbase_m: float = within(b.VEHICLE_M, "Distance between the axles.", 2.85)
+    max_steer_rad: float = Field(0.6, ge=b.STEER_RAD.low, lt=b.STEER_RAD.high, description="Largest road-wheel angle.")
+    max_steer_rate_radps: float = within(b.STEER_RATE_RADPS, "Largest steering rate.", 0.8)
+    max_accel_mps2: float = within(b.ACCEL_MPS2, "Largest acceleration.", 3.5)
+    max_brake_mps2: float = within(b.ACCEL_MPS2, "Largest deceleration.", 8.0)
 
 
 class JitterSpec(Part):
     """Ranges within which scenes of other seeds than 0 differ from the file; 0 switches a term off. Uniform, relative unless in a unit."""
 
-    length: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of element lengths.")
-    curvature: float = Field(default=0.1, ge=0, le=0.5, description="Relative change of curvatures.")
-    lane_width: float = Field(default=0.02, ge=0, le=0.2, description="Relative change of the lane width.")
-    speed: float = Field(default=0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
-    position_m: float = Field(default=1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
-    time_us: Annotated[int, within(b.TIME_US)] = Field(default=150_000, description="Shift of scripted moments, each way.")
+    length: float = Field(0.05, ge=0, le=0.5, description="Relative change of element lengths.")
+    curvature: float = Field(0.1, ge=0, le=0.5, description="Relative change of curvatures.")
+    lane_width: float = Field(0.02, ge=0, le=0.2, description="Relative change of the lane width.")
+    speed: float = Field(0.05, ge=0, le=0.5, description="Relative change of the speeds of ego and actors.")
+    position_m: float = Field(1.5, ge=0, le=20, description="Shift of actors along the road, each way.")
+    time_us: int = within(b.TIME_US, "Shift of scripted moments, each way.", 150_000)
 
 
 class RangeSpec(Part):
@@ -232,32 +219,38 @@ class ScenarioSpec(Part):
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$",
         description="Name of the scene; none: the file's folder and name.",
     )
-    description: str = Field(default="", description="One sentence.")
-    tags: tuple[str, ...] = Field(default=(), max_length=int(b.LISTED.high), description="Keywords.")
+    description: str = Field("", description="One sentence.")
+    tags: tuple[str, ...] = Field((), max_length=int(b.LISTED.high), description="Keywords.")
     seed: int = Field(
         default=0, ge=0, le=int(b.SEED.high), description="Scene seed; 0: the numbers are used as written, others jitter them."
     )
-    road: RoadSpec | None = Field(default=None, description="A road to build; give this or log.")
-    log: LogSpec | None = Field(default=None, description="A recorded drive to use; give this or road.")
-    ego: EgoSpec = Field(default=EgoSpec(), description="The expert that drives a built road.")
-    actors: tuple[ActorSpec, ...] = Field(default=(), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users.")
-    environment: EnvironmentSpec = Field(default=EnvironmentSpec(), description="Surroundings.")
+    road: RoadSpec | None = Field(None, description="A road to build; give this or log.")
+    log: LogSpec | None = Field(None, description="A recorded drive to use; give this or road.")
+    ego: EgoSpec = Field(EgoSpec(), description="The expert that drives a built road.")
+    actors: tuple[ActorSpec, ...] = Field((), max_length=int(b.ACTOR_ENTRIES.high), description="Other road users.")
+    environment: EnvironmentSpec = Field(EnvironmentSpec(), description="Surroundings.")
     cameras: tuple[CameraModel, ...] | None = Field(
         default=None, min_length=1, max_length=int(b.CAMERAS.high), description="Cameras; none: the log's own, or one named front."
     )
-    rates: RatesSpec = Field(default=RatesSpec(), description="Periods of the loop.")
-    timing: TimingSpec = Field(default=TimingSpec(), description="Start, length and warm-up.")
-    latency: LatencySpec = Field(default=LatencySpec(), description="Delay of the policy.")
-    degradation: DegradationSpec = Field(default=DegradationSpec(), description="Degradation of the renderer 3dgs.")
-    background: BackgroundSpec | None = Field(default=None, description="A Gaussian file as background.")
-    vehicle: VehicleSpec | None = Field(default=None, description="The ego vehicle; none: the log's own, or the default one.")
-    jitter: JitterSpec = Field(default=JitterSpec(), description="How scenes of other seeds than 0 differ from the file.")
+    rates: RatesSpec = Field(RatesSpec(), description="Periods of the loop.")
+    timing: TimingSpec = Field(TimingSpec(), description="Start, length and warm-up.")
+    latency: LatencySpec = Field(LatencySpec(), description="Delay of the policy.")
+    degradation: DegradationSpec = Field(DegradationSpec(), description="Degradation of the renderer 3dgs.")
+    background: BackgroundSpec | None = Field(None, description="A Gaussian file as background.")
+    vehicle: VehicleSpec | None = Field(None, description="The ego vehicle; none: the log's own, or the default one.")
+    jitter: JitterSpec = Field(JitterSpec(), description="How scenes of other seeds than 0 differ from the file.")
     variations: dict[str, RangeSpec | ChoiceSpec] = Field(
         default={}, description="Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed."
     )
     samples: tuple[dict[str, Any], ...] = Field(
         default=(), description="Explicit samples, each dotted key to value; the scene seed picks one, cyclically."
     )
+
+    @property
+    def built_until_us(self) -> int:
+        """Return the end of the drive on a built road, after the log's first pose."""
+        duration_us = self.timing.duration_us
+        return self.timing.start_us + (DEFAULT_DURATION_US if duration_us is None else duration_us)
 
     @model_validator(mode="after")
     def _one_source(self) -> ScenarioSpec:
@@ -276,8 +269,7 @@ def json_schema() -> str:
 
 def models() -> dict[str, type[BaseModel]]:
     """Return every section's model by the key path under which it stands in a file, for the documentation."""
-    from scenarios.schema_actors import ACTOR_KINDS
-    from scenarios.schema_road import SEGMENT_KINDS
+    from scenarios.schema_parts import ACTOR_KINDS, SEGMENT_KINDS
 
     out: dict[str, type[BaseModel]] = {"": ScenarioSpec, "road": RoadSpec, "log": LogSpec, "ego": EgoSpec}
     out["ego.lane_changes[]"] = LaneChangeSpec
@@ -289,9 +281,6 @@ def models() -> dict[str, type[BaseModel]]:
         "variations.KEY (a range)": RangeSpec, "variations.KEY (a choice)": ChoiceSpec,
     }  # fmt: skip
     return out
-
-
-Seed = Annotated[int, Field(ge=0)]
 
 if __name__ == "__main__":
     SCHEMA_FILE.write_text(json_schema(), encoding="utf-8")

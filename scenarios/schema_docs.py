@@ -1,24 +1,34 @@
-"""The key tables of the scenario pages in docs/, made from the schema. ``python -m scenarios.schema_docs docs`` rewrites them."""
+"""The tables of the scenario pages and of the limits in docs/, made from the schema and the bounds.
+
+``python -m scenarios.schema_docs docs`` rewrites them.
+"""
 
 from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from alpasim_plugin.io import limits as bounds
+from alpasim_plugin.io.limits import Bound, number
+from scenarios import budget
 from scenarios.schema import models
-from scenarios.schema_base import Part
+from scenarios.schema_parts import Part
 
-BEGIN, END = "<!-- keys: begin -->\n", "<!-- keys: end -->"
+BEGIN, END = "<!-- made by python -m scenarios.schema_docs docs -->\n", "<!-- end of what is made -->\n"
 PAGES = {  # page -> the sections of the schema whose tables it holds, by the first part of their path; the last page holds the rest
     "scenario-road-keys.md": ("road", "environment"),
     "scenario-actor-keys.md": ("ego", "actors"),
     "scenario-keys.md": (),
 }
+LIMITS_PAGE = "limits.md"
+WORDS = {float: "number", int: "whole number", str: "text", bool: "true or false"}
+SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
 def page_of(where: str) -> str:
@@ -33,56 +43,56 @@ def key_tables(page: str) -> str:
     for where, model in models().items():
         if page_of(where) != page:
             continue
-        title = f"`{where}`" if where else "Top level"
         summary = (model.__doc__ or "").strip().split("\n")[0]
+        out.append(f"### {f'`{where}`' if where else 'Top level'}\n\n{summary}\n\n| key | type | default | meaning |\n|---|---|---|---|")
         discriminator = "kind" if " kind: " in where else ""  # the heading says it
-        rows = [
-            f"| `{name}` | {_kind(f)} | {_default(f)} | {f.description} |"
-            for name, f in model.model_fields.items()
-            if name != discriminator
-        ]
-        out.append("\n".join([f"### {title}", "", summary, "", "| key | type | default | meaning |", "|---|---|---|---|", *rows, "", ""]))
-    return "".join(out)
+        fields = ((name, field) for name, field in model.model_fields.items() if name != discriminator)
+        out += [f"| `{name}` | {_kind(field)} | {_default(field)} | {field.description} |" for name, field in fields]
+        out.append("")
+    return "\n".join(out) + "\n"
+
+
+def limit_tables() -> str:
+    """Return the tables of limits: what one scenario may cost, and the range of every quantity."""
+    single = [value for value in vars(bounds).values() if isinstance(value, Bound)]
+    return f"\n## What one scenario may hold\n\n{_limits(budget.BUDGETS)}\n## Ranges\n\n{_limits(single)}\n"
+
+
+def _limits(rows: Sequence[Bound]) -> str:
+    lines = ["| quantity | unit | least | most | why |", "|---|---|---:|---:|---|"]
+    lines += [f"| {row.name} | {row.unit} | {number(row.low)} | {number(row.high)} | {row.reason} |" for row in rows]
+    return "\n".join(lines) + "\n"
 
 
 def _kind(field: FieldInfo) -> str:
-    text = _name(field.annotation)
-    bounds = []
+    texts = [_name(field.annotation)]
     for item in field.metadata:
-        for sign, attribute in ((">", "gt"), (">=", "ge"), ("<", "lt"), ("<=", "le")):
-            value = getattr(item, attribute, None)
-            if value is not None:
-                bounds.append(f"{sign} {value}")
-    return ", ".join([text, *bounds])
+        texts += [f"{sign} {getattr(item, name)}" for name, sign in SIGNS.items() if getattr(item, name, None) is not None]
+    return ", ".join(texts)
 
 
 def _name(annotation: Any) -> str:
-    origin = get_origin(annotation)
+    origin, options = get_origin(annotation), get_args(annotation)
     if origin is Literal:
-        return " \\| ".join(f"`{a}`" for a in get_args(annotation))
+        return " \\| ".join(f"`{a}`" for a in options)
     if hasattr(annotation, "__metadata__"):
-        return _name(get_args(annotation)[0])
-    if origin is tuple:
-        parts = [a for a in get_args(annotation) if a is not Ellipsis]
-        inner = sorted({_name(a) for a in parts})
-        return f"list of {inner[0]}" if Ellipsis in get_args(annotation) else f"{len(parts)} x {inner[0]}"
+        return _name(options[0])
     if origin is dict:
         return "keys"
-    options = get_args(annotation)
-    if options:
-        names = [_name(a) for a in options if a is not type(None)]
-        if all(n == "section" for n in names):
-            return "section"
+    names = [_name(a) for a in options if a not in (type(None), Ellipsis)]
+    if origin is tuple:
+        return f"list of {min(names)}" if Ellipsis in options else f"{len(options)} x {min(names)}"
+    if names:
         return " or ".join(dict.fromkeys(names))
     if isinstance(annotation, type) and issubclass(annotation, Part):
         return "section"
-    return {float: "number", int: "whole number", str: "text", bool: "true or false"}.get(annotation, "any value")
+    return WORDS.get(annotation, "any value")
 
 
 def _default(field: FieldInfo) -> str:
-    if field.default is PydanticUndefined:
-        return "required"
     value = field.default
+    if value is PydanticUndefined:
+        return "required"
     if value is None:
         return "none"
     if isinstance(value, Part):
@@ -94,10 +104,10 @@ def _default(field: FieldInfo) -> str:
 
 def main(folder: Path) -> None:
     """Rewrite the tables between the marks of every page in a folder."""
-    for page in PAGES:
-        text = (folder / page).read_text(encoding="utf-8")
-        head, rest = text.split(BEGIN)
-        (folder / page).write_text(head + BEGIN + key_tables(page) + END + rest.split(END)[1], encoding="utf-8")
+    made = {page: key_tables(page) for page in PAGES} | {LIMITS_PAGE: limit_tables()}
+    for page, tables in made.items():
+        head, rest = (folder / page).read_text(encoding="utf-8").split(BEGIN)
+        (folder / page).write_text(head + BEGIN + tables + END + rest.split(END)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":

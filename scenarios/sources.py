@@ -1,4 +1,4 @@
-"""The formats of recorded drives that come with the package, and how a path finds its reader."""
+"""From a path to its document, and from a specification to its recording: the formats of recorded drives and their readers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,15 @@ from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Source
+from alpasim_plugin.io.config import Document, load_yaml
+from alpasim_plugin.io.reading import parsing
 from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
+from scenarios.budget import check_record
 from scenarios.recorded import RecordedLog
+from scenarios.schema_parts import SHIPPED
+from scenarios.variation import Drawn
+
+DOING = "reading a scenario"
 
 
 class Argoverse(Source):
@@ -75,6 +82,27 @@ class Usdz(Source):
         return read_usdz(path)
 
 
+def open_document(path: Path, source: str | None) -> Document:
+    """Return the document of a scenario file, or the one that stands for a recorded log.
+
+    Args:
+        path: File or folder, which exists.
+        source: Who reads it, as `alpasim_plugin.plugins.parts.resolve` takes it; None finds out.
+
+    Raises:
+        InputError: Nothing recognises the path, the file is broken, or it is a suite.
+    """
+    kind = source or detect(path)
+    if kind != "yaml":
+        place = str(path.resolve())
+        log = {kind: place} if kind in SHIPPED else {"source": kind, "path": place}
+        return Document({"version": 1, "log": log}, {}, str(path))
+    document = load_yaml(path, DOING)
+    if isinstance(document.data, dict) and "scenarios" in document.data:
+        raise document.error(DOING, ("scenarios",), "a suite, not a scenario", "use load_suite, or run it with simrun")
+    return document
+
+
 def source_of(path: Path) -> str | None:
     """Return the name of the source that recognises a path; None where none does. Scenario files are recognised by none."""
     return next((name for name in names("source") if _source(name)[1].matches(path)), None)
@@ -94,27 +122,28 @@ def detect(path: Path) -> str:
     what = f"a folder with {', '.join(sorted(p.name for p in path.iterdir())[:5]) or 'nothing'}" if path.is_dir() else "a file"
     formats = ", ".join(_source(name)[1].help or name for name in names("source"))
     do = f"give a scenario .yaml, or one of: {formats}; a reader of your own is named with --source (docs/extending.md)"
-    raise InputError("reading a scenario", str(path), f"{what} that no reader recognises", do)
+    raise InputError(DOING, str(path), f"{what} that no reader recognises", do)
 
 
-def read_log(kind: str, path: Path, ego: int | str | None) -> RecordedLog:
-    """Read a recorded log.
-
-    Args:
-        kind: Its source as `alpasim_plugin.plugins.parts.resolve` takes it.
-        path: File or folder.
-        ego: Which recorded vehicle becomes the ego, where the format does not say it.
+def recorded_drive(drawn: Drawn) -> RecordedLog:
+    """Read the recorded log that a specification names, and check what the reader returns.
 
     Raises:
-        InputError: Anything wrong with the log, or a reader that gives something else than a `RecordedLog`.
+        InputError: Nothing is there, anything is wrong with the log, or the reader gives something else than a `RecordedLog`.
     """
+    document, log = drawn.document, drawn.spec.log
+    assert log is not None
+    kind, text, key = log.recorded
+    path = document.folder_of(("log", key)) / text if document.marks else Path(text)
+    if not path.exists():
+        raise document.error(DOING, ("log", key), f"{path} does not exist", "correct the path; it is relative to the scenario file")
     spec, source = _source(kind)
-    record = source.read(path, None if ego is None else str(ego))
-    if not isinstance(record, RecordedLog):
-        found = f"a {type(record).__name__}"
-        raise InputError(
-            "reading a scenario", f"source {spec.name!r}, {path}", found, "make the reader return a scenarios.recorded.RecordedLog"
-        )
+    with parsing(DOING, path, "repair this log, or use another one"):
+        record = source.read(path, None if log.ego is None else str(log.ego))
+        if not isinstance(record, RecordedLog):
+            found = f"a {type(record).__name__}"
+            raise InputError(DOING, f"source {spec.name!r}, {path}", found, "make the reader return a scenarios.recorded.RecordedLog")
+        check_record(record, str(path))
     return record
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 from collections.abc import Sequence
@@ -16,8 +15,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.config import Document, load_yaml, validate
 from alpasim_plugin.io.limits import LISTED, SEED, SEEDS
 from alpasim_plugin.io.reading import exists
-from scenarios.library import shipped_names, suites
-from scenarios.schema_base import Part, within
+from scenarios.library import shipped_names, suites, unknown
+from scenarios.schema_parts import Part, within
 from scenarios.sources import source_of
 
 DOING = "reading a suite"
@@ -112,12 +111,7 @@ def _locate(text: str, base: Path | None) -> Path:
     for key in (name, f"suites/{name}"):
         if key in names:
             return names[key]
-    near = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5) or [n for n in names if n.split("/")[-1] == name.split("/")[-1]]
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise InputError(
-        "finding a scenario", text, "no such file or folder, and no shipped scenario or suite has that name",
-        f"{hint}give a path, or a name that 'simrun list scenarios' shows",
-    )  # fmt: skip
+    raise unknown("finding a scenario", text, "scenario or suite", names)
 
 
 def _placed(document: Document, i: int, e: InputError) -> InputError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,9 +24,8 @@ from alpasim_plugin.world.scripted import (
 )  # fmt: skip
 from scenarios.ego_path import EgoPath, lane_chain
 from scenarios.expert import Drive, ExpertStyle, Follower, drive
-from scenarios.lookahead import ScriptedTrack
-from scenarios.schema import ScenarioSpec
-from scenarios.schema_actors import (
+from scenarios.schema import EgoSpec, ScenarioSpec
+from scenarios.schema_parts import (
     ActorSpec,
     CrossingActor,
     CutInActor,
@@ -35,12 +33,11 @@ from scenarios.schema_actors import (
     HardBrakeActor,
     IdmActor,
     LoggedActor,
+    NarrowGapSegment,
     OncomingActor,
     ParkedActor,
 )  # fmt: skip
-from scenarios.schema_road import NarrowGapSegment
-
-Fail = Callable[[tuple[str | int, ...], InputError], InputError]
+from scenarios.variation import Drawn
 
 SIZES = {
     "car": Box(4.6, 1.85, 1.55),
@@ -58,50 +55,45 @@ class Traffic:
     """All actors on the road except the ego."""
 
     scripted: list[Actor] = field(default_factory=list)
-    reactive: list[tuple[str, str, dict[str, float]]] = field(default_factory=list)  # id, label, behaviour parameters
-    followers: list[Follower] = field(default_factory=list)
+    reactive: list[tuple[IdmActor, dict[str, float]]] = field(default_factory=list)  # with the parameters of their behaviour
+    followers: list[Follower] = field(default_factory=list)  # in the same order
 
-    def scripts(self) -> list[ScriptedTrack]:
-        """Return the scripted tracks for the expert."""
-        return [ScriptedTrack(a.track, a.box) for a in self.scripted]
+    def drive(self, ego: EgoSpec, ego_path: EgoPath, vehicle: Vehicle, end_us: int) -> Drive:
+        """Let the expert drive among these actors."""
+        style = ExpertStyle(ego.speed_mps, ego.cruise_mps, ego.max_lateral_accel_mps2, ego.headway_s)
+        return drive(ego_path.path, ego.start_m, vehicle, style, self.scripted, self.followers, end_us)
 
     def actors(self, run: Drive) -> tuple[Actor, ...]:
         """Return all actors, with the tracks that the followers drove beside the expert."""
-        idm = [
-            Actor(actor_id, label, follower.box, track, behaviour=Behaviour("idm", params))
-            for (actor_id, label, params), follower, track in zip(self.reactive, self.followers, run.followers, strict=True)
-        ]
-        return (*self.scripted, *idm)
+        out = list(self.scripted)
+        for (actor, params), track in zip(self.reactive, run.followers, strict=True):
+            out.append(Actor(actor.id, actor.label, box_of(actor), track, behaviour=Behaviour("idm", params)))
+        return tuple(out)
 
 
-def place_actors(spec: ScenarioSpec, road: Road, ego_path: EgoPath, vehicle: Vehicle, end_us: int, fail: Fail) -> Traffic:
+def place_actors(drawn: Drawn, road: Road, ego_path: EgoPath, vehicle: Vehicle, end_us: int) -> Traffic:
     """Place every actor; those who are timed against the ego come last, after a drive without them.
 
     Raises:
         InputError: An actor outside its lane or in a lane that does not exist, with the position of its key.
     """
-    traffic, t_us = Traffic(), grid(0, end_us)
+    spec, traffic, t_us = drawn.spec, Traffic(), grid(0, end_us)
     placer = _Placer(spec, road, ego_path, vehicle, t_us)
     traffic.scripted += _gap_cars(placer)
     late: list[tuple[int, CrossingActor]] = []
     for i, actor in enumerate(spec.actors):
-        try:
+        with drawn.at("actors", i):
             if isinstance(actor, CrossingActor):
                 late.append((i, actor))
             elif isinstance(actor, IdmActor):
                 _add_follower(placer, traffic, actor)
             else:
                 traffic.scripted += _scripted(placer, actor)
-        except InputError as e:
-            raise fail(("actors", i), e) from e
     if late:
-        style = ExpertStyle(spec.ego.speed_mps, spec.ego.cruise_mps, spec.ego.max_lateral_accel_mps2, spec.ego.headway_s)
-        run = drive(ego_path.path, spec.ego.start_m, vehicle, style, traffic.scripts(), traffic.followers, end_us)
+        run = traffic.drive(spec.ego, ego_path, vehicle, end_us)
         for i, crossing in late:
-            try:
+            with drawn.at("actors", i):
                 traffic.scripted.append(_crossing(placer, crossing, run.ego_log))
-            except InputError as e:
-                raise fail(("actors", i), e) from e
     return traffic
 
 
@@ -203,8 +195,7 @@ def _stand(placer: _Placer, name: str, label: str, box: Box, at: float, side: st
 
 def outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tuple[Path, float, bool]:
     """Return the ego's line, the signed distance from it to the outer lane's outer edge, and whether that lane is an oncoming one."""
-    i = int(np.clip(np.searchsorted(ego_path.stretch_s, at_s_m, side="right") - 1, 0, len(road.stretches) - 1))
-    stretch = road.stretches[i]
+    stretch = road.stretches[ego_path.stretch_at(at_s_m)]
     xyz, yaw = ego_path.path.at(at_s_m)
     oncoming = [b for b in stretch.backward if b is not None]
     forward = [f for f in stretch.forward if f is not None]
@@ -212,10 +203,11 @@ def outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tuple
     turned = side == "left" and bool(oncoming)
     edge = lane.right if side == "right" or turned else lane.left
     assert edge is not None
-    normal = np.array([-np.sin(float(yaw)), np.cos(float(yaw))])
+    c, s = np.cos(float(yaw)), np.sin(float(yaw))
+    along, normal = np.array([c, s]), np.array([-s, c])
     rest = edge[:, :2] - xyz[:2]
     # The edge's vertex most nearly abreast; edges are sampled every metre and nearly parallel to the line.
-    k = int(np.argmin(np.abs(rest @ np.array([np.cos(float(yaw)), np.sin(float(yaw))])) + 0.1 * np.abs(rest @ normal)))
+    k = int(np.argmin(np.abs(rest @ along) + 0.1 * np.abs(rest @ normal)))
     return ego_path.path, float(rest[k] @ normal), turned
 
 
@@ -240,12 +232,9 @@ def _gap_cars(placer: _Placer) -> list[Actor]:
 
 def _add_follower(placer: _Placer, traffic: Traffic, actor: IdmActor) -> None:
     path, s0 = placer.place(actor.lane, actor.s_m, actor.id)
-    desired = actor.desired_speed_mps if actor.desired_speed_mps is not None else max(actor.speed_mps, 1.0)
-    params = {
-        "desired_speed_mps": desired, "headway_s": actor.headway_s, "min_gap_m": actor.min_gap_m, "accel_mps2": actor.accel_mps2,
-        "brake_mps2": actor.brake_mps2,
-    }  # fmt: skip
-    traffic.reactive.append((actor.id, actor.label, params))
+    desired = max(actor.speed_mps, 1.0) if actor.desired_speed_mps is None else actor.desired_speed_mps
+    params = {"desired_speed_mps": desired, **actor.model_dump(include={"headway_s", "min_gap_m", "accel_mps2", "brake_mps2"})}
+    traffic.reactive.append((actor, params))
     traffic.followers.append(Follower(path, s0, actor.speed_mps, box_of(actor), IdmParams.from_mapping(params), actor.offset_m))
 
 
@@ -256,10 +245,9 @@ def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Act
     front_m = placer.vehicle.rear_axle_to_centre_m + placer.vehicle.box.length_m / 2
     s_log, _ = placer.ego_path.path.project(ego_log.xyz[:, :2])
     if not s_log[0] + front_m < at < s_log[-1] + front_m:
-        raise InputError(
-            "timing a crossing", actor.id, f"the ego's front drives from {s_log[0] + front_m - placer.spec.ego.start_m:.0f} to "
-            f"{s_log[-1] + front_m - placer.spec.ego.start_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}", "choose s_m inside",
-        )  # fmt: skip
+        first_m, last_m = (s + front_m - placer.spec.ego.start_m for s in (s_log[0], s_log[-1]))
+        found = f"the ego's front drives from {first_m:.0f} to {last_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}"
+        raise InputError("timing a crossing", actor.id, found, "choose s_m inside")
     arrival_us = float(np.interp(at - front_m, s_log, ego_log.t_us.astype(np.float64)))
     right, left = (_road_edge(placer.road, placer.ego_path.path, at, side) for side in ("right", "left"))
     ends = {"right": right - actor.margin_m, "left": left + actor.margin_m}

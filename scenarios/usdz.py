@@ -16,17 +16,16 @@ import numpy as np
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.types import F64, Actor, Box, LaneMap, Scene, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
-from scenarios.clipgt import clipgt_map, without_rails
 from scenarios.cosmos_camera import FRONT_WIDE
-from scenarios.opendrive import lane_map_of
+from scenarios.map_lines import lane_edges
+from scenarios.opendrive import T_local_map, lane_map_of
 from scenarios.opendrive_alpasim import alpasim_map
-from scenarios.opendrive_place import T_local_map
 from scenarios.opendrive_road import parse_map
 from scenarios.reading import SourceFiles
-from scenarios.recorded import RecordedLog
-from scenarios.tracks import checked_trajectory
+from scenarios.recorded import RecordedLog, checked_trajectory
 from scenarios.usdz_archive import Archive
 from scenarios.usdz_camera import front_wide
+from scenarios.usdz_tables import clipgt_map, without_rails
 
 DOING = "reading an AlpaSim scene"
 RECONSTRUCTIONS = ("checkpoint.ckpt", "nerf.ingp", "volume.nurec")
@@ -71,8 +70,8 @@ def read_usdz(path: str | Path, rails: bool = True, needs_map: bool = True) -> R
         cameras, camera_notes = front_wide(archive)
         vehicle, vehicle_notes = rig.vehicle()
         inside = [f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive]
-    surface = [e for lane in road.lane_map.lanes.values() for e in (lane.left, lane.right) if e is not None]
-    ground = from_points(np.concatenate([*surface, *road.lane_map.road_edges, rig.ego_log.xyz]), GROUND_CELL_M, rig.ego_log.xyz)
+    surface = [*lane_edges(road.lane_map.lanes), *road.lane_map.road_edges, rig.ego_log.xyz]
+    ground = from_points(np.concatenate(surface), GROUND_CELL_M, rig.ego_log.xyz)
     notes = (
         f"{inside[0]} is a checkpoint of a closed renderer and is not read; the map is dressed instead" if inside
         else "no reconstruction in this scene; the map is dressed instead",
@@ -148,12 +147,12 @@ class _Rig:
         times = self._array(self._rig, "T_rig_world_timestamps_us", (-1,))
         t_us = times.astype(np.int64)
         if (t_us != times).any():
-            raise self.files.fail(self.where, "times that are no whole microseconds", "give integers")
+            raise self.files.fail(self.where, "times that are not whole microseconds", "give integers")
         if len(poses) != len(t_us):
             raise self.files.fail(self.where, f"{len(poses)} poses and {len(t_us)} times", "give one time for each pose")
         turned = np.abs(np.linalg.det(poses[:, :3, :3]) - 1.0) if len(poses) else np.zeros(0)
         if len(poses) and not float(turned.max()) < 1e-3:
-            raise self.files.fail(self.where, f"pose {int(np.argmax(turned))} is no rigid motion", "give rotation matrices")
+            raise self.files.fail(self.where, f"pose {int(np.argmax(turned))} is not a rigid motion", "give rotation matrices")
         self.ego_log: Trajectory = checked_trajectory(
             self.files, self.where, t_us, poses[:, :3, 3].copy(), quat_from_matrix(poses[:, :3, :3]), least=2
         )
@@ -166,7 +165,7 @@ class _Rig:
         """Return when the first frame of the front wide camera ends, of all cameras where it has none; None without frames.
 
         Raises:
-            InputError: A frame's times are no pair of integers.
+            InputError: A frame's times are not a pair of integers.
         """
         frames = self._rig.get("cameras_frame_timestamps_us") or {}
         calibrated = self._document.get("camera_calibrations") or {}

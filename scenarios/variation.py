@@ -6,37 +6,110 @@ Every drawn number has its own stream, keyed by scene, seed and the number's key
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.io.config import Document, apply_overrides, dotted
+from alpasim_plugin.io.config import Document, apply_overrides, dotted, validate
 from scenarios.schema import JitterSpec, RangeSpec, ScenarioSpec
-from scenarios.schema_base import Part
+from scenarios.schema_parts import Part
 
 _LENGTHS, _SPEEDS = ("length_m",), ("speed_mps", "cruise_mps", "desired_speed_mps", "end_speed_mps")
 _CURVATURES = ("curvature_per_m", "start_curvature_per_m", "end_curvature_per_m")
 _TIMES = ("at_us", "brake_at_us", "resume_at_us")
 
 
-def draw(document: Document, spec: ScenarioSpec, scene_id: str, seed: int, fixed: tuple[str, ...] = ()) -> Document:
-    """Return the document with the variations and the sample of this seed written into it.
+DOING = "reading a scenario"
+AS_WRITTEN = 0  # the scene seed that jitters nothing
 
-    Keys that the user fixed by an override keep their value.
+
+@dataclass(frozen=True)
+class Drawn:
+    """A scenario file as a scene seed makes it."""
+
+    document: Document  # with overrides, variations and sample written into it, for the positions of keys
+    spec: ScenarioSpec
+    scene_id: str
+    reseeded: bool  # the seed is another one than the file's
+    varied: dict[str, tuple[Any, Any]]  # see `differences`
+
+    @contextmanager
+    def at(self, *loc: str | int) -> Iterator[None]:
+        """Put the position of a key path in front of what an error of the block names."""
+        try:
+            yield
+        except InputError as e:
+            raise InputError(e.doing, f"{self.document.mark(loc)} ({e.with_what})", e.found, e.do_this) from e
+
+
+def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Drawn:
+    """Validate a document and draw its variations, its sample and its jitter.
+
+    Args:
+        document: Scenario file, or what stands for a recorded log.
+        seed: Scene seed; None takes the file's.
+        overrides: ``key=value`` with dotted keys; what they fix is neither varied nor jittered.
+
+    Raises:
+        InputError: A key or value that the schema refuses, or a name that stands twice, with its position.
     """
+    document = apply_overrides(document, overrides, DOING)
+    own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
+    if seed is not None:
+        document = apply_overrides(document, [f"seed={int(seed)}"], DOING)
+    written = validate(ScenarioSpec, document, DOING)
+    scene_id = written.scene_id or _default_id(Path(document.path))
+    fixed = tuple(text.partition("=")[0].strip() for text in overrides)
+    document = _varied(document, written, scene_id, fixed)
+    spec = validate(ScenarioSpec, document, DOING)
+    _check_names(document, spec)
+    if spec.seed != AS_WRITTEN:
+        spec = _jitter(spec, scene_id, fixed)
+    return Drawn(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
+
+
+def _default_id(path: Path) -> str:
+    resolved = path.resolve()
+    if path.suffix in (".yaml", ".yml"):
+        return f"{resolved.parent.name}-{resolved.stem}"
+    return resolved.stem if resolved.is_file() else resolved.name
+
+
+def _check_names(document: Document, spec: ScenarioSpec) -> None:
+    seen: dict[str, int] = {}
+    for i, actor in enumerate(spec.actors):
+        if actor.id in seen:
+            first = document.mark(("actors", seen[actor.id], "id"))
+            raise document.error(DOING, ("actors", i, "id"), f"duplicate actor id {actor.id!r}, first at {first}", "give it another id")
+        seen[actor.id] = i
+    names = [camera.name for camera in spec.cameras or ()]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise document.error(DOING, ("cameras", i, "name"), f"duplicate camera name {name!r}", "give it another name")
+    if spec.log is not None and spec.actors:
+        raise document.error(DOING, ("actors",), "actors beside a recorded log", "remove actors; log.actors chooses the recorded traffic")
+
+
+def _varied(document: Document, spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> Document:
+    """Return the document with the variations and the sample of this seed written into it, except for keys that an override fixes."""
     chosen: dict[str, Any] = {}
     for key, rule in spec.variations.items():
-        rng = stream(scene_id, seed, f"scenario/variation/{key}")
+        rng = stream(scene_id, spec.seed, f"scenario/variation/{key}")
         if isinstance(rule, RangeSpec):
             chosen[key] = float(rng.uniform(rule.low, rule.high))
         else:
             chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
     if spec.samples:
-        chosen |= spec.samples[seed % len(spec.samples)]
+        chosen |= spec.samples[spec.seed % len(spec.samples)]
     kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
     return apply_overrides(document, kept, "drawing a variation", origin="variation")
 
 
-def jitter(spec: ScenarioSpec, scene_id: str, seed: int, fixed: tuple[str, ...] = ()) -> ScenarioSpec:
+def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:
     """Return the specification with road, ego and actors changed within the declared ranges."""
     ids = {str(i): actor.id for i, actor in enumerate(spec.actors)}
     touched = {_by_id(k, ids) for k in (*fixed, *spec.variations, *(k for sample in spec.samples for k in sample))}
@@ -53,7 +126,7 @@ def jitter(spec: ScenarioSpec, scene_id: str, seed: int, fixed: tuple[str, ...] 
             return part if all(a is b for a, b in zip(new, part, strict=True)) else new
         if isinstance(part, bool) or not isinstance(part, int | float) or ".".join(map(str, loc)) in touched:
             return part
-        return _shake(part, loc, name, spec.jitter, scene_id, seed)
+        return _shake(part, loc, name, spec.jitter, scene_id, spec.seed)
 
     update = {"road": walk(spec.road, ("road",), "road"), "ego": walk(spec.ego, ("ego",), "ego")}
     update["actors"] = walk(spec.actors, ("actors",), "actors")

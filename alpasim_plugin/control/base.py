@@ -1,4 +1,7 @@
-"""What every controller shares: the checks on a plan, and the move from a world pose to the plane and back."""
+"""What every controller shares, and the controller without a vehicle.
+
+Shared are the checks on a plan, and the move from a world pose to the plane and back.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,8 @@ import numpy as np
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.geometry import se2, yaw_of
-from alpasim_plugin.core.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.geometry import interpolate, se2, wrap_angle, yaw_of
+from alpasim_plugin.core.types import Controller, EgoState, Trajectory, Vehicle
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 
@@ -17,30 +20,25 @@ def check_plan(plan: Trajectory) -> None:
     found = ""
     if len(plan) == 0 or plan.xyz.shape != (len(plan), 3) or plan.quat.shape != (len(plan), 4):
         found = f"shapes t {plan.t_us.shape}, xyz {plan.xyz.shape}, quat {plan.quat.shape}"
-    elif not np.isfinite(plan.xyz).all():
-        row = int(np.flatnonzero(~np.isfinite(plan.xyz).all(axis=1))[0])
+    elif (bad := ~np.isfinite(plan.xyz).all(axis=1)).any():
+        row = int(np.argmax(bad))
         found = f"position {plan.xyz[row].tolist()} in row {row}"
-    elif not np.isfinite(plan.quat).all():
-        row = int(np.flatnonzero(~np.isfinite(plan.quat).all(axis=1))[0])
+    elif (bad := ~np.isfinite(plan.quat).all(axis=1)).any():
+        row = int(np.argmax(bad))
         found = f"rotation {plan.quat[row].tolist()} in row {row}"
-    elif (np.diff(plan.t_us) <= 0).any():
-        row = int(np.flatnonzero(np.diff(plan.t_us) <= 0)[0])
+    elif (bad := np.diff(plan.t_us) <= 0).any():
+        row = int(np.argmax(bad))
         found = f"times {int(plan.t_us[row])} and then {int(plan.t_us[row + 1])} us in rows {row} and {row + 1}"
     if found:
-        raise PolicyError(
-            "following a plan",
-            f"a plan of {len(plan)} poses",
-            found,
-            "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults",
-        )
+        do_this = "make the policy return at least one finite pose and strictly increasing times; `check_policy` finds such faults"
+        raise PolicyError("following a plan", f"a plan of {len(plan)} poses", found, do_this)
 
 
 def check_interval(state: EgoState, to_us: int) -> float:
     """Return the seconds from the state to ``to_us``; raise InputError unless they are positive."""
     if to_us <= state.t_us:
-        raise InputError(
-            "advancing the ego", f"a state at {state.t_us} us", f"the target time {to_us} us is not later", "ask for a later time"
-        )
+        found = f"the target time {to_us} us is not later"
+        raise InputError("advancing the ego", f"a state at {state.t_us} us", found, "ask for a later time")
     return (to_us - state.t_us) * 1e-6
 
 
@@ -52,14 +50,9 @@ def planar(state: EgoState) -> BicycleState:
 
 def spatial(now: BicycleState, t_us: int, z_m: float, accel_mps2: float, vehicle: Vehicle) -> EgoState:
     """Return the ego state of a planar state: level, at height ``z_m``."""
-    return EgoState(
-        t_us=t_us,
-        T_world_rig=se2(now.x_m, now.y_m, now.yaw_rad, z_m),
-        speed_mps=now.speed_mps,
-        accel_mps2=accel_mps2,
-        yaw_rate_radps=now.speed_mps * float(np.tan(now.steer_rad)) / vehicle.wheelbase_m,
-        steer_rad=now.steer_rad,
-    )
+    pose = se2(now.x_m, now.y_m, now.yaw_rad, z_m)
+    yaw_rate = now.speed_mps * float(np.tan(now.steer_rad)) / vehicle.wheelbase_m
+    return EgoState(t_us, pose, now.speed_mps, accel_mps2, yaw_rate, now.steer_rad)
 
 
 def coast_to_stop(state: EgoState, to_us: int, vehicle: Vehicle) -> EgoState:
@@ -69,3 +62,27 @@ def coast_to_stop(state: EgoState, to_us: int, vehicle: Vehicle) -> EgoState:
     after = step(before, Command(before.steer_rad, 0.0, GENTLE_BRAKE_MPS2), dt_s, vehicle)
     accel = 0.0 if after.speed_mps == 0 else (after.speed_mps - before.speed_mps) / dt_s
     return spatial(after, to_us, float(state.T_world_rig[2, 3]), accel, vehicle)
+
+
+class PerfectController(Controller):
+    """Put the ego on the plan's interpolated pose at the given time; before the first and after the last pose, hold that pose."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+
+    def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
+        """Return the state at ``to_us``; see `Controller.advance`. Speed and yaw rate are differences over the step."""
+        if plan is None:
+            return coast_to_stop(state, to_us, self.vehicle)
+        dt_s = check_interval(state, to_us)
+        check_plan(plan)
+        at_us = min(max(to_us, int(plan.t_us[0])), int(plan.t_us[-1]))
+        pose = interpolate(plan, at_us)
+        moved = pose[:2, 3] - state.T_world_rig[:2, 3]
+        turn = float(wrap_angle(yaw_of(pose) - yaw_of(state.T_world_rig)))
+        # The chord of the step points along its mean heading.
+        mean_yaw = yaw_of(state.T_world_rig) + turn / 2
+        speed = float(moved @ np.array([np.cos(mean_yaw), np.sin(mean_yaw)])) / dt_s
+        yaw_rate = turn / dt_s
+        steer = float(np.arctan(self.vehicle.wheelbase_m * yaw_rate / speed)) if abs(speed) > 0.5 else state.steer_rad
+        return EgoState(to_us, pose, speed, (speed - state.speed_mps) / dt_s, yaw_rate, steer)

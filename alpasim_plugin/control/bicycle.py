@@ -12,7 +12,7 @@ tracker keeps its commands where that is fair (`tracker.MAX_LATERAL_MPS2`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Vehicle
@@ -65,18 +65,14 @@ def step(state: BicycleState, command: Command, dt_s: float, vehicle: Vehicle, m
         >>> round(s.x_m, 9)
         10.0
     """
-    values = (state.x_m, state.y_m, state.yaw_rad, state.speed_mps, state.steer_rad, *_as_tuple(command), dt_s)
+    values = (*vars(state).values(), *vars(command).values(), dt_s)
     if not all(map(math.isfinite, values)) or dt_s < 0:
-        raise InputError(
-            "advancing the vehicle",
-            f"{state} under {command}",
-            f"a value that is not finite, or dt_s = {dt_s} < 0",
-            "give finite values and dt_s >= 0",
-        )
+        found = f"a value that is not finite, or dt_s = {dt_s} < 0"
+        raise InputError("advancing the vehicle", f"{state} under {command}", found, "give finite values and dt_s >= 0")
     n = max(1, math.ceil(dt_s / max_substep_s - 1e-9))
     h = dt_s / n
     target = _clip(command.steer_rad, vehicle.max_steer_rad)
-    drive = min(max(command.drive_mps2, -vehicle.max_accel_mps2), vehicle.max_accel_mps2)
+    drive = _clip(command.drive_mps2, vehicle.max_accel_mps2)
     brake = min(max(command.brake_mps2, 0.0), vehicle.max_brake_mps2)
     for _ in range(n):
         # A constant rate over the sub-step keeps the right-hand side smooth inside it, which order 4 needs.
@@ -92,8 +88,7 @@ def _substep(state: BicycleState, steer_rate: float, drive: float, brake: float,
     if state.speed_mps * accel < 0:
         stop_s = -state.speed_mps / accel
         if stop_s < h:
-            at_stop = _rk4(state, steer_rate, accel, stop_s, wheelbase)
-            at_stop = BicycleState(at_stop.x_m, at_stop.y_m, at_stop.yaw_rad, 0.0, at_stop.steer_rad)
+            at_stop = replace(_rk4(state, steer_rate, accel, stop_s, wheelbase), speed_mps=0.0)
             return _rk4(at_stop, steer_rate, _accel(0.0, drive, brake), h - stop_s, wheelbase)
     return _rk4(state, steer_rate, accel, h, wheelbase)
 
@@ -118,10 +113,6 @@ def _rk4(s: BicycleState, steer_rate: float, accel: float, h: float, wheelbase: 
     x = s.x_m + h / 6 * (v0 * cos(s.yaw_rad) + 2 * v1 * (cos(yaw_a) + cos(yaw_b)) + v2 * cos(yaw_c))
     y = s.y_m + h / 6 * (v0 * sin(s.yaw_rad) + 2 * v1 * (sin(yaw_a) + sin(yaw_b)) + v2 * sin(yaw_c))
     return BicycleState(x, y, s.yaw_rad + h / 6 * (w0 + 4 * w1 + w2), v2, s.steer_rad + h * steer_rate)
-
-
-def _as_tuple(command: Command) -> tuple[float, float, float]:
-    return command.steer_rad, command.drive_mps2, command.brake_mps2
 
 
 def _clip(value: float, limit: float) -> float:

@@ -16,8 +16,7 @@ from urllib.parse import parse_qs
 import can
 import numpy as np
 
-from alpasim_plugin.control.can_codec import BadFrame, Codec
-from alpasim_plugin.control.can_map import Received
+from alpasim_plugin.control.can_codec import BadFrame, Codec, Received
 from alpasim_plugin.core.errors import InputError, PolicyError
 
 DOING = "opening a CAN bus"

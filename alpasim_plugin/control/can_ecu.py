@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 import can
 
 from alpasim_plugin.control.can_bus import Address, open_bus
-from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, open_codec
-from alpasim_plugin.control.can_map import load_map
+from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, load_map, open_codec
 
 LOOKAHEAD_S, LEAST_LOOKAHEAD_M = 0.7, 5.0
 WHEELBASE_M = 2.85
@@ -66,7 +65,7 @@ class LaneKeeper:
 
 
 def serve(bus: can.BusABC, unit: LaneKeeper, stop: threading.Event) -> None:
-    """Answer the bus until told to stop."""
+    """Answer the bus until `stop` is set."""
     while not stop.is_set():
         frame = bus.recv(0.05)
         for frame_id, data in unit.answer(frame) if frame is not None else ():

@@ -13,8 +13,7 @@ import numpy as np
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.control.can_bus import Address, Commands, Exchange, open_bus
-from alpasim_plugin.control.can_codec import open_codec
-from alpasim_plugin.control.can_map import load_map
+from alpasim_plugin.control.can_codec import load_map, open_codec
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import transform_points, yaw_of
 from alpasim_plugin.core.types import F64, EgoState, Observation, Plan, Policy, Route, Scenario, SensorSpec, Vehicle

@@ -19,8 +19,7 @@ import can
 import numpy as np
 
 from alpasim_plugin.control.can_bus import Address, open_bus
-from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, open_codec
-from alpasim_plugin.control.can_map import load_map
+from alpasim_plugin.control.can_codec import BadFrame, Codec, checked_values, load_map, open_codec
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.reading import check_regular, parsing
 
@@ -50,7 +49,7 @@ def read_recording(folder: Path, bus: int = 0) -> Recording:
     """Read ``processed_log/CAN/raw_can`` of a comma2k19 segment.
 
     Raises:
-        InputError: A file is missing or no array of its kind, or the bus has no frame.
+        InputError: A file is missing or not an array of its kind, or the bus has no frame.
     """
     arrays = {}
     for name, kind in (("t", "f"), ("src", "iu"), ("address", "iu"), ("data", "S")):

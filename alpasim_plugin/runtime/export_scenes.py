@@ -14,7 +14,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.io.config import load_yaml
-from scenarios.load import find, load_scenario
+from scenarios.library import find
+from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 from scenarios.usdz_write import rig_box, write_usdz
 

@@ -14,12 +14,23 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, se2, se3, slerp, wrap_angle, yaw_of
 from alpasim_plugin.core.types import F64, I64, Actor, Bool, EgoState, HeightField, LaneMap, Scenario, Vehicle
-from alpasim_plugin.world.curves import smoothstep
 from alpasim_plugin.world.ground import ground_pose
-from alpasim_plugin.world.idm import Bodies, IdmParams, Spans, find_leader, idm_acceleration, nearest_ahead, spans, wanted_gap_m
-from alpasim_plugin.world.lane_map import LaneIndex
-from alpasim_plugin.world.path import Path, polyline_path
-from alpasim_plugin.world.state import bodies_from, concatenate
+from alpasim_plugin.world.idm import (
+    NO_BODIES,
+    Bodies,
+    IdmParams,
+    Spans,
+    bodies_from,
+    concatenate,
+    find_leader,
+    idm_acceleration,
+    moved_on,
+    nearest_ahead,
+    spans,
+    wanted_gap_m,
+)
+from alpasim_plugin.world.path import Path, polyline_path, smoothstep
+from alpasim_plugin.world.route import LaneIndex
 
 MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
 MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows it to its end
@@ -147,7 +158,6 @@ class _Replay:
 
     def __init__(self, actors: Sequence[Actor]) -> None:
         self.actors = list(actors)
-        self.boxes = [a.box for a in actors]
         self.first = np.array([int(a.track.t_us[0]) for a in actors], dtype=np.int64)
         self.last = np.array([int(a.track.t_us[-1]) for a in actors], dtype=np.int64)
         counts = np.array([len(a.track) for a in actors], dtype=np.int64)
@@ -184,15 +194,14 @@ class _Replay:
     def bodies(self, poses: Mapping[str, F64]) -> Bodies:
         """Return the moving bodies present, with the velocity of the track's current piece."""
         rows = [k for k, a in enumerate(self.actors) if not a.is_static and a.actor_id in poses]
-        T = np.array([poses[self.actors[k].actor_id] for k in rows]).reshape(-1, 4, 4)
+        if not rows:
+            return NO_BODIES
+        T = np.array([poses[self.actors[k].actor_id] for k in rows])
         i = self.cursor[rows]
         j = np.minimum(i + 1, self.end[rows])
-        if rows:
-            dt_s = np.maximum(self.t[j] - self.t[i], 1).astype(np.float64) * 1e-6
-            velocity = (self.xyz[j, :2] - self.xyz[i, :2]) / dt_s[:, None]
-        else:
-            velocity = np.zeros((0, 2))
-        return bodies_from(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]), [self.boxes[k] for k in rows], velocity)
+        dt_s = np.maximum(self.t[j] - self.t[i], 1).astype(np.float64) * 1e-6
+        velocity = (self.xyz[j, :2] - self.xyz[i, :2]) / dt_s[:, None]
+        return bodies_from(T[:, :2, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0]), [self.actors[k].box for k in rows], velocity)
 
 
 class _Standing:
@@ -255,37 +264,35 @@ class _Driver:
         speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
         self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
 
+    def _driving(self) -> tuple[Path, _Motion]:
+        """Return line and state of a driver that has taken over from its track."""
+        assert self.path is not None
+        assert self.motion is not None
+        return self.path, self.motion
+
     def bodies(self) -> Bodies:
-        m = self.motion
-        if m is None or self.path is None:
-            return bodies_from(np.zeros((0, 2)), np.zeros(0), [], np.zeros((0, 2)))
-        xyz, yaw = self.path.at(m.s_m, m.offset_m)
+        path, m = self._driving()
+        xyz, yaw = path.at(m.s_m, m.offset_m)
         direction = np.array([np.cos(float(yaw)), np.sin(float(yaw))])
         return bodies_from(xyz[:2], yaw, [self.actor.box], m.speed_mps * direction)
 
     def decide(self, everybody: Bodies, own_row: int, standing: _Standing, present: Bool) -> None:
         """Choose the acceleration for the next step."""
-        m = self.motion
-        if m is None or self.path is None:
-            return
+        path, m = self._driving()
         if not self.knows_standing:
-            self.standing, self.knows_standing = standing.on(self.path), True
+            self.standing, self.knows_standing = standing.on(path), True
         front, half = m.s_m + self.actor.box.length_m / 2, self.actor.box.width_m / 2
         # Twice the wanted gap behind a standing leader: beyond it the interaction is below a quarter of the own acceleration.
         horizon_m = 20.0 + 2.0 * wanted_gap_m(m.speed_mps, m.speed_mps, self.params)
-        leaders = [find_leader(self.path, front, half, everybody, horizon_m, own_row=own_row)]
+        leaders = [find_leader(path, front, half, everybody, horizon_m, own_row=own_row)]
         if self.standing is not None:
             leaders.append(nearest_ahead(self.standing.only(present[self.standing.index]), front, half, horizon_m))
         m.accel_mps2 = min(idm_acceleration(m.speed_mps, o.gap_m, m.speed_mps - o.speed_mps, self.params) for o in leaders)
 
     def advance(self, dt_s: float) -> None:
-        m = self.motion
-        if m is None or self.path is None:
-            return
-        a = max(m.accel_mps2, -m.speed_mps / dt_s)  # a car that brakes stops, it does not reverse
-        m.s_m += m.speed_mps * dt_s + 0.5 * a * dt_s * dt_s
-        m.speed_mps = max(0.0, m.speed_mps + a * dt_s)
-        if m.s_m > self.path.length_m:
+        path, m = self._driving()
+        m.s_m, m.speed_mps = moved_on(m.s_m, m.speed_mps, m.accel_mps2, dt_s)
+        if m.s_m > path.length_m:
             self.present, self.motion = False, None
 
     def pose(self, t_us: int, closed_us: int, motion: _Motion | None) -> F64 | None:
@@ -320,10 +327,10 @@ def _driving_line(actor: Actor, index: LaneIndex | None) -> Path | None:
 
 def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
     """Return the way on from the end of a track: the lane there that runs the same way, and what follows it."""
-    candidates = [i for i in index.containing(end[:2]) if abs(float(wrap_angle(index.heading_rad(i, end) - heading))) < MAX_TURN_RAD]
-    if not candidates:
+    turns = {lane: abs(float(wrap_angle(index.heading_rad(lane, end) - heading))) for lane in index.containing(end[:2])}
+    lane = min(turns, key=lambda one: turns[one], default=None)
+    if lane is None or turns[lane] >= MAX_TURN_RAD:
         return None
-    lane = min(candidates, key=lambda i: abs(float(wrap_angle(index.heading_rad(i, end) - heading))))
     xyz = index.path_ahead(lane, EXTENSION_M, start=end).xyz
     if len(xyz) < 2:
         return None

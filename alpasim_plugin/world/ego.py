@@ -1,4 +1,4 @@
-"""The ego as its recording has it: states read off a log of poses."""
+"""Motion read off recorded poses: the ego's states, and the speeds of a track."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.geometry import interpolate, wrap_angle
-from alpasim_plugin.core.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
 DIFFERENCE_US = 100_000  # half window of the differences: long enough to bridge the noise of 200 Hz poses
 
@@ -44,6 +44,15 @@ def ego_states_from_log(ego_log: Trajectory, t_us: npt.ArrayLike, vehicle: Vehic
     return [EgoState(*row) for row in zip(*columns, strict=True)]
 
 
-def _along(move: npt.NDArray[np.float64], forward: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _along(move: F64, forward: F64) -> F64:
     """Return the component ``(N,)`` of moves ``(N, 3)`` along unit vectors ``(N, 3)``."""
     return np.asarray(np.sum(move * forward, axis=-1))
+
+
+def speeds(track: Trajectory) -> F64:
+    """Return the speed in the plane ``(T,)`` at every pose of a track, by central differences; one pose: 0."""
+    if len(track) < 2:
+        return np.zeros(len(track))
+    t_s = (track.t_us - track.t_us[0]).astype(np.float64) * 1e-6
+    v = np.gradient(track.xyz[:, :2], t_s, axis=0)
+    return np.asarray(np.hypot(v[:, 0], v[:, 1]))

@@ -1,4 +1,4 @@
-"""A drivable line with arc length, heading and curvature, and fast projection onto it."""
+"""Curves of roads (clothoids, Hermite turns), and drivable lines with arc length, heading, curvature and fast projection onto them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,144 @@ import scipy
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, I64
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+def smoothstep(x: npt.ArrayLike) -> F64:
+    """Return the quintic blend 0..1 whose first and second derivatives vanish at both ends; clamped outside [0, 1]."""
+    t = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
+    return np.asarray(t * t * t * (10.0 + t * (6.0 * t - 15.0)))
+
+
+def sample_clothoid(
+    start: tuple[float, float, float], length_m: float, start_curvature_per_m: float, end_curvature_per_m: float, step_m: float = 1.0
+) -> F64:
+    """Sample a curve whose curvature is linear in arc length (straight and arc are its special cases).
+
+    The heading is exact; positions integrate ``(cos, sin)`` of it with 8-point Gauss-Legendre quadrature between stations, which at
+    steps of 1 m is exact to rounding for any drivable curvature (compared with Fresnel integrals in the tests).
+
+    Args:
+        start: x, y in metres and heading in radians.
+        length_m: Arc length, > 0.
+        start_curvature_per_m: Curvature at the start, left positive.
+        end_curvature_per_m: Curvature at the end.
+        step_m: Largest distance between stations.
+
+    Returns:
+        ``(N, 4)``: x, y, heading (not wrapped), curvature; the first row is ``start``.
+
+    Raises:
+        InputError: A length or step that is not positive.
+    """
+    if not (length_m > 0 and step_m > 0):
+        raise InputError("sampling a clothoid", f"length {length_m} m, step {step_m} m", "not positive", "give lengths > 0")
+    n = max(1, int(np.ceil(length_m / step_m - 1e-9)))
+    s = np.linspace(0.0, length_m, n + 1)
+    rate = (end_curvature_per_m - start_curvature_per_m) / length_m
+    x0, y0, yaw0 = start
+
+    def heading(at: F64) -> F64:
+        return np.asarray(yaw0 + at * (start_curvature_per_m + 0.5 * rate * at))
+
+    half = 0.5 * np.diff(s)[:, None]
+    yaw_at_nodes = heading(0.5 * (s[1:] + s[:-1])[:, None] + half * _NODES)  # (N - 1, 8)
+    dx = np.sum(half * _WEIGHTS * np.cos(yaw_at_nodes), axis=1)
+    dy = np.sum(half * _WEIGHTS * np.sin(yaw_at_nodes), axis=1)
+    x, y = np.concatenate([[0.0], np.cumsum(dx)]) + x0, np.concatenate([[0.0], np.cumsum(dy)]) + y0
+    return np.stack([x, y, heading(s), start_curvature_per_m + rate * s], axis=1)
+
+
+def connect(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float = 0.5) -> F64:
+    """Join two poses by a quintic Hermite curve with zero curvature at both ends, and straights where a turn is longer on one side.
+
+    The common tangent length is the one, out of a fixed set, with the smallest peak curvature: turning lanes come out as wide as the
+    junction allows.
+
+    Returns:
+        ``(N, 3)``: x, y, heading; first and last points are ``p0`` and ``p1`` exactly.
+    """
+    before, after = _leads(p0, yaw0, p1, yaw1)
+    q0 = p0[:2] + before * np.array([np.cos(yaw0), np.sin(yaw0)])
+    q1 = p1[:2] - after * np.array([np.cos(yaw1), np.sin(yaw1)])
+    turn = _turn(q0, yaw0, q1, yaw1, step_m)
+    head, tail = _straight(p0, q0, yaw0, step_m)[:-1], _straight(q1, p1, float(turn[-1, 2]), step_m)[1:]
+    curve = np.concatenate([head, turn, tail])
+    curve[0, :2], curve[-1, :2] = p0[:2], p1[:2]
+    return curve
+
+
+def _leads(p0: F64, yaw0: float, p1: F64, yaw1: float) -> tuple[float, float]:
+    """Return the straights before and after a turn that make what is left of it as long on one side as on the other."""
+    d0, d1 = np.array([np.cos(yaw0), np.sin(yaw0)]), np.array([np.cos(yaw1), np.sin(yaw1)])
+    cross = float(d0[0] * d1[1] - d0[1] * d1[0])
+    if abs(cross) < 0.1:
+        return 0.0, 0.0
+    span = p1[:2] - p0[:2]
+    a = float(span[0] * d1[1] - span[1] * d1[0]) / cross  # from p0 to where the two lines meet
+    b = float(d0[0] * span[1] - d0[1] * span[0]) / cross  # and on to p1
+    if a <= 0 or b <= 0:
+        return 0.0, 0.0
+    shorter = min(a, b)
+    return a - shorter, b - shorter
+
+
+def _straight(p: F64, q: F64, yaw: float, step_m: float) -> F64:
+    """Return ``(N, 3)`` rows from p to q; the single row p where they are the same."""
+    n = int(np.ceil(float(np.hypot(*(q[:2] - p[:2]))) / step_m - 1e-6))
+    share = np.linspace(0.0, 1.0, n + 1)[:, None]
+    return np.column_stack([p[:2] + share * (q[:2] - p[:2]), np.full(n + 1, yaw)])
+
+
+def _turn(p0: F64, yaw0: float, p1: F64, yaw1: float, step_m: float) -> F64:
+    chord = float(np.hypot(p1[0] - p0[0], p1[1] - p0[1]))
+    n = max(8, int(np.ceil(1.2 * chord / step_m)))
+    t = np.linspace(0.0, 1.0, n + 1)
+    best, best_peak = None, np.inf
+    for factor in np.linspace(0.8, 2.4, 33):
+        xy, d, dd = _quintic(p0, yaw0, p1, yaw1, factor * chord, t)
+        speed = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)
+        peak = float(np.max(np.abs(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3))
+        if peak < best_peak - 1e-9:
+            best, best_peak = (xy, d), peak
+    assert best is not None
+    xy, d = best
+    yaw = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+    yaw[0], yaw[-1] = yaw0, yaw0 + (yaw1 - yaw0 + np.pi) % (2 * np.pi) - np.pi
+    xy[0], xy[-1] = p0[:2], p1[:2]
+    return np.column_stack([xy, yaw])
+
+
+def _quintic(p0: F64, yaw0: float, p1: F64, yaw1: float, tangent_m: float, t: F64) -> tuple[F64, F64, F64]:
+    """Return position, first and second derivative ``(N, 2)`` by t of the Hermite quintic with zero second derivatives at its ends."""
+    blend = smoothstep(t)[:, None]
+    d_blend = (30 * t**2 * (1 - t) ** 2)[:, None]
+    dd_blend = (60 * t * (1 - t) * (1 - 2 * t))[:, None]
+    start = t - 6 * t**3 + 8 * t**4 - 3 * t**5
+    d_start = 1 - 18 * t**2 + 32 * t**3 - 15 * t**4
+    dd_start = -36 * t + 96 * t**2 - 60 * t**3
+    end = -4 * t**3 + 7 * t**4 - 3 * t**5
+    d_end = -12 * t**2 + 28 * t**3 - 15 * t**4
+    dd_end = -24 * t + 84 * t**2 - 60 * t**3
+    m0 = tangent_m * np.array([np.cos(yaw0), np.sin(yaw0)])
+    m1 = tangent_m * np.array([np.cos(yaw1), np.sin(yaw1)])
+    span = p1[:2] - p0[:2]
+    xy = p0[:2] + blend * span + start[:, None] * m0 + end[:, None] * m1
+    return (
+        xy,
+        d_blend * span + d_start[:, None] * m0 + d_end[:, None] * m1,
+        (dd_blend * span + dd_start[:, None] * m0 + dd_end[:, None] * m1),
+    )
+
+
+def offset_line(curve: F64, offset_m: npt.ArrayLike, z_m: float = 0.0) -> F64:
+    """Return ``(N, 3)`` points beside a curve ``(N, 3+)`` of x, y, heading, at signed distances (left positive) along its normals."""
+    d = np.broadcast_to(np.asarray(offset_m, dtype=np.float64), (len(curve),))
+    x = curve[:, 0] - d * np.sin(curve[:, 2])
+    y = curve[:, 1] + d * np.cos(curve[:, 2])
+    return np.column_stack([x, y, np.full(len(curve), z_m)])
+
 
 FEW_DISTANCES = 200_000  # above it, a tree over the stations is quicker than all distances, and takes no memory
 

@@ -1,4 +1,8 @@
-"""Lanes side by side along one reference curve, with shared edges and exact joints."""
+"""What a procedural road is made of, and lanes side by side along one reference curve, with shared edges and exact joints.
+
+The cross-section and the elements follow one another along the ego's way. A taper is a strip in which the rightmost forward lane ends or a
+new one opens.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,91 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking, Paint
-from alpasim_plugin.world.curves import offset_line
-from alpasim_plugin.world.road_elements import Profile
+from alpasim_plugin.world.path import offset_line, smoothstep
+
+Turn = Literal["left", "straight", "right"]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Cross-section of the main road; driving is on the right. The reference line is the middle between the two directions."""
+
+    forward: int = 1  # lanes in the ego's direction
+    backward: int = 1  # oncoming lanes; 0 makes the road one-way
+    lane_width_m: float = 3.5
+    median_m: float = 0.0  # raised median between the directions; 0: paint only
+    shoulder_m: float = 0.0  # paved strip outside the outer lanes
+    parking_m: float = 0.0  # parking strip outside the outer lanes, instead of the shoulder
+    speed_limit_mps: float | None = None
+    centre_paint: Paint = "double_yellow"
+    lane_paint: Paint = "dashed_white"
+    edge_paint: Paint = "solid_white"
+
+    @property
+    def strip_m(self) -> float:
+        """Width of the strip outside the outer lane."""
+        return self.parking_m if self.parking_m > 0 else self.shoulder_m
+
+    @property
+    def strip_kind(self) -> str:
+        """Lane kind of that strip."""
+        return "parking" if self.parking_m > 0 else "shoulder"
+
+    def right_extent_m(self, forward: int | None = None) -> float:
+        """Distance from the reference line to the right road edge."""
+        n = self.forward if forward is None else forward
+        return self.median_m / 2 + n * self.lane_width_m + self.strip_m
+
+    def left_extent_m(self) -> float:
+        """Distance from the reference line to the left road edge; on a one-way road the strip lies left of the reference line."""
+        return self.median_m / 2 + self.backward * self.lane_width_m + self.strip_m
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A stretch whose curvature is linear in arc length: straight, arc or clothoid. Left curvature is positive."""
+
+    length_m: float
+    start_curvature_per_m: float = 0.0
+    end_curvature_per_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class LaneTaper:
+    """A straight stretch in which the rightmost forward lane ends (``merge``) or a new one opens (``split``)."""
+
+    kind: Literal["merge", "split"]
+    length_m: float
+
+
+@dataclass(frozen=True)
+class Intersection:
+    """A junction at the end of the stretch before it; the main road leaves it by ``turn``."""
+
+    turn: Turn = "straight"
+    arms: tuple[Turn, ...] = ("left", "straight", "right")  # arms that exist, seen from the entry
+    cross_lanes: int = 1  # lanes per direction on arms other than the entry and the exit
+    arm_length_m: float = 40.0
+    corner_radius_m: float = 8.0
+    crosswalks: bool = True
+    guide_lines: bool = True  # dashed lines through the junction along the main road
+
+
+Element = Curve | LaneTaper | Intersection
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """The main road's lanes in one element; index 0 is next to the centre line.
+
+    ``forward_next[k]`` is the index that a car in forward lane k has in the next element, or None where that lane does not go on along
+    the main road.
+    """
+
+    forward: tuple[str | None, ...]
+    forward_next: tuple[int | None, ...]
+    backward: tuple[str | None, ...]
+
 
 Joint = dict[str, F64]  # line name -> its point (3,) at the end of a strip
 
@@ -41,14 +128,8 @@ class MapDraft:
 
     def finish(self) -> LaneMap:
         """Freeze the map."""
-        return LaneMap(
-            dict(self.lanes),
-            tuple(self.road_edges),
-            tuple(self.drivable_areas),
-            tuple(self.crosswalks),
-            tuple(self.stop_lines),
-            tuple(self.markings),
-        )
+        edges, areas, crosswalks = tuple(self.road_edges), tuple(self.drivable_areas), tuple(self.crosswalks)
+        return LaneMap(dict(self.lanes), edges, areas, crosswalks, tuple(self.stop_lines), tuple(self.markings))
 
 
 @dataclass(frozen=True)
@@ -117,13 +198,12 @@ def add_sides(draft: MapDraft, name: str, lines: dict[str, F64], profile: Profil
     """Add the strips outside the outer lanes, the road edges and the drivable area."""
     outer_right, outer_left = lines[f"f{profile.forward}"], lines[f"b{profile.backward}"]
     if profile.strip_m > 0:
-        for side, inner, outer, flip in (("r", outer_right, lines["right"], False), ("l", outer_left, lines["left"], profile.backward > 0)):
-            left, right = (inner, outer) if side == "r" else ((inner, outer) if flip else (outer, inner))
-            left, right = (left[::-1], right[::-1]) if flip else (left, right)
-            draft.add(
-                Lane(f"{name}_{profile.strip_kind}_{side}", 0.5 * (left + right), left, right, profile.strip_kind,
-                     left_paint="none", right_paint="none", speed_limit_mps=profile.speed_limit_mps)
-            )  # fmt: skip
+        # The strip beside oncoming lanes runs in their direction, its left edge next to the lane.
+        left_strip = (outer_left[::-1], lines["left"][::-1]) if profile.backward > 0 else (lines["left"], outer_left)
+        for side, (left, right) in (("r", (outer_right, lines["right"])), ("l", left_strip)):
+            kind, limit = profile.strip_kind, profile.speed_limit_mps
+            lane_id, centre = f"{name}_{kind}_{side}", 0.5 * (left + right)
+            draft.add(Lane(lane_id, centre, left, right, kind, left_paint="none", right_paint="none", speed_limit_mps=limit))
     draft.road_edges += [lines["left"], lines["right"]]
     if profile.median_m > 0 and profile.backward > 0:
         draft.road_edges += [lines["f0"], lines["b0"]]
@@ -167,3 +247,62 @@ def _check_width(name: str, curve: F64, profile: Profile) -> None:
             f"and {profile.right_extent_m():.1f} m to the right: its inner edge would fold",
             "use a smaller curvature or fewer or narrower lanes",
         )
+
+
+def build_taper(draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint | None) -> tuple[Strip, str]:
+    """Add a straight stretch with one slanting lane beside (and running into, or out of) the outermost straight one.
+
+    The slanting lane keeps its full width and overlaps its neighbour, as merging lanes do in surveyed maps: its edges meet the
+    neighbour's edges exactly at the narrow end.
+
+    Args:
+        draft: Map that receives the lanes.
+        name: Prefix of the lane ids.
+        curve: ``(N, 4)`` reference line, straight.
+        profile: Cross-section at the narrow end.
+        kind: ``merge`` (wide to narrow) or ``split`` (narrow to wide).
+        joint: End points of the strip before.
+
+    Returns:
+        The strip with its lines at the far end, and the id of the slanting lane.
+    """
+    n, w, half = profile.forward, profile.lane_width_m, profile.median_m / 2
+    s = np.hypot(curve[:, 0] - curve[0, 0], curve[:, 1] - curve[0, 1])
+    share = smoothstep(s / s[-1])
+    out = (1.0 - share) if kind == "merge" else share  # 1 where the extra lane stands fully beside the others
+    left, centre, right = (offset_line(curve, -half - (n - 1 + shift + out) * w) for shift in (0.0, 0.5, 1.0))
+    edge = offset_line(curve, -half - (n + out) * w - profile.strip_m) if profile.strip_m > 0 else right
+    lines = make_lines(curve, profile)
+    if joint is not None:
+        extra = n if kind == "merge" else n - 1
+        for key, line in lines.items():
+            if key in joint and key != "right":
+                line[0] = joint[key]
+        left[0], centre[0], right[0] = joint[f"f{extra}"], joint[f"fc{extra}"], joint[f"f{extra + 1}"]
+        edge[0] = joint["right"]
+    if kind == "merge":  # the narrow end: meet the neighbour exactly
+        left[-1], centre[-1], right[-1] = lines[f"f{n - 1}"][-1], lines[f"fc{n - 1}"][-1], lines[f"f{n}"][-1]
+    inner = replace(profile, shoulder_m=0.0, parking_m=0.0)
+    scratch = MapDraft()
+    strip = build_strip(scratch, name, curve, inner)
+    turned = reverse(lines)
+    for lane_id in (*strip.forward, *strip.backward):
+        draft.add(_with_lines(scratch.lanes[lane_id], lane_id, name, lines, turned, n))
+    slant = draft.add(
+        Lane(f"{name}_{kind}", centre, left, right, left_paint="none", right_paint=profile.edge_paint,
+             speed_limit_mps=profile.speed_limit_mps)
+    )  # fmt: skip
+    add_sides(draft, name, {**lines, f"f{n}": right, "right": edge}, profile)
+    end_lines = {**lines, "right": edge}
+    if kind == "split":
+        end_lines |= {f"fc{n}": centre, f"f{n + 1}": right}
+    return Strip(strip.forward, strip.backward, end_lines), slant
+
+
+def _with_lines(lane: Lane, lane_id: str, name: str, lines: dict[str, F64], turned: dict[str, F64], n: int) -> Lane:
+    """Put the shared line arrays into a lane, and dashed paint where the slanting lane crosses."""
+    k = int(lane_id.removeprefix(f"{name}_")[1:])
+    if lane_id.startswith(f"{name}_f"):
+        paint = "dashed_white" if k == n - 1 else lane.right_paint
+        return replace(lane, centre=lines[f"fc{k}"], left=lines[f"f{k}"], right=lines[f"f{k + 1}"], right_paint=paint)
+    return replace(lane, centre=turned[f"bc{k}"], left=turned[f"b{k}"], right=turned[f"b{k + 1}"])

@@ -1,4 +1,7 @@
-"""Procedural roads: a list of elements becomes a lane map and the order of lanes along the main road."""
+"""Procedural roads: a list of elements becomes a lane map and the order of lanes along the main road.
+
+Junctions have arms, turning lanes, kerbs, crosswalks and stop lines.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,195 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, LaneMap
-from alpasim_plugin.world.curves import sample_clothoid
-from alpasim_plugin.world.road_elements import Curve, Element, Intersection, LaneTaper, Profile, Stretch
-from alpasim_plugin.world.road_intersection import Junction, build_intersection
-from alpasim_plugin.world.road_strip import Joint, MapDraft, Strip, build_strip
-from alpasim_plugin.world.road_taper import build_taper
+from alpasim_plugin.core.geometry import wrap_angle
+from alpasim_plugin.core.types import F64, Lane, LaneMap, Marking
+from alpasim_plugin.world.path import connect, offset_line, sample_clothoid
+from alpasim_plugin.world.road_strip import (
+    Curve,
+    Element,
+    Intersection,
+    Joint,
+    LaneTaper,
+    MapDraft,
+    Profile,
+    Stretch,
+    Strip,
+    build_strip,
+    build_taper,
+    make_lines,
+)
+
+_ANGLE = {"left": np.pi / 2, "straight": 0.0, "right": -np.pi / 2}
+CROSSWALK_M = (1.0, 4.0)  # from the junction's border, outwards
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One road at the junction, seen from its middle outwards: ``out`` lanes leave, ``into`` lanes arrive; index 0 at the centre line."""
+
+    name: str  # entry | left | straight | right
+    heading_rad: float  # outwards
+    profile: Profile  # seen outwards: forward lanes leave the junction
+    joint: Joint  # points on the junction's border, named as seen outwards
+    out: tuple[str | None, ...]  # None where the lane does not exist yet (the exit arm's strip comes later)
+    into: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Junction:
+    """What the main road needs to go on."""
+
+    pose: tuple[float, float, float]  # start of the exit arm
+    joint: Joint  # of the exit arm
+    forward: tuple[str | None, ...]  # connectors of the main road by entry lane index
+    forward_next: tuple[int | None, ...]
+    backward: tuple[str | None, ...]  # connectors of the oncoming direction by lane index at the entry arm
+    exits: tuple[tuple[str, int], ...]  # connector id, exit lane index: to be linked once the exit strip exists
+    entries: tuple[tuple[int, str], ...]  # incoming lane index of the exit arm, connector id
+
+
+def build_intersection(
+    draft: MapDraft, name: str, pose: tuple[float, float, float], element: Intersection, profile: Profile, entry_joint: Joint,
+    entry_forward: tuple[str, ...], entry_backward: tuple[str, ...],
+) -> Junction:  # fmt: skip
+    """Add a junction at the end of a strip.
+
+    Raises:
+        InputError: The main road leaves by an arm that is not there.
+    """
+    if element.turn not in element.arms:
+        raise InputError(
+            "building an intersection", name, f"turn: {element.turn}, but the arms are {', '.join(element.arms)}", "add that arm"
+        )
+    side = replace(profile, forward=element.cross_lanes, backward=element.cross_lanes, median_m=0.0, parking_m=0.0)
+    reach = max(profile.right_extent_m(), profile.left_extent_m(), side.right_extent_m()) + element.corner_radius_m
+    x, y, yaw = pose
+    centre = np.array([x + reach * np.cos(yaw), y + reach * np.sin(yaw)])
+    back = replace(profile, forward=profile.backward, backward=profile.forward)
+    arms = [Arm("entry", yaw + np.pi, back, _outward(entry_joint), entry_backward, entry_forward)]
+    exit_pose = pose
+    for turn in ("right", "straight", "left"):  # counter-clockwise after the entry
+        if turn not in element.arms:
+            continue
+        heading = yaw + _ANGLE[turn]
+        at = centre + reach * np.array([np.cos(heading), np.sin(heading)])
+        start = (float(at[0]), float(at[1]), float(heading))
+        if turn == element.turn:
+            exit_pose = start
+            stub = sample_clothoid(start, 1.0, 0.0, 0.0)
+            joint = {key: line[0] for key, line in make_lines(stub, profile).items()}
+            arms.append(Arm(turn, heading, profile, joint, (None,) * profile.forward, tuple(f"?{k}" for k in range(profile.backward))))
+        else:
+            curve = sample_clothoid(start, element.arm_length_m, 0.0, 0.0)
+            strip = build_strip(draft, f"{name}_{turn}", curve, side)
+            arms.append(Arm(turn, heading, side, strip.joint(at_end=False), strip.forward, strip.backward))
+    return _connect_all(draft, name, element, arms, exit_pose)
+
+
+def _connect_all(draft: MapDraft, name: str, element: Intersection, arms: list[Arm], exit_pose: tuple[float, float, float]) -> Junction:
+    forward: dict[int, str] = {}
+    forward_next: dict[int, int] = {}
+    backward: dict[int, str] = {}
+    exits: list[tuple[str, int]] = []
+    entries: list[tuple[int, str]] = []
+    for a in arms:
+        for b in arms:
+            if a is b:
+                continue
+            for i, j in _movements(a, b):
+                lane = draft.add(_connector(name, a, b, i, j))
+                if a.name == element.turn:
+                    entries.append((i, lane))
+                else:
+                    draft.link(a.into[i], lane)
+                if b.name == element.turn:
+                    exits.append((lane, j))
+                else:
+                    draft.link(lane, b.out[j])
+                if a.name == "entry" and b.name == element.turn:
+                    forward[i], forward_next[i] = lane, j
+                if a.name == element.turn and b.name == "entry":
+                    backward[j] = lane
+    _kerbs(draft, arms)
+    _paint(draft, element, arms, list(forward.values()))
+    exit_arm = next(a for a in arms if a.name == element.turn)
+    entry = arms[0]
+    return Junction(
+        exit_pose,
+        exit_arm.joint,
+        tuple(forward.get(i) for i in range(len(entry.into))),
+        tuple(forward_next.get(i) for i in range(len(entry.into))),
+        tuple(backward.get(j) for j in range(len(entry.out))),
+        tuple(exits),
+        tuple(entries),
+    )
+
+
+def _movements(a: Arm, b: Arm) -> list[tuple[int, int]]:
+    """Return (incoming index at a, outgoing index at b): straight lane by lane, left from and to the inner, right the outer lane."""
+    n_in, n_out = len(a.into), len(b.out)
+    if n_in == 0 or n_out == 0:
+        return []
+    angle = float(wrap_angle(b.heading_rad - a.heading_rad - np.pi))
+    if abs(angle) < 0.1:
+        return [(i, i) for i in range(min(n_in, n_out))]
+    return [(0, 0)] if angle > 0 else [(n_in - 1, n_out - 1)]
+
+
+def _connector(name: str, a: Arm, b: Arm, i: int, j: int) -> Lane:
+    yaw0, yaw1 = a.heading_rad + np.pi, b.heading_rad
+    begin, end = a.joint[f"bc{i}"], b.joint[f"fc{j}"]
+    centre = connect(begin, yaw0, end, yaw1)
+    t = np.linspace(0.0, 1.0, len(centre))
+    width = (1 - t) * a.profile.lane_width_m + t * b.profile.lane_width_m
+    left, mid, right = offset_line(centre, width / 2), offset_line(centre, 0.0), offset_line(centre, -width / 2)
+    # An arriving lane drives against the arm's outward direction: its left edge is the one nearer to the centre line.
+    left[0], mid[0], right[0] = a.joint[f"b{i}"], begin, a.joint[f"b{i + 1}"]
+    left[-1], mid[-1], right[-1] = b.joint[f"f{j}"], end, b.joint[f"f{j + 1}"]
+    return Lane(
+        f"{name}_{a.name}{i}_{b.name}{j}", mid, left, right, is_intersection=True, left_paint="none", right_paint="none",
+        speed_limit_mps=a.profile.speed_limit_mps,
+    )  # fmt: skip
+
+
+def _kerbs(draft: MapDraft, arms: list[Arm]) -> None:
+    """Join each arm's left border to the right border of the next arm counter-clockwise, and close the drivable ring."""
+    ring: list[F64] = []
+    for a, b in zip(arms, arms[1:] + arms[:1], strict=True):
+        curve = connect(a.joint["left"], a.heading_rad + np.pi, b.joint["right"], b.heading_rad)
+        kerb = offset_line(curve, 0.0)
+        kerb[0], kerb[-1] = a.joint["left"], b.joint["right"]
+        draft.road_edges.append(kerb)
+        ring.append(kerb)
+    draft.drivable_areas.append(np.concatenate([*ring, ring[0][:1]]))
+
+
+def _paint(draft: MapDraft, element: Intersection, arms: list[Arm], guided: list[str]) -> None:
+    for arm in arms:
+        outward = np.array([np.cos(arm.heading_rad), np.sin(arm.heading_rad), 0.0])
+        left, right, middle = arm.joint["left"], arm.joint["right"], arm.joint["b0"]
+        stop_m = 1.0
+        if element.crosswalks:
+            near, far = CROSSWALK_M
+            corners = (right + near * outward, right + far * outward, left + far * outward, left + near * outward)
+            draft.crosswalks.append(np.stack([*corners, corners[0]]))
+            stop_m = far + 1.0
+        if arm.into:
+            edge = arm.joint[f"b{len(arm.into)}"]
+            draft.stop_lines.append(np.stack([middle + stop_m * outward, edge + stop_m * outward]))
+    if element.guide_lines:
+        for lane_id in guided:
+            lane = draft.lanes[lane_id]
+            assert lane.left is not None
+            assert lane.right is not None
+            draft.markings += [Marking(lane.left, "dashed_white"), Marking(lane.right, "dashed_white")]
+
+
+def _outward(joint: Joint) -> Joint:
+    """Rename the lines of a strip's end as they are seen looking back along it."""
+    swap = {"f": "b", "b": "f"}
+    names = {"left": "right", "right": "left"}
+    return {names.get(key) or swap[key[0]] + key[1:]: point for key, point in joint.items()}
 
 
 @dataclass(frozen=True)
@@ -23,18 +209,18 @@ class Road:
     lane_map: LaneMap
     stretches: tuple[Stretch, ...]  # in the ego's direction
 
-    def forward_chain(self, lane: int) -> list[tuple[str, int]]:
-        """Return (lane id, index) of every stretch for a car that starts in forward lane ``lane`` and changes only where its lane ends.
+    def forward_chain(self, lane: int, stretch: int = 0) -> list[tuple[str, int]]:
+        """Return (lane id, index) of every stretch from one on for a car in forward lane ``lane`` that changes only where its lane ends.
 
         The chain stops where the lane does not go on.
         """
         out: list[tuple[str, int]] = []
         at: int | None = lane
-        for stretch in self.stretches:
-            if at is None or at >= len(stretch.forward) or stretch.forward[at] is None:
+        for part in self.stretches[stretch:]:
+            if at is None or at >= len(part.forward) or part.forward[at] is None:
                 break
-            out.append((str(stretch.forward[at]), at))
-            at = stretch.forward_next[at]
+            out.append((str(part.forward[at]), at))
+            at = part.forward_next[at]
         return out
 
     def backward_chain(self, lane: int) -> list[str]:
@@ -96,7 +282,7 @@ def _grow_curve(draft: MapDraft, name: str, tip: _Tip, element: Curve, step_m: f
     strip = build_strip(draft, name, curve, tip.profile, tip.joint)
     _link(draft, tip, strip)
     indices = tuple(range(len(strip.forward)))
-    _move(tip, curve, strip, strip.forward, strip.backward)
+    _move(tip, curve, strip, strip.forward)
     return Stretch(strip.forward, indices, strip.backward)
 
 
@@ -111,20 +297,16 @@ def _grow_taper(draft: MapDraft, name: str, tip: _Tip, element: LaneTaper, step_
     curve = sample_clothoid(tip.pose, element.length_m, 0.0, 0.0, step_m)
     strip, slant = build_taper(draft, name, curve, narrow, element.kind, tip.joint)
     _link(draft, tip, strip)
-    n = narrow.forward
+    n, forward = narrow.forward, (*strip.forward, slant)
     if element.kind == "merge":
         draft.link(tip.forward[n], slant)
-        _move(tip, curve, strip, strip.forward, strip.backward)
-        draft_next = (*strip.forward, slant)
-        tip.forward = draft_next  # the slanting lane's successor is the last straight lane's
+        _move(tip, curve, strip, forward)  # the slanting lane's successor is the last straight lane's
         tip.profile = narrow
-        stretch = Stretch(draft_next, (*range(n), n - 1), strip.backward)
-    else:
-        draft.link(tip.forward[n - 1], slant)
-        _move(tip, curve, strip, (*strip.forward, slant), strip.backward)
-        tip.profile = replace(narrow, forward=n + 1)
-        stretch = Stretch((*strip.forward, slant), tuple(range(n + 1)), strip.backward)
-    return stretch
+        return Stretch(forward, (*range(n), n - 1), strip.backward)
+    draft.link(tip.forward[n - 1], slant)
+    _move(tip, curve, strip, forward)
+    tip.profile = replace(narrow, forward=n + 1)
+    return Stretch(forward, tuple(range(n + 1)), strip.backward)
 
 
 def _grow_intersection(draft: MapDraft, name: str, tip: _Tip, element: Intersection) -> Stretch:
@@ -148,19 +330,18 @@ def _link(draft: MapDraft, tip: _Tip, strip: Strip) -> None:
         tip.junction = None
         return
     for k, before in enumerate(tip.forward):
-        draft.link(before, strip.forward[min(k, len(strip.forward) - 1)] if k < len(strip.forward) or _is_slant(before) else None)
+        if k < len(strip.forward):
+            draft.link(before, strip.forward[k])
+        elif before is not None and before.endswith("_merge"):  # a lane that ends runs into the outermost one
+            draft.link(before, strip.forward[-1])
     for before, after in zip(tip.backward, strip.backward, strict=False):
         draft.link(after, before)
 
 
-def _is_slant(lane_id: str | None) -> bool:
-    return lane_id is not None and lane_id.endswith("_merge")
-
-
-def _move(tip: _Tip, curve: F64, strip: Strip, forward: tuple[str | None, ...], backward: tuple[str | None, ...]) -> None:
+def _move(tip: _Tip, curve: F64, strip: Strip, forward: tuple[str, ...]) -> None:
     end = curve[-1]
     tip.pose = (float(end[0]), float(end[1]), float(end[2]))
-    tip.joint, tip.strip, tip.forward, tip.backward = strip.joint(), strip, forward, backward
+    tip.joint, tip.strip, tip.forward, tip.backward = strip.joint(), strip, forward, strip.backward
 
 
 def polyline(lane_map: LaneMap, lane_ids: Sequence[str]) -> F64:

@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.types import F64, I64, Box, Trajectory
-from alpasim_plugin.world.curves import smoothstep
-from alpasim_plugin.world.path import Path
+from alpasim_plugin.world.path import Path, smoothstep
 
 STEP_US = 50_000  # a 20 Hz track: linear interpolation errs by less than 3 mm at 7 m/s^2
 

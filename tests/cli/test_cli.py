@@ -148,7 +148,7 @@ def test_a_run_folder_that_cannot_be_made_is_a_four_part_error(tmp_path: Path, c
 def test_policy_of_the_working_directory_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "policy_of_this_folder.py").write_text("from policies.constant_velocity import ConstantVelocity as Mine\n")
+    (tmp_path / "policy_of_this_folder.py").write_text("from policies.simple import ConstantVelocity as Mine\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])  # as a console script finds it: without the working directory
     command = ["simrun", "--renderer", "clean", "--policy", "policy_of_this_folder:Mine", "--dry-run", "--json", "smoke/straight"]

@@ -20,9 +20,8 @@ can = pytest.importorskip("can")
 
 from alpasim_plugin.control.bicycle import BicycleState  # noqa: E402
 from alpasim_plugin.control.can_bus import HOLD_US, STOP_MPS2, Address, Exchange, open_bus  # noqa: E402
-from alpasim_plugin.control.can_codec import BadFrame, Codec, checksum_of, open_codec  # noqa: E402
+from alpasim_plugin.control.can_codec import BadFrame, Codec, checksum_of, load_map, open_codec  # noqa: E402
 from alpasim_plugin.control.can_ecu import LaneKeeper, serve  # noqa: E402
-from alpasim_plugin.control.can_map import load_map  # noqa: E402
 from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities  # noqa: E402
 from alpasim_plugin.control.can_replay import decode, read_recording, replay  # noqa: E402
 from alpasim_plugin.core.types import Vehicle  # noqa: E402

@@ -147,7 +147,7 @@ def test_a_part_that_may_name_others_depends_on_all_of_ours(tmp_path: Path) -> N
 
 
 def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    home = "policies/constant_velocity.py"
+    home = "policies/simple.py"
     digest = resolve("policy", "policies:ConstantVelocity").digest
     whole = spec.code_digest
     monkeypatch.setattr(spec, "code_digest", lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""))

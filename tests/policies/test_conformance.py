@@ -14,7 +14,7 @@ from alpasim_plugin.core.types import Observation, Plan, Route, SensorSpec
 from alpasim_plugin.plugins.parts import names
 from policies import check_policy
 from policies.conformance import canned_scenario
-from policies.pure_pursuit import PurePursuit
+from policies.simple import PurePursuit
 
 SCENARIO = canned_scenario()
 

@@ -15,9 +15,8 @@ from alpasim_plugin.core.types import EgoState, Observation
 from policies import check_policy, make_policy
 from policies.conformance import STRAIGHT, observations
 from policies.learned import WEIGHTS, Learned
-from policies.learned_command import route_command
+from policies.learned_input import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, level_view, route_command, view_homography
 from policies.learned_net import KNOTS_M, LearnedNet, integrate_path, knot_weights, load_net, path_grid, save_net
-from policies.learned_view import FOCAL_PX, HEIGHT, HORIZON_ROW, WIDTH, level_view, view_homography
 from policies.painted_road import Line, PaintedRoad, pinhole_camera
 from tests.policies.policy_world import CAMERA, observe, scenario_with
 

@@ -9,11 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.geometry import inverse
-from policies.ground_grid import make_grid
 from policies.lane_filter import LaneState, predict, search, shift, start, update
-from policies.lane_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint
 from policies.obstacle_vision import anomaly, find_foot, learn_road, track_obstacle
 from policies.painted_road import Block, Line, PaintedRoad, pinhole_camera
+from policies.road_vision import PaintPoints, RidgeFilter, _windows, brightness, find_paint, make_grid
 from tests.examples import examples
 
 CAMERA = pinhole_camera()

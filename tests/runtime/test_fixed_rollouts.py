@@ -17,7 +17,7 @@ from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
-from policies.log_replay import LogReplay
+from policies.simple import LogReplay
 from tests.examples import first_of
 from tests.fixers.block_fixers import Blend, GivesFloats, GuardSteps, LosesAFrame, Raises, ShiftsTime, fixed_offline
 

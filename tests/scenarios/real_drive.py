@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.world.lane_map import LaneIndex
+from alpasim_plugin.world.route import LaneIndex
 
 
 def rectangles(centres, yaw, length, width):

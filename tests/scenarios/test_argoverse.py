@@ -7,8 +7,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.geometry import yaw_from_quat
-from scenarios.argoverse import LABELS, read_argoverse
-from scenarios.argoverse_map import PAINTS
+from scenarios.argoverse import LABELS, PAINTS, read_argoverse
 from tests.scenarios.make_argoverse import (
     CAR,
     ORIGIN,

@@ -11,8 +11,7 @@ import shapely
 from alpasim_plugin.core.geometry import interpolate, lane_polygon, matrix_from_quat, se3, wrap_angle, yaw_from_quat
 from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.world.ground import height_at
-from alpasim_plugin.world.lane_map import LaneIndex
-from alpasim_plugin.world.route import route_from_log
+from alpasim_plugin.world.route import LaneIndex, route_from_log
 from scenarios.argoverse import read_argoverse, read_calibration, read_ego_poses
 from scenarios.reading import SourceFiles
 from tests.examples import first_of

@@ -9,11 +9,9 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import interpolate, lane_polygon, se3, yaw_from_quat
 from alpasim_plugin.core.types import HeightField
-from alpasim_plugin.world.lane_map import LaneIndex
-from alpasim_plugin.world.route import route_from_log
-from scenarios.commonroad import read_commonroad
+from alpasim_plugin.world.route import LaneIndex, route_from_log
+from scenarios.commonroad import read_commonroad, read_obstacles
 from scenarios.commonroad_map import read_lanelets
-from scenarios.commonroad_obstacles import read_obstacles
 from scenarios.reading import SourceFiles
 from tests.scenarios.make_commonroad import LANES, TRAFFIC, bound, document, drive, lanelet, obstacle, points, state, write_commonroad
 from tests.scenarios.real_drive import boxes_at, footprint, ruling

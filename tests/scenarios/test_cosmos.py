@@ -12,11 +12,9 @@ from scipy.spatial import KDTree
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import densify, inverse, lane_polygon, se3, transform_points, wrap_angle, yaw_from_quat
 from alpasim_plugin.world.ground import height_at
-from alpasim_plugin.world.lane_map import LaneIndex
-from alpasim_plugin.world.route import route_from_log
-from scenarios.cosmos import read_cosmos, read_poses
+from alpasim_plugin.world.route import LaneIndex, route_from_log
+from scenarios.cosmos import paint_of, read_cosmos, read_layer, read_poses, sign_pose
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, front_camera, lens_of, read_lenses
-from scenarios.cosmos_layers import paint_of, read_layer, sign_pose
 from scenarios.reading import SourceFiles
 from tests.scenarios.ftheta import project_ftheta
 from tests.scenarios.make_cosmos import CLIP, WIDE, cuboid, label, lane, layers, polyline, poses, write_cosmos
@@ -180,9 +178,9 @@ def test_truncated_tar(tmp_path, name, keep):
         ({}, "a tar without files"),
         ({7: np.eye(4)}, "no frame 000000 among 1 poses"),
         ({0: np.eye(4), 2: np.eye(4)}, "no frame 000001 among 2 poses"),
-        ([np.eye(4), np.eye(4) * 2], "no rigid motion"),
-        ([np.eye(4), np.zeros((4, 4))], "no rigid motion"),
-        ([np.eye(4), np.full((4, 4), np.nan)], "no rigid motion"),
+        ([np.eye(4), np.eye(4) * 2], "not a rigid motion"),
+        ([np.eye(4), np.zeros((4, 4))], "not a rigid motion"),
+        ([np.eye(4), np.full((4, 4), np.nan)], "not a rigid motion"),
         ([np.eye(3), np.eye(3)], "an array of shape (3, 3)"),
     ],
 )
@@ -214,7 +212,7 @@ def test_maps_that_are_no_map(tmp_path, changed, found):
 @pytest.mark.parametrize("lens", [[1.0, 2.0], [*WIDE[:10], 3.0], [*WIDE[:2], 0.0, 0.0, *WIDE[4:]], [np.nan] * 11])
 def test_lens_that_is_none(tmp_path, lens):
     error = refused(write_cosmos(tmp_path / "x", lens=lens))
-    assert "no f-theta lens" in error.found
+    assert "not an f-theta lens" in error.found
 
 
 # --- the facts of the recorded clip -----------------------------------------------------------------------------------

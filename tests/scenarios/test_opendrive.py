@@ -14,11 +14,9 @@ from scipy.integrate import quad
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, lane_polygon
-from scenarios.opendrive import lane_map_of
+from scenarios.opendrive import T_enu_earth, T_local_map, geographic_origin, lane_map_of
 from scenarios.opendrive_alpasim import alpasim_map
-from scenarios.opendrive_geometry import Cubic, Geometry, cubics_at, reference_line
-from scenarios.opendrive_place import T_enu_earth, T_local_map, geographic_origin
-from scenarios.opendrive_road import OdrMap, parse_map
+from scenarios.opendrive_road import Cubic, Geometry, OdrMap, cubics_at, parse_map, reference_line
 from scenarios.reading import SourceFiles
 
 FILES = SourceFiles("reading OpenDRIVE")

@@ -101,7 +101,7 @@ def test_map_data_comes_before_clipgt(tmp_path: Path) -> None:
             "rails of 4 and 5 points",
         ),
         (changed(clipgt__lane_dot_parquet=b"PAR1 no"), "no readable parquet"),
-        (changed(clipgt__road_boundary_dot_parquet=parquet([{"key": 3.0, "road_boundary": None}])), "that are no structs"),
+        (changed(clipgt__road_boundary_dot_parquet=parquet([{"key": 3.0, "road_boundary": None}])), "that are not structs"),
         (
             changed(
                 clipgt__road_boundary_dot_parquet=parquet(

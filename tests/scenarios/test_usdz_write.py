@@ -17,13 +17,12 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import lane_polygon
 from alpasim_plugin.core.types import Actor, Box, Lane, LaneMap, Scenario, Trajectory
-from scenarios.alpasim_map import alpasim_view, rails
 from scenarios.load import load_scenario
+from scenarios.map_lines import alpasim_view, rails, with_vertices
 from scenarios.usdz import read_usdz
-from scenarios.usdz_calibration import pixel_to_angle
+from scenarios.usdz_camera import pixel_to_angle
 from scenarios.usdz_tables import table_ids
 from scenarios.usdz_write import alpasim_cameras, write_usdz
-from scenarios.vertices import with_vertices
 
 TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
 

@@ -30,9 +30,8 @@ from alpasim_plugin.core.types import F64, U8, Bool, Box, LaneMap
 from alpasim_plugin.semantic_map.draw import FThetaCamera, draw_map
 from alpasim_plugin.semantic_map.prepare import ActorBox, Area, MapExtras, PreparedMap, prepare_map
 from alpasim_plugin.semantic_map.style import COLOURS, LUDUS, OPENGL, MapStyle
-from scenarios.cosmos import read_cosmos
+from scenarios.cosmos import read_cosmos, read_layer
 from scenarios.cosmos_camera import FRONT_WIDE, T_RIG_FRONT_WIDE, orthonormal, read_lenses
-from scenarios.cosmos_layers import read_layer
 from scenarios.reading import SourceFiles
 
 SIZE = (1280, 704)

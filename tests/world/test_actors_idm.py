@@ -9,9 +9,18 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Box
-from alpasim_plugin.world.idm import Bodies, IdmParams, find_leader, idm_acceleration, nearest_ahead, spans
+from alpasim_plugin.world.idm import (
+    NO_BODIES,
+    Bodies,
+    IdmParams,
+    bodies_from,
+    concatenate,
+    find_leader,
+    idm_acceleration,
+    nearest_ahead,
+    spans,
+)
 from alpasim_plugin.world.path import polyline_path
-from alpasim_plugin.world.state import NO_BODIES, bodies_from, concatenate
 
 P = IdmParams(desired_speed_mps=20.0, headway_s=1.5, min_gap_m=2.0, accel_mps2=1.0, brake_mps2=1.5)
 ROAD = polyline_path(np.column_stack([np.linspace(0, 200, 201), np.zeros(201), np.zeros(201)]))

@@ -7,6 +7,7 @@ import pytest
 
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import Box
+from alpasim_plugin.world.ego import speeds
 from alpasim_plugin.world.path import polyline_path
 from alpasim_plugin.world.scripted import (
     brake_rows,
@@ -18,7 +19,6 @@ from alpasim_plugin.world.scripted import (
     track_on_path,
     walk_track,
 )
-from alpasim_plugin.world.state import speeds
 
 BOX = Box(4.0, 1.8, 1.5)
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import fresnel
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.world.curves import connect, offset_line, sample_clothoid, smoothstep
-from alpasim_plugin.world.path import polyline_path, smooth_path
+from alpasim_plugin.world.path import connect, offset_line, polyline_path, sample_clothoid, smooth_path, smoothstep
 from tests.examples import examples
 
 

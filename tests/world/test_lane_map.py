@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, densify, lane_polygon
 from alpasim_plugin.core.types import Lane, LaneMap
-from alpasim_plugin.world.lane_map import LaneIndex
+from alpasim_plugin.world.route import LaneIndex
 from tests.examples import examples
 from tests.world.small_maps import FAR, arc, make, straight
 

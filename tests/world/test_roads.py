@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import LaneMap
-from alpasim_plugin.world.road_elements import Curve, Intersection, LaneTaper, Profile
+from alpasim_plugin.world.road_strip import Curve, Intersection, LaneTaper, Profile
 from alpasim_plugin.world.roads import Road, build_road, polyline
 from tests.examples import examples
 

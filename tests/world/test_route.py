@@ -8,8 +8,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2, se3
 from alpasim_plugin.core.types import LaneMap, Route, Trajectory
-from alpasim_plugin.world.lane_map import LaneIndex
-from alpasim_plugin.world.route import _change_cost, _local_costs, match_lanes, route_from_log, route_in_rig
+from alpasim_plugin.world.route import LaneIndex, _change_cost, _local_costs, match_lanes, route_from_log, route_in_rig
 from tests.world.small_maps import FAR, arc, make, straight
 
 

@@ -24,8 +24,8 @@ from alpasim_plugin.lab.training.perturbed_rollouts import PerturbedRollout, Rol
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M, expert_path, expert_speeds, leader_on
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.world.route import route_in_rig
-from policies.lane_camera import front_camera
-from policies.learned_command import COMMANDS, route_command
+from policies.base import front_camera
+from policies.learned_input import COMMANDS, route_command
 
 DEMONSTRATIONS_FILE = "demonstrations.json"
 DEMONSTRATIONS_VERSION = 3  # of the format

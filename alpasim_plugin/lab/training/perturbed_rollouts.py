@@ -17,10 +17,9 @@ from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.training.policy_expert import STEP_S, DrivingStyle, ReferenceLine, acceleration, advance, leader_on
 from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
-from alpasim_plugin.world.idm import Bodies
-from alpasim_plugin.world.lane_map import LaneIndex
+from alpasim_plugin.world.idm import Bodies, bodies_from
 from alpasim_plugin.world.path import Path, smooth_path
-from alpasim_plugin.world.state import bodies_from
+from alpasim_plugin.world.route import LaneIndex
 
 FRAME_INTERVAL_S = 0.5  # between two frames; the earlier one shows the motion of other road users
 MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = 1.8, 1.3  # with a neighbouring lane the nearest lane must not change

@@ -17,8 +17,8 @@ from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.demonstrations import Demonstrations, demonstrations_digest
 from alpasim_plugin.lab.training.policy_expert import SIGHT_M
 from alpasim_plugin.lab.training.trainer import Loss
+from policies.learned_input import level_view, network_input
 from policies.learned_net import KNOTS_M, PROXIMITY_M, SPEED_UNIT_MPS, LearnedNet, integrate_path, knot_weights
-from policies.learned_view import level_view, network_input
 
 SIGMA_KNOT = KNOTS_M.index(16.0)
 

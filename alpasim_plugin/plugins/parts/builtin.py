@@ -51,9 +51,9 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
     "policy": {
-        "log-replay": ("policies.log_replay:LogReplay", "the recorded ego poses, exactly; takes no camera"),
-        "constant-velocity": ("policies.constant_velocity:ConstantVelocity", "straight on at the present speed; takes no camera"),
-        "pure-pursuit": ("policies.pure_pursuit:PurePursuit", "along the route at the initial speed, slower in curves; takes no camera"),
+        "log-replay": ("policies.simple:LogReplay", "the recorded ego poses, exactly; takes no camera"),
+        "constant-velocity": ("policies.simple:ConstantVelocity", "straight on at the present speed; takes no camera"),
+        "pure-pursuit": ("policies.simple:PurePursuit", "along the route at the initial speed, slower in curves; takes no camera"),
         "lane-camera": (
             "policies.lane_camera:LaneCamera",
             "lane paint and obstacles from one front camera, by OpenCV; the route is a weak prior",
@@ -85,7 +85,7 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
             "alpasim_plugin.alpasim.client.controller:VdcController",
             "an AlpaSim controller, and physics: vdc://HOST:PORT[?physics=HOST:PORT&scene=ID]",
         ),
-        "perfect": ("alpasim_plugin.control.perfect:PerfectController", "the ego is exactly where its plan says"),
+        "perfect": ("alpasim_plugin.control.base:PerfectController", "the ego is exactly where its plan says"),
     },
     "evaluator": {
         "collision": ("evaluators.collision:FACTORY", "contact with other actors by class, and the distance to them"),

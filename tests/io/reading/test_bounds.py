@@ -14,9 +14,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io import limits as bounds
 from alpasim_plugin.io.limits import Bound
-from alpasim_plugin.world.idm import Bodies, find_leader
+from alpasim_plugin.world.idm import Bodies, find_leader, find_leaders
 from alpasim_plugin.world.path import FEW_DISTANCES, nearest, polyline_path
-from alpasim_plugin.world.queue import find_leaders
 from scenarios.budget import check_scenario
 from scenarios.load import load_scenario
 from tests.fuzz import seen

@@ -27,7 +27,7 @@ from alpasim_plugin.lab.training.demonstrations import (
 from alpasim_plugin.lab.training.perturbed_rollouts import perturbed_rollouts, traffic_at, turning_lines
 from alpasim_plugin.lab.training.policy import PolicyRecipe, PolicyTask, measure
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
-from policies.learned_command import COMMANDS
+from policies.learned_input import COMMANDS
 from policies.learned_net import LearnedNet, load_net
 from scenarios.load import load_scenario
 

@@ -16,9 +16,8 @@ from alpasim_plugin.lab.training.policy_expert import (
     expert_speeds,
     leader_on,
 )
-from alpasim_plugin.world.idm import NO_LEADER, Leader
+from alpasim_plugin.world.idm import NO_BODIES, NO_LEADER, Leader, bodies_from
 from alpasim_plugin.world.path import smooth_path
-from alpasim_plugin.world.state import NO_BODIES, bodies_from
 from policies.learned_net import KNOTS_M, TIMES_S
 
 STRAIGHT = smooth_path(np.stack([np.linspace(0.0, 200.0, 60), np.zeros(60)], axis=1))

@@ -1,0 +1,322 @@
+"""The sections of a scenario file that say where things are: the road or the log in its place, and the actors."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from alpasim_plugin.io import limits as b
+
+
+def within(bound: b.Bound, description: str | None = None, default: Any = ...) -> Any:
+    """Return the field of a number within a bound, which is required without a default; alone, the constraint for a type."""
+    return Field(default, ge=bound.low, le=bound.high, description=description)
+
+
+BuildingHeight = Annotated[float, within(b.BUILDING_M)]
+Side = Annotated[float, within(b.BODY_M)]  # of a body
+Speed = Annotated[float, within(b.SPEED_MPS)]
+Moment = Annotated[float, within(b.MOMENT_S)]
+Coordinate = Annotated[float, within(b.COORDINATE_M)]
+Angle = Annotated[float, Field(ge=-1e4, le=1e4)]  # radians, not wrapped
+
+
+class Part(BaseModel):
+    """A section: frozen, and no key that the schema does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Turn = Literal["left", "straight", "right"]
+CentrePaint = Literal["double_yellow", "solid_yellow", "dashed_yellow", "dashed_white", "solid_white", "none"]
+
+
+class StraightSegment(Part):
+    """A straight."""
+
+    kind: Literal["straight"]
+    length_m: float = within(b.SEGMENT_M, "Length.")
+
+
+class ArcSegment(Part):
+    """A circular bend."""
+
+    kind: Literal["arc"]
+    length_m: float = within(b.SEGMENT_M, "Length along the road's middle.")
+    curvature_per_m: float = within(b.CURVATURE_PER_M, "1 / radius; left is positive.")
+
+
+class ClothoidSegment(Part):
+    """A transition whose curvature is linear in length."""
+
+    kind: Literal["clothoid"]
+    length_m: float = within(b.SEGMENT_M, "Length along the road's middle.")
+    start_curvature_per_m: float = within(b.CURVATURE_PER_M, "Curvature at the start; left is positive.", 0.0)
+    end_curvature_per_m: float = within(b.CURVATURE_PER_M, "Curvature at the end.", 0.0)
+
+
+class MergeSegment(Part):
+    """A straight on which the rightmost forward lane ends."""
+
+    kind: Literal["merge"]
+    length_m: float = within(b.SEGMENT_M, "Length of the taper.", 60.0)
+
+
+class SplitSegment(Part):
+    """A straight on which a new rightmost forward lane opens."""
+
+    kind: Literal["split"]
+    length_m: float = within(b.SEGMENT_M, "Length of the taper.", 40.0)
+
+
+class IntersectionSegment(Part):
+    """A junction; the road goes on by ``turn``."""
+
+    kind: Literal["intersection"]
+    turn: Turn = Field("straight", description="Where the road goes on.")
+    arms: tuple[Turn, ...] = Field(("left", "straight", "right"), min_length=1, description="Arms seen from the entry.")
+    cross_lanes: int = Field(1, ge=1, le=4, description="Lanes per direction on the arms beside the road.")
+    arm_length_m: float = Field(40.0, ge=b.SEGMENT_M.low, le=1000, description="Length of those arms.")
+    corner_radius_m: float = Field(8.0, ge=3, le=40, description="Size of the kerb's corners.")
+    crosswalks: bool = Field(True, description="Crosswalks on every arm.")
+    guide_lines: bool = Field(True, description="Dashed lines through the junction along the road.")
+
+
+class NarrowGapSegment(Part):
+    """A straight on which parked cars on both sides leave a narrow gap for the ego."""
+
+    kind: Literal["narrow_gap"]
+    length_m: float = within(b.SEGMENT_M, "Length of the straight; the cars stand in its middle half.", 40.0)
+    gap_m: float = Field(3.0, gt=2.0, le=8, description="Free width between the rows of parked cars.")
+    shift_m: float = Field(0.0, ge=-3, le=3, description="The gap's middle, metres left of the ego lane's middle.")
+    cars_left: int = Field(2, ge=0, le=8, description="Parked cars on the left.")
+    cars_right: int = Field(2, ge=0, le=8, description="Parked cars on the right.")
+
+
+SEGMENT_KINDS: dict[str, type[Part]] = {
+    "straight": StraightSegment,
+    "arc": ArcSegment,
+    "clothoid": ClothoidSegment,
+    "intersection": IntersectionSegment,
+    "merge": MergeSegment,
+    "split": SplitSegment,
+    "narrow_gap": NarrowGapSegment,
+}
+
+SegmentSpec = Annotated[
+    StraightSegment | ArcSegment | ClothoidSegment | IntersectionSegment | MergeSegment | SplitSegment | NarrowGapSegment,
+    Field(discriminator="kind"),
+]
+
+
+class RoadSpec(Part):
+    """A road built from segments that follow one another along the ego's path. Driving is on the right."""
+
+    lanes_forward: int = Field(1, ge=1, le=6, description="Lanes in the ego's direction at the start.")
+    lanes_backward: int = Field(1, ge=0, le=6, description="Oncoming lanes; 0: one-way.")
+    lane_width_m: float = Field(3.5, ge=2.2, le=6, description="Width of every lane.")
+    median_m: float = Field(0.0, ge=0, le=30, description="Raised median between the directions; 0: markings only.")
+    shoulder_m: float = Field(0.5, ge=0, le=6, description="Paved strip outside the outer lanes.")
+    parking_m: float = Field(0.0, ge=0, le=6, description="Parking strip outside the outer lanes, instead of the shoulder.")
+    speed_limit_mps: float | None = within(b.LIMIT_MPS, "Speed limit of all lanes.", None)
+    centre_paint: CentrePaint = Field("double_yellow", description="Line between the directions.")
+    heading_deg: float = within(b.ANGLE_DEG, "Direction of the road's beginning, from east to the left.", 0.0)
+    segments: tuple[SegmentSpec, ...] = Field(min_length=1, max_length=int(b.ELEMENTS.high), description="Segments in driving order.")
+
+
+SHIPPED = ("argoverse", "commonroad", "cosmos", "usdz")
+
+
+class LogSpec(Part):
+    """A recorded drive. Exactly one of the sources is given; relative paths start at this file's folder."""
+
+    argoverse: str | None = Field(None, min_length=1, description="Folder of one Argoverse 2 log.")
+    commonroad: str | None = Field(None, min_length=1, description="CommonRoad XML file.")
+    cosmos: str | None = Field(None, min_length=1, description="Folder of one Cosmos-Drive-Dreams clip.")
+    usdz: str | None = Field(None, min_length=1, description="AlpaSim scene file.")
+    source: str | None = Field(
+        default=None, min_length=1, description="A source of an installed package, or package.module:Class; it reads path."
+    )
+    path: str | None = Field(None, min_length=1, description="File or folder that source reads.")
+    ego: int | str | None = Field(None, description="CommonRoad: the recorded vehicle that becomes the ego; none: chosen.")
+    actors: Literal["replay", "idm", "none"] = Field("replay", description="Replay the recorded traffic, let it react, or drop it.")
+
+    @model_validator(mode="after")
+    def _one(self) -> LogSpec:
+        given = [key for key in (*SHIPPED, "source") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"{len(given)} sources ({', '.join(given) or 'none'}) | give one of {', '.join(SHIPPED)}, or source and path")
+        if (self.source is None) != (self.path is None):
+            raise ValueError("only one of source and path | give both, or one of the shipped sources")
+        return self
+
+    @property
+    def recorded(self) -> tuple[str, str, str]:
+        """Return the source, the path, and the key under which the path stands."""
+        if self.source is not None:
+            return self.source, str(self.path), "path"
+        (kind,) = (kind for kind in SHIPPED if getattr(self, kind) is not None)
+        return kind, str(getattr(self, kind)), kind
+
+
+Label = Literal["car", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "other"]
+ActorId = Annotated[str, Field(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", description="Unique name.")]
+
+
+class _Actor(Part):
+    id: ActorId
+    label: Label = Field("car", description="Class of road user.")
+    size_m: tuple[Side, Side, Side] | None = Field(None, description="Length, width, height; none: as usual.")
+
+
+class _InLane(_Actor):
+    lane: int | str = Field(
+        default=0, description="Forward lane (0 is next to the centre line), oncoming lane (-1 is next to it), or a lane id."
+    )
+    s_m: float = within(b.STATION_M, "Centre, metres along the road from the ego's start (lane id: from that lane's beginning).")
+    offset_m: float = within(b.OFFSET_M, "Metres left of the lane's middle, in its driving direction.", 0.0)
+
+
+class ParkedActor(_Actor):
+    """A standing vehicle, or a row of them, beside the outer lane."""
+
+    kind: Literal["parked"]
+    s_m: float = within(b.STATION_M, "Centre, metres along the road from the ego's start.")
+    side: Literal["left", "right"] = Field("right", description="Side of the road.")
+    clearance_m: float = within(b.OFFSET_M, "From the outer lane's edge to the body; negative: it stands in the lane.", 0.3)
+    count: int = Field(1, ge=1, le=40, description="Vehicles in the row.")
+    spacing_m: float = within(b.SPACING_M, "Distance between their centres.", 7.0)
+    yaw_deg: float = Field(0.0, ge=-180, le=180, description="Turned to the left against the lane.")
+
+
+class LoggedActor(_Actor):
+    """A track given point by point."""
+
+    kind: Literal["logged"]
+    points: tuple[tuple[Moment, Coordinate, Coordinate, Angle], ...] = Field(
+        min_length=1,
+        max_length=int(b.POINTS.high),
+        description="Rows of time in seconds after the log's start, x, y in metres (world), yaw in radians.",
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LoggedActor:
+        times = [p[0] for p in self.points]
+        if any(b - a < 1e-6 for a, b in itertools.pairwise(times)):
+            raise ValueError("the times of points do not increase | order the rows by time, each time once")
+        return self
+
+
+class IdmActor(_InLane):
+    """A driver who follows the lane, keeps the distance (also to the ego) and reacts in the closed loop."""
+
+    kind: Literal["idm"]
+    speed_mps: float = within(b.SPEED_MPS, "Speed at the start.")
+    desired_speed_mps: float | None = within(b.CRUISE_MPS, "Desired speed; none: the speed at the start, at least 1.", None)
+    headway_s: float = within(b.HEADWAY_S, "Time gap.", 1.5)
+    min_gap_m: float = Field(2.0, gt=0, le=b.GAP_M.high, description="Gap at standstill.")
+    accel_mps2: float = within(b.ACCEL_MPS2, "Acceleration.", 1.5)
+    brake_mps2: float = within(b.ACCEL_MPS2, "Comfortable deceleration.", 2.0)
+
+
+class DriveActor(_InLane):
+    """A vehicle that drives a given speed over time and reacts to nobody."""
+
+    kind: Literal["drive"]
+    speeds: tuple[tuple[Annotated[float, Field(ge=0, le=b.MOMENT_S.high)], Speed], ...] = Field(
+        min_length=1,
+        max_length=int(b.POINTS.high),
+        description="Rows of time in seconds after the log's start and speed in m/s; linear in between.",
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> DriveActor:
+        times = [p[0] for p in self.speeds]
+        if any(b <= a for a, b in itertools.pairwise(times)):
+            raise ValueError("the times of speeds do not increase | order the rows by time, each time once")
+        return self
+
+
+class OncomingActor(_Actor):
+    """A vehicle that comes the other way at a constant speed."""
+
+    kind: Literal["oncoming"]
+    lane: int = within(b.LANE_INDEX, "Oncoming lane; 0 is next to the centre line.", 0)
+    s_m: float = within(b.STATION_M, "Centre at the start, metres along the ego's path from the ego's start.")
+    speed_mps: float = within(b.SPEED_MPS, "Speed.")
+    offset_m: float = within(b.OFFSET_M, "Metres left of the lane's middle, in its driving direction.", 0.0)
+
+
+class HardBrakeActor(_InLane):
+    """A leader who brakes hard, and may drive on."""
+
+    kind: Literal["hard_brake"]
+    speed_mps: float = within(b.CRUISE_MPS, "Speed before braking.")
+    brake_at_us: int = within(b.TIME_US, "Start of braking after the log's start.")
+    decel_mps2: float = Field(6.0, ge=b.ACCEL_MPS2.low, le=10, description="Deceleration.")
+    end_speed_mps: float = within(b.SPEED_MPS, "Speed after braking.", 0.0)
+    resume_at_us: int | None = within(b.TIME_US, "When it accelerates again to its first speed; none: never.", None)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> HardBrakeActor:
+        if self.end_speed_mps >= self.speed_mps:
+            raise ValueError(f"end_speed_mps = {self.end_speed_mps} is not below speed_mps = {self.speed_mps} | lower it")
+        if self.resume_at_us is not None and self.resume_at_us <= self.brake_at_us:
+            raise ValueError("resume_at_us is not after brake_at_us | give a later time")
+        return self
+
+
+class CutInActor(_Actor):
+    """A vehicle that changes into another lane with a quintic lateral motion."""
+
+    kind: Literal["cut_in"]
+    from_lane: int = within(b.LANE_INDEX, "Forward lane at the start; 0 is next to the centre line.")
+    to_lane: int = within(b.LANE_INDEX, "Forward lane afterwards.")
+    s_m: float = within(b.STATION_M, "Centre at the start, metres along the road from the ego's start.")
+    speed_mps: float = within(b.CRUISE_MPS, "Speed.")
+    at_us: int = within(b.TIME_US, "Start of the lateral motion after the log's start.")
+    change_us: int = Field(2_500_000, ge=b.PERIOD_US.low, le=b.TIME_US.high, description="Duration of the lateral motion.")
+    end_speed_mps: float | None = within(b.SPEED_MPS, "Speed afterwards; none: the same.", None)
+    decel_mps2: float = within(b.ACCEL_MPS2, "How fast the speed changes after the lateral motion has begun.", 2.0)
+
+    @model_validator(mode="after")
+    def _two_lanes(self) -> CutInActor:
+        if self.from_lane == self.to_lane:
+            raise ValueError(f"from_lane and to_lane are both {self.to_lane} | give two different lanes")
+        return self
+
+
+class CrossingActor(_Actor):
+    """A pedestrian (or cyclist) who crosses, timed against the ego."""
+
+    kind: Literal["crossing_pedestrian"]
+    label: Label = Field("pedestrian", description="Class of road user.")
+    s_m: float = within(b.STATION_M, "Place of crossing, metres along the road from the ego's start.")
+    side: Literal["left", "right"] = Field("right", description="Side that the crossing starts from.")
+    speed_mps: float = within(b.CRUISE_MPS, "Walking speed.", 1.4)
+    before_ego_s: float = Field(
+        default=1.0,
+        ge=-b.TIME_US.high * 1e-6,
+        le=b.TIME_US.high * 1e-6,
+        description="How long before the ego would be there, undisturbed, the middle of the ego's lane is reached.",
+    )
+    margin_m: float = within(b.GAP_M, "Distance behind the road edge at which the walk starts and ends.", 1.0)
+
+
+ACTOR_KINDS: dict[str, type[Part]] = {
+    "parked": ParkedActor,
+    "logged": LoggedActor,
+    "idm": IdmActor,
+    "drive": DriveActor,
+    "oncoming": OncomingActor,
+    "hard_brake": HardBrakeActor,
+    "cut_in": CutInActor,
+    "crossing_pedestrian": CrossingActor,
+}
+
+ActorSpec = Annotated[
+    ParkedActor | LoggedActor | IdmActor | DriveActor | OncomingActor | HardBrakeActor | CutInActor | CrossingActor,
+    Field(discriminator="kind"),
+]
