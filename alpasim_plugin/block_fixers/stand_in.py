@@ -10,13 +10,13 @@ from pathlib import Path
 
 import torch
 
+from alpasim_plugin.block_fixers.networks import condition_sizes
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.seeding import derive_seed, stream
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.fixers.networks import condition_sizes
-from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 
 VELOCITY = 0.25  # root mean square of the predicted velocity; latents have about unit variance
 MODULATION = 0.1  # shift, scale and gate of the final layer

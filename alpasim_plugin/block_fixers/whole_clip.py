@@ -10,16 +10,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import on_grid, to_clip, to_images
+from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_networks
+from alpasim_plugin.block_fixers.onefixer import latent_noise
+from alpasim_plugin.block_fixers.pipeline import condition_of, map_video, opacity_input
+from alpasim_plugin.block_fixers.sampling import context_level, flow_step, mixed_source, opacity_mask, sources_needed
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.types import U8, BlockRule
-from alpasim_plugin.fixers.networks import LATENT, Networks, decode, load_networks
-from alpasim_plugin.fixers.noise import latent_noise
-from alpasim_plugin.fixers.pipeline import condition_of, map_video, opacity_input
-from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.views import group_views, to_clip, to_images
+from alpasim_plugin.fixers.views import group_views
 from alpasim_plugin.lab.bench.fixer_speed import Clip
-from alpasim_plugin.nets.clips import on_grid
-from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, sources_needed
-from alpasim_plugin.nets.schedule import context_level, from_names
+from alpasim_plugin.nets.schedule import from_names, interpolant
 
 
 def refine_latents(

@@ -49,7 +49,9 @@ def _fixers() -> dict[str, str]:
     listed = {}
     for name, help_text in names("fixer").items():
         spec = unidentified("fixer", name)
-        listed[name] = f"{help_text} [{note_of(spec, declaration_of(load(spec.target, 'fixer'), spec.settings, Path()))}]"
+        factory = load(spec.target, "fixer")
+        help_text = getattr(factory, "help", {}).get(name, help_text)
+        listed[name] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings, Path()))}]"
     return listed
 
 

@@ -9,63 +9,81 @@ that the weights were trained with. Only safetensors is read: a pickle is refuse
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
-from alpasim_plugin.fixers.settings import LatentFixerSettings
+from alpasim_plugin.fixers.settings import WeightedSettings
 from alpasim_plugin.io.atomic import write_safetensors
 from alpasim_plugin.io.reading.files import kind_of, parse_json
-from alpasim_plugin.nets.checkpoints import StateDict, load_weights
 from alpasim_plugin.nets.headers import read_metadata
-from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.plugins.interfaces import Declaration, Fixer
 
-BundleSettings = LatentFixerSettings | PixelFixerSettings
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from alpasim_plugin.nets.checkpoints import StateDict
+
 FORMAT = "simrun-fixer-1"
 DOING = "loading a fixer's weights"
 RENAMED = {"onefixer-tiny": "onefixer-dit-tiny", "onefixer-s": "onefixer-dit-s"}  # former names in the headers of older bundles
 OLDEST_KIND = "block"  # of bundles whose header names none
+FILES = ("bundle", "dit", "vae", "decoder", "prompt")  # of `WeightsSettings`
+S = TypeVar("S", bound=WeightedSettings)
 
 
 @dataclass(frozen=True)
-class Kind:
-    """What a kind of bundle holds.
+class FixerFactory(Generic[S]):
+    """Makes the sessions of a fixer with weights, and says what they are without loading a network.
 
     Args:
-        needed, optional: Parts.
-        must_match: Settings that give wrong images at other values than those of the training.
-        may_differ: Settings that may have other values, which the label then names.
+        settings_model: Of its settings.
+        session: Makes one rollout's session from settings, scene id, seed, device and threads. It imports what loads torch.
+        help: One line for every fixer that the factory makes, by its name.
     """
 
-    needed: frozenset[str]
-    optional: frozenset[str]
-    must_match: tuple[str, ...]
-    may_differ: tuple[str, ...]
+    settings_model: type[S]
+    session: Callable[[S, str, int, str, int | None], Fixer]
+    help: Mapping[str, str] = field(default_factory=dict)
 
-    def problems(self, parts: Iterable[str]) -> list[str]:
-        """Return what is missing and what does not belong."""
-        found = set(parts)
-        return [f"no {part}.*" for part in sorted(self.needed - found)] + [
-            f"unknown part {part}.*" for part in sorted(found - self.needed - self.optional)
-        ]
+    def __call__(self, settings: S, scene_id: str, seed: int = 0, device: str = "cpu", threads: int | None = None) -> Fixer:
+        """Make one rollout's session."""
+        return self.session(settings, scene_id, seed, device, threads)
+
+    def describe(self, settings: S) -> Declaration:
+        """Say whose weights the settings name.
+
+        Raises:
+            InputError: Weights that are named but not there.
+        """
+        files = {f"weights.{part}": path for part in FILES if (path := settings.weights.path(part)) is not None}
+        for key, path in files.items():
+            if not path.is_file():
+                do = f"correct --set fixer.{key}, or where it is written"
+                raise InputError("looking for a fixer's weights", f"{settings.name}: {key} = {path}", "no such file", do)
+        if "weights.bundle" in files:
+            trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
+            return Declaration(files, trained, "trained" if trained else "untrained")
+        trained = "weights.dit" in files
+        missing = next((part for part in settings.needed_weights if f"weights.{part}" not in files), None)
+        if settings.untrained == "refuse" and missing is not None:
+            note = f"weights missing: {missing}" if files else "weights missing"
+            return Declaration(files, trained, note, missing=weights_to_give(missing, getattr(settings, "trained_by", None)))
+        return Declaration(files, trained, "weights of a checkpoint" if trained else f"untrained ({settings.untrained})")
 
 
-_LATENT_PARTS = frozenset({"dit", "vae"}), frozenset({"decoder", "prompt"})
-_LATENT = ("rope_ratios", "vae.kind", "decoder.kind", "decoder.scaled")
-KINDS: Mapping[str, Kind] = {
-    "block": Kind(
-        *_LATENT_PARTS,
-        (*_LATENT, "block_latents", "render_input", "opacity_input"),
-        ("steps", "history", "window", "sink", "holes", "uses_map", "no_map"),
-    ),
-    "render-step": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "render_level.alpha", "render_level.sigma"), ("references",)),
-    "noise-window": Kind(*_LATENT_PARTS, (*_LATENT, "opacity_to_decoder", "window_frames"), ("steps", "stride_frames", "stitch", "noise")),
-    "per-frame": Kind(frozenset({"generator"}), frozenset(), (), ("steps", "holes", "uses_map")),
-}
+def weights_to_give(part: str, trained_by: str | None = None) -> str:
+    """Return what to do about missing weights, as the last part of an error.
+
+    Args:
+        part: Key of the settings' ``weights``.
+        trained_by: The command that trains them, where there is one.
+    """
+    choice = "" if part == "bundle" else " (or fixer.weights.bundle=FILE)"
+    do = f"give --set fixer.weights.{part}=FILE{choice}; for timing alone, fixer.untrained=random"
+    return do if trained_by is None else f"train it: {trained_by}; then {do}"
 
 
 @dataclass(frozen=True)
@@ -78,7 +96,7 @@ class Bundle:
 
 
 def save_bundle(
-    path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: BundleSettings, *, trained: bool, note: str = ""
+    path: str | Path, parts: Mapping[str, Mapping[str, Tensor]], settings: WeightedSettings, *, trained: bool, note: str = ""
 ) -> None:
     """Write a bundle atomically.
 
@@ -94,35 +112,38 @@ def save_bundle(
         InputError: A part that is not known, or one that is missing.
     """
     kind = settings.bundle_kind
-    problems = KINDS[kind].problems(parts)
+    problems = kind.problems(parts)
     if problems:
-        do = f"give {', '.join(sorted(KINDS[kind].needed))}, and nothing else but {', '.join(sorted(KINDS[kind].optional)) or 'these'}"
+        do = f"give {', '.join(sorted(kind.needed))}, and nothing else but {', '.join(sorted(kind.optional)) or 'these'}"
         raise InputError("saving a fixer's weights", str(path), "; ".join(problems), do)
     tensors = {f"{part}.{key}": value for part, sd in parts.items() for key, value in sd.items()}
     plain = settings.model_dump(mode="json", exclude={"weights"})
-    header = {"format": FORMAT, "kind": kind, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)}
+    header = {"format": FORMAT, "kind": kind.name, "trained": str(trained).lower(), "note": note, "settings": json.dumps(plain)}
     write_safetensors(path, tensors, header)
 
 
-def read_bundle(path: str | Path, settings: BundleSettings) -> Bundle:
+def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     """Read a bundle for use with some settings.
 
     Raises:
         InputError: Not a safetensors file, not a bundle, a digest that differs, or weights that were made for other settings.
     """
     header, trained_with = _header(path)
-    name = settings.bundle_kind
+    kind = settings.bundle_kind
     found_kind = header.get("kind", OLDEST_KIND)
-    if found_kind != name:
+    if found_kind != kind.name:
         do = f"take a fixer of that kind: `simrun list fixers`, this bundle is for {trained_with['name']}"
-        raise InputError(DOING, f"{path} with the settings of {settings.name}", f"a bundle of the kind {found_kind!r}, not {name!r}", do)
-    kind = KINDS[name]
+        raise InputError(
+            DOING, f"{path} with the settings of {settings.name}", f"a bundle of the kind {found_kind!r}, not {kind.name!r}", do
+        )
     # A header written before a setting existed lacks it: its weights were trained at what is now the default.
     trained_with = {**_defaults(settings), **trained_with}
     differs = [(key, _at(trained_with, key), _at(settings.model_dump(mode="json"), key)) for key in (*kind.must_match, *kind.may_differ)]
     wrong = [f"{key} is {used} for {due}" for key, due, used in differs if due != used and key in kind.must_match]
     if wrong:
         raise InputError(DOING, f"{path} with the settings of {settings.name}", "; ".join(wrong), "set these as the weights need them")
+    from alpasim_plugin.nets.checkpoints import load_weights  # loads torch
+
     parts = parts_of(load_weights(path, sha256=settings.weights.sha256.bundle))
     problems = kind.problems(parts)
     if problems:
@@ -145,16 +166,6 @@ def bundle_fixer(path: str | Path) -> tuple[str, tuple[str, ...]]:
     if not isinstance(name, str):
         raise InputError(DOING, f"{path}, settings in its header", f"name: {kind_of(name)}", "give a file that save_bundle wrote")
     return RENAMED.get(name, name), (*_flat(trained_with), f"weights.bundle={json.dumps(str(Path(path).absolute()))}")
-
-
-def load_tiny_vae(path: str | Path) -> TinyVAE:
-    """Return the tiny autoencoder in a file: a bundle's, or one that `TinyVAE.save` wrote.
-
-    Raises:
-        InputError: Neither, or a bundle with another kind of autoencoder.
-    """
-    tensors = load_weights(path)
-    return TinyVAE.from_state_dict(parts_of(tensors).get("vae", tensors), source=str(path))
 
 
 def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
@@ -181,7 +192,7 @@ def _header(path: str | Path) -> tuple[Mapping[str, str], dict[str, object]]:
     return header, settings
 
 
-def _defaults(settings: BundleSettings) -> dict[str, object]:
+def _defaults(settings: WeightedSettings) -> dict[str, object]:
     """Return the settings that have a default, at it, as JSON has them."""
     fields = type(settings).model_fields.items()
     return {key: field.get_default() for key, field in fields if isinstance(field.get_default(), str | bool | int | float)}

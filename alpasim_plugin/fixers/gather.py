@@ -68,3 +68,21 @@ def _gather_fine(render, opacity, output, fine):
                         for c in range(3):
                             cell[run * r + 3 * k + c] = render[b, y, x, c]
                             cell[three + one + run * r + 3 * k + c] = output[b, y, x, c]
+
+
+def draw_and_gather() -> None:
+    """Draw a line and a car, and gather a picture's cells: a tiny case that makes numba compile the kernels of what a fixer reads."""
+    from alpasim_plugin.core.geometry import se2
+    from alpasim_plugin.core.types import Box, CameraSpec, LaneMap
+    from alpasim_plugin.semantic_map.draw import draw_map
+    from alpasim_plugin.semantic_map.prepare import ActorBox, prepare_map
+
+    side_px = 16
+    ahead = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # camera axes in a rig that looks along x
+    edge = np.array([[2.0, -1.0, 0.0], [9.0, 1.0, 0.0]])
+    camera = CameraSpec("front", side_px, side_px, np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), ahead)
+    car = ActorBox(se2(5.0, 0.0, 0.0, 0.8), Box(4.5, 1.9, 1.6), "car")
+    draw_map(prepare_map(LaneMap({}, road_edges=(edge,))), camera, ahead, [car], threads=1)
+    image = torch.zeros(1, side_px, side_px, 3)
+    state = PixelState(image, image, image[:, ::CELL, ::CELL], image, image)
+    gather_cells_cpu(image, image[..., :1], image, state, image + 1)

@@ -1,8 +1,12 @@
-"""The generator in pixels as a streaming session: one frame in, one frame out, a history per camera, every frame guarded."""
+"""The generator in pixels as a streaming session: one frame in, one frame out, a history per camera, every frame guarded.
+
+`fix_frame` is one frame through the network, tensors in and tensors out: source (Eq. 1), flow steps (Eq. 2), the harmlessness guard. Its
+state goes in and comes out, and nothing else is remembered. Several cameras are a batch.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,14 +17,58 @@ from torch import Tensor
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, I64, U8, BlockRule, Fixer, Frame
 from alpasim_plugin.fixers import guard
-from alpasim_plugin.fixers.devices import take_threads
-from alpasim_plugin.fixers.pixel_noise import content_key, pixel_noise
-from alpasim_plugin.fixers.pixel_pipeline import PixelInputs, fix_frame, load_generator
+from alpasim_plugin.fixers.guard import render_share
+from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import HALF, Views, check_continues, group_views
+from alpasim_plugin.nets.machine_probe import take_threads
 from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
-from alpasim_plugin.nets.pixel_source import sparse_source
+from alpasim_plugin.nets.pixel_source import content_key, pixel_noise, sparse_source
+from alpasim_plugin.nets.schedule import from_names, interpolant
+
+
+@dataclass(frozen=True)
+class PixelInputs:
+    """One frame of B cameras; sides are multiples of 16."""
+
+    render: Tensor  # (B, H, W, 3) in [-1, 1]
+    opacity: Tensor  # (B, H, W, 1), 0 to 1
+    sdmap: Tensor  # (B, H, W, 3) in [-1, 1]; black where there is no map
+
+
+@torch.inference_mode()
+def fix_frame(
+    generator: LoadedGenerator,
+    settings: PixelFixerSettings,
+    inputs: PixelInputs,
+    state: PixelState,
+    source: Callable[[int], Tensor],
+) -> tuple[Tensor, PixelState]:
+    """Fix one frame.
+
+    Args:
+        generator: Network.
+        settings: Steps and guard.
+        inputs: The frame.
+        state: Of the same cameras, from `PixelGenerator.start` or the last call.
+        source: Returns the source z_1 (Eq. 1) of a flow step by its number, ``(B, H, W, 3)``.
+
+    Returns:
+        ``(B, H, W, 3)``, not clipped to [-1, 1], and the state after the frame, whose last output is this one.
+    """
+    render = inputs.render
+    images = render, inputs.opacity, inputs.sdmap, state
+    out, after = generator.step(*images, source(0))
+    for index, level in enumerate(from_names(settings.steps)[1:], start=1):
+        t = level.sigma
+        out, after = generator.net(*images, interpolant(out, source(index), t), render.new_full((len(render),), t))
+    if settings.keep_render:
+        share = render_share(out, render, inputs.opacity, inputs.sdmap, state.output)
+        if share is not None:
+            out = torch.lerp(out, render, share)
+            after = after._replace(output=out.clamp(-1, 1))
+    return out, after
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,26 @@
-"""Settings of the per-frame generator in pixels."""
+"""The per-frame generator in pixels before it is loaded: its settings, its kind of bundle, and its factory."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from alpasim_plugin.fixers.settings import FixerSettings, Part, Positive, Unit, WeightsSettings, check_no_blocks, check_steps, counted_steps
+from alpasim_plugin.fixers.bundle import FixerFactory
+from alpasim_plugin.fixers.settings import (
+    BundleKind,
+    Part,
+    Positive,
+    Unit,
+    WeightedSettings,
+    WeightsSettings,
+    check_no_blocks,
+    check_steps,
+    counted_steps,
+)
+
+if TYPE_CHECKING:
+    from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 
 
 class PixelSizesSettings(Part):
@@ -21,16 +35,16 @@ class PixelSizesSettings(Part):
     memory: int = Field(default=0, ge=0, description="Past frames, every fourth, that are attended to at 1/16; 0: none.")
 
 
-class PixelFixerSettings(FixerSettings):
+PER_FRAME = BundleKind("per-frame", frozenset({"generator"}), may_differ=("steps", "holes", "uses_map"))
+
+
+class PixelFixerSettings(WeightedSettings):
     """A causal generator in pixels, one frame at a time."""
 
-    bundle_kind: ClassVar[str] = "per-frame"  # of `alpasim_plugin.fixers.bundle.KINDS`
+    bundle_kind: ClassVar[BundleKind] = PER_FRAME
     uses_map: bool = Field(default=True, description="Whether the semantic map is drawn and given to the fixer.")
     generator: PixelSizesSettings = Field(default=PixelSizesSettings(), description="Sizes where no weights say them.")
     weights: WeightsSettings = Field(default=WeightsSettings(), description="File with weights: `bundle` alone.")
-    untrained: Literal["identity", "random", "refuse"] = Field(
-        default="refuse", description="Initialisation without weights: returns the render (identity), random, or an error (refuse)."
-    )
     steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
     holes: Literal["noise", "render", "everywhere"] = Field(
         default="noise",
@@ -69,3 +83,12 @@ class PixelFixerSettings(FixerSettings):
         if parts:
             raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")
         return self
+
+
+def _session(settings: PixelFixerSettings, scene_id: str, seed: int, device: str, threads: int | None) -> PixelFixer:
+    from alpasim_plugin.fixers.pixel_fixer import PixelFixer  # loads torch
+
+    return PixelFixer(settings, scene_id, seed, device, threads)
+
+
+per_frame = FixerFactory(PixelFixerSettings, _session)

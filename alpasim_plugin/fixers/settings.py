@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.config import apply_overrides, load_yaml, validate
 from alpasim_plugin.io.yaml_positions import Document
 from alpasim_plugin.nets import schedule
-from alpasim_plugin.nets.styles import CLEAR
 
 DOING = "reading the settings of a fixer"
 Positive = Annotated[int, Field(ge=1)]
@@ -88,40 +86,6 @@ class FixerSettings(Part):
         return load_settings(name, cls, overrides)
 
 
-class DiTSettings(Part):
-    """Sizes of the transformer where they are not read off weights."""
-
-    width: Positive = Field(description="Channels of the token stream.")
-    blocks: Positive = Field(description="Transformer blocks.")
-    head_width: Positive = Field(description="Channels of an attention head, even.")
-    mlp_width: Positive = Field(description="Inner channels of the feed-forward part.")
-    adaln_rank: Positive = Field(description="Rank of the time modulation.")
-    text_width: Positive = Field(description="Width of the prompt's features.")
-    context_width: Positive = Field(description="Width of the projected prompt.")
-
-
-class CodecSettings(Part):
-    """The video autoencoder."""
-
-    kind: Literal["tiny", "wan"] = Field(description="tiny: TinyVAE. wan: the Wan 2.1 autoencoder at any width.")
-    base: Positive = Field(default=96, description="Width of an untrained wan autoencoder: 96 as published, 24 for LightVAE.")
-    widths: tuple[Positive, Positive, Positive, Positive, Positive] = Field(
-        default=(64, 96, 96, 64, 48),
-        description="Channels of an untrained tiny autoencoder: encoder at 1/4 and 1/8, decoder at 1/8, 1/4 and per frame.",
-    )
-
-
-class DecoderSettings(Part):
-    """From latents to frames."""
-
-    kind: Literal["latent", "render", "taehv"] = Field(
-        default="latent",
-        description="latent: the autoencoder's decoder. render: the same, and it also sees the render's frames (tiny only). "
-        "taehv: the tiny Wan decoder.",
-    )
-    scaled: bool = Field(default=False, description="taehv: weights expect de-normalised latents (LightTAE).")
-
-
 class DigestSettings(Part):
     """Expected SHA-256 digests, hexadecimal, checked before the tensors are read."""
 
@@ -155,6 +119,45 @@ class WeightsSettings(Part):
         return self
 
 
+@dataclass(frozen=True)
+class BundleKind:
+    """What a kind of bundle holds; the module that owns a fixer's settings declares its kind.
+
+    Args:
+        name: In the header of a bundle.
+        needed, optional: Parts, which are the first words of the tensors' keys.
+        must_match: Settings that give wrong images at other values than those of the training.
+        may_differ: Settings that may have other values, which the label then names.
+    """
+
+    name: str
+    needed: frozenset[str]
+    optional: frozenset[str] = frozenset()
+    must_match: tuple[str, ...] = ()
+    may_differ: tuple[str, ...] = ()
+
+    def problems(self, parts: Iterable[str]) -> list[str]:
+        """Return what is missing and what does not belong."""
+        found = set(parts)
+        unknown = sorted(found - self.needed - self.optional)
+        return [f"no {part}.*" for part in sorted(self.needed - found)] + [f"unknown part {part}.*" for part in unknown]
+
+
+class WeightedSettings(FixerSettings):
+    """Settings of a fixer whose network has weights."""
+
+    bundle_kind: ClassVar[BundleKind]
+    weights: WeightsSettings = Field(default=WeightsSettings(), description="Files with weights.")
+    untrained: Literal["identity", "random", "refuse"] = Field(
+        default="refuse", description="Initialisation without weights: returns the render (identity), random, or an error (refuse)."
+    )
+
+    @property
+    def needed_weights(self) -> tuple[str, ...]:
+        """Files of ``weights`` that the fixer needs where no bundle is given."""
+        return ("bundle",)
+
+
 def counted_steps(value: Any) -> Any:
     """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
     if isinstance(value, int) and not isinstance(value, bool):
@@ -170,117 +173,6 @@ def check_steps(steps: tuple[float, ...]) -> None:
     """
     if any(b >= a for a, b in pairwise(steps)) or steps[0] != 1000 or steps[-1] <= 0:
         raise ValueError(f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]")
-
-
-class LatentFixerSettings(FixerSettings):
-    """Any fixer with an autoencoder and a transformer on its latents."""
-
-    bundle_kind: ClassVar[str]  # of `alpasim_plugin.fixers.bundle.KINDS`
-    dit: DiTSettings = Field(description="Sizes of the transformer where no weights say them.")
-    rope_ratios: tuple[float, float, float] = Field(default=(3.0, 3.0, 1.0), description="NTK stretch: height, width, time.")
-    vae: CodecSettings = Field(description="The video autoencoder.")
-    decoder: DecoderSettings = Field(default=DecoderSettings(), description="From latents to frames.")
-    weights: WeightsSettings = Field(default=WeightsSettings(), description="Files with weights.")
-    untrained: Literal["identity", "random", "refuse"] = Field(
-        default="refuse", description="Initialisation without weights: an identity, random, or an error (refuse)."
-    )
-    trained_by: str | None = Field(default=None, description="Command that trains the weights, for the error where there are none.")
-    precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the transformer.")
-    codec_precision: Literal["fp32", "bf16", "fp16"] = Field(default="fp32", description="Of the autoencoder.")
-    fold: bool = Field(default=True, description="Fold the modulation into the linears where there is one step.")
-
-    @property
-    def shows_render(self) -> bool:
-        """Whether the decoder sees the render."""
-        return self.decoder.kind == "render"
-
-    @property
-    @abstractmethod
-    def network_times(self) -> tuple[float, ...]:
-        """Time inputs of the network's denoising steps, 0 to 1000."""
-
-    @property
-    def finalises(self) -> bool:
-        """Whether a further call of the network writes the history."""
-        return False
-
-    @model_validator(mode="after")
-    def _decodable(self) -> Self:
-        if self.decoder.kind == "render" and self.vae.kind != "tiny":
-            raise ValueError(f"decoder.kind 'render' with vae.kind {self.vae.kind!r} | only the tiny autoencoder can see the render")
-        if self.decoder.kind == "taehv" and self.vae.kind != "wan":
-            raise ValueError(f"decoder.kind 'taehv' with vae.kind {self.vae.kind!r} | it decodes Wan latents: use vae.kind wan")
-        return self
-
-
-class OneFixerSettings(LatentFixerSettings):
-    """A causal latent fixer: autoencoder, transformer with history, flow steps."""
-
-    bundle_kind: ClassVar[str] = "block"
-    window: Positive = Field(default=6, description="Attention window in latents, the block itself and the sink included.")
-    sink: int = Field(default=0, ge=0, description="Attention sink: first latents of the rollout that stay in the window.")
-    steps: tuple[float, ...] = Field(default=(1000.0,), min_length=1, description="Named time steps, falling from 1000.")
-    history: Literal["finalise", "last-forward", "none"] = Field(
-        default="last-forward",
-        description="Keys and values cached of a block: those of an extra forward (finalise) or of the last step. none: no history, "
-        "every frame is fixed by itself.",
-    )
-    holes: Literal["noise", "render", "everywhere"] = Field(
-        default="noise",
-        description="Source of a block where the render is transparent: noise (Eq. 1), or the render. everywhere: noise alone, which needs "
-        "render_input.",
-    )
-    no_map: Literal["nothing", "black"] = Field(
-        default="nothing", description="In the map's place where there is none: nothing is added to the tokens, or a black map is encoded."
-    )
-    render_input: bool = Field(default=False, description="Whether the render's latents are a condition beside the map's.")
-    opacity_input: bool = Field(default=False, description="Whether every block of the transformer embeds the opacity (ArtiFixer).")
-    prompt: str | None = Field(
-        default=None, description="Name of a prompt that its weights learned, such as night; recipe appearance has clear, night, fog, snow."
-    )
-    graphs: Literal["auto", "off"] = Field(default="auto", description="auto: on a GPU, blocks are recorded as CUDA graphs and replayed.")
-
-    @property
-    def network_times(self) -> tuple[float, ...]:
-        """Time inputs of the network's denoising steps, 0 to 1000."""
-        return tuple(level.t for level in schedule.from_names(self.steps))
-
-    @property
-    def shows_render(self) -> bool:
-        """Whether the decoder sees the render; in another appearance than the render's, its detail would show the clear day through."""
-        return super().shows_render and self.keeps_appearance
-
-    @property
-    def keeps_appearance(self) -> bool:
-        """Whether no prompt asks for another appearance than the render's."""
-        return self.prompt in (None, CLEAR)
-
-    @property
-    def finalises(self) -> bool:
-        """Whether a further call of the network writes the history."""
-        return self.history == "finalise"
-
-    @property
-    def unit(self) -> Unit:
-        """What a block costs."""
-        frames = 1 if self.history == "none" else 4 * self.block_latents
-        return Unit(frames, len(self.steps) + self.finalises, self.block_latents, frames - 1)
-
-    @field_validator("steps", mode="before")
-    @classmethod
-    def _counted(cls, value: Any) -> Any:
-        return counted_steps(value)
-
-    @model_validator(mode="after")
-    def _consistent(self) -> OneFixerSettings:
-        check_steps(self.steps)
-        if self.sink > self.window:
-            raise ValueError(f"sink {self.sink} in a window of {self.window} | the window includes the sink: make it larger")
-        if self.history == "none" and self.block_latents != 1:
-            raise ValueError(f"block_latents {self.block_latents} without history | frames are fixed one by one: set block_latents 1")
-        if self.holes == "everywhere" and not self.render_input:
-            raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
-        return self
 
 
 def check_no_blocks(settings: FixerSettings) -> None:

@@ -1,4 +1,4 @@
-"""Convert frames to tensors and back: grouping by camera and size, padding to the block's grid, cropping.
+"""Frames of a block grouped by camera and size, checked, and stacked.
 
 A *view* is one camera's frames of a block. Views of one size form a batch.
 """
@@ -10,16 +10,12 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.types import F32, U8, Frame
-from alpasim_plugin.nets.clips import ClipSize, crop_clip, pad_clip
-from alpasim_plugin.nets.sampling import RANGE_SLACK as SLACK
 
 DOING = "giving a block of frames to a fixer"
-SIDE = 16  # pixels of a token's side
+SLACK = 1e-3  # opacity outside [0, 1] by rounding is clipped; more is an error
 HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
 
 
@@ -61,15 +57,6 @@ class Past(Protocol):
     def raw(self) -> U8:
         """Its render ``(H, W, 3)``."""
         ...
-
-
-@dataclass(frozen=True)
-class Clip:
-    """One block as the networks take it, padded in time and space."""
-
-    rgb: Tensor  # (B, 3, T, H, W) in [-1, 1]
-    alpha: Tensor | None  # (B, 1, T, H, W), 0 to 1; None where every pixel is opaque
-    maps: Tensor | None  # (B, 3, T, H, W) in [-1, 1]
 
 
 def group_views(block: Sequence[Frame], maps: Sequence[U8], frames_due: int) -> tuple[Views, ...]:
@@ -120,32 +107,6 @@ def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
         if times[0] <= past.t_us:
             found = f"a frame at {times[0]} us after one at {past.t_us} us"
             raise InputError(DOING, f"camera {camera!r}", found, "give frames in the order of time, or reset")
-
-
-def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -> Clip:
-    """Convert views to tensors: ``x / 127.5 - 1``, the last frame repeated up to ``frames_due``, edges padded to multiples of 16."""
-
-    def video(images: U8 | F32) -> Tensor:
-        x = torch.from_numpy(images).to(device).float()
-        x = x if images.dtype == np.float32 else x.div_(HALF).sub_(1)
-        x = x.permute(0, 4, 1, 2, 3)
-        short = frames_due - x.shape[2]
-        if short:
-            x = torch.cat([x, x[:, :, -1:].expand(-1, -1, short, -1, -1)], dim=2)
-        return pad_clip(x, group=1, side=SIDE)[0]
-
-    return Clip(
-        video(views.rgb),
-        None if views.alpha is None else video(views.alpha[..., None]),
-        None if views.maps is None else video(views.maps),
-    )
-
-
-def to_images(video: Tensor, size: ClipSize) -> U8:
-    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values are clipped to the range."""
-    levels = crop_clip(video, size).float().clamp(-1, 1).add_(1).mul_(HALF).round_()
-    images: U8 = levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
-    return images
 
 
 def _check_view(camera: str, frames: Sequence[Frame], maps: Sequence[U8]) -> None:
@@ -202,3 +163,12 @@ def _same(a: object, b: object) -> bool:
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return np.array_equal(a, b)
     return a is b if a is None or b is None else bool(a == b)
+
+
+@dataclass(frozen=True)
+class ClipSize:
+    """Frames, height and width of a clip before padding."""
+
+    frames: int
+    height: int
+    width: int

@@ -1,1 +1,1 @@
-"""The laboratory: training, the arms and claims of the paper, learned metrics, benches and studies."""
+"""The laboratory: what compares and trains fixers. Nothing of the product imports it."""

@@ -1,36 +1,30 @@
-"""Networks of the fixer: causal transformer, video autoencoders, weights on disk, sampling."""
+"""Networks of the fixers, and reading their weights.
+
+The networks of the block generators can be imported from here by name. The package that holds them registers them in the entry-point group
+``simrun.networks``; they are loaded on first use.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
-from alpasim_plugin.core.lazy import lazy_names
+from alpasim_plugin.core.lazy import installed
 
-if TYPE_CHECKING:
-    from alpasim_plugin.nets.dit import CosmosCausalDiT as CosmosCausalDiT
-    from alpasim_plugin.nets.dit import TextContext as TextContext
-    from alpasim_plugin.nets.sizes import DiTSizes as DiTSizes
-    from alpasim_plugin.nets.taehv import TinyDecoder as TinyDecoder
-    from alpasim_plugin.nets.tiny_vae import TinyVAE as TinyVAE
-    from alpasim_plugin.nets.wan_vae import WanVAE as WanVAE
+GROUP = "simrun.networks"
+__all__ = ["CosmosCausalDiT", "DiTSizes", "TextContext", "TinyDecoder", "TinyVAE", "WanVAE"]
 
-__all__ = [
-    "CosmosCausalDiT",
-    "DiTSizes",
-    "TextContext",
-    "TinyDecoder",
-    "TinyVAE",
-    "WanVAE",
-]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "CosmosCausalDiT": ".dit",
-        "DiTSizes": ".sizes",
-        "TextContext": ".dit",
-        "TinyDecoder": ".taehv",
-        "TinyVAE": ".tiny_vae",
-        "WanVAE": ".wan_vae",
-    },
-)
+def __getattr__(name: str) -> Any:
+    """Return a network of an installed package.
+
+    Raises:
+        AttributeError: Not the name of a network.
+        ImportError: The network's package is not installed.
+    """
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in installed(GROUP):
+        raise ImportError(
+            f"{name}: no installed package registers this network (entry points {GROUP}); install simrun with its block fixers"
+        )
+    return installed(GROUP)[name].load()

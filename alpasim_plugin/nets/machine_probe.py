@@ -3,6 +3,8 @@
 Instruction sets alone do not tell: bfloat16 is several times as fast as float32 where the processor multiplies matrices of it, about as
 fast where it only converts, and several times slower where it is emulated; and a second thread that shares a core may cost more than it
 brings. Within a run each node is asked once, for all of its workers (`alpasim_plugin.io.measured`).
+
+Where a fixer computes.
 """
 
 from __future__ import annotations
@@ -10,11 +12,12 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from alpasim_plugin.core.errors import FixerError
 from alpasim_plugin.io.measured import measured
 
 REPEATS = 5
@@ -122,3 +125,64 @@ def _ms(image: Tensor, kernel: Tensor) -> float:
     began = time.perf_counter()
     _convolve(image, kernel)
     return (time.perf_counter() - began) * 1e3
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A precision, and the reason for it."""
+
+    name: Literal["fp32", "bf16"]
+    why: str
+    probe: Probe | None = None  # what was measured; None where nothing had to be
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for a record, with the measured error of one convolution at this precision."""
+        out: dict[str, Any] = {"name": self.name, "why": self.why}
+        if self.probe is not None:
+            out |= {"error": self.probe.bf16_error if self.name == "bf16" else self.probe.fp32_error, "probe": asdict(self.probe)}
+        return out
+
+
+def choose_precision(wanted: Literal["auto", "fp32", "bf16"] = "auto", device: str = "cpu") -> Choice:
+    """Return the precision of convolutions that pays on this machine.
+
+    ``auto`` is bfloat16 on a GPU, and on a processor on which a convolution in bfloat16 takes at most two thirds of the time that it takes
+    in float32 (`alpasim_plugin.nets.machine_probe`). Where bfloat16 is emulated it takes several times as long.
+
+    Example:
+        >>> choose_precision("fp32")
+        Choice(name='fp32', why='as set', probe=None)
+    """
+    if wanted != "auto":
+        return Choice(wanted, "as set")
+    if device.split(":")[0] == "cuda":
+        return Choice("bf16", "a GPU")
+    probe = probe_precision()
+    gain = probe.fp32_ms / probe.bf16_ms
+    return Choice("bf16" if gain >= WORTH else "fp32", f"bfloat16 is {gain:.2g} times as fast as float32 on this processor", probe)
+
+
+def require_device(device: str, doing: str) -> None:
+    """Refuse a CUDA device on a machine without one.
+
+    Raises:
+        FixerError: torch sees no such device.
+    """
+    if device.split(":")[0] == "cuda" and not torch.cuda.is_available():
+        raise FixerError(doing, f"device {device!r}", "torch sees no CUDA device", "use --device cpu")
+
+
+def take_threads(threads: int | None) -> dict[str, Any]:
+    """Set torch's threads to as many of the allowed ones as pay.
+
+    Args:
+        threads: That this process may use; None leaves their number.
+
+    Returns:
+        The choice with its measurements, under ``threads``, for a fixer's ``chosen``; empty where nothing was chosen.
+    """
+    if threads is None:
+        return {}
+    number = choose_threads(threads)
+    torch.set_num_threads(number.number)
+    return {"threads": number.as_dict()}

@@ -22,8 +22,19 @@ from torch.random import fork_rng
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import listed, weight
-from alpasim_plugin.nets.pixel_layers import Conv3, Downsample, ResidualBlock, Upsample, activation, cells, pixels, repeat_per_pixel, small
-from alpasim_plugin.nets.pixel_memory import FrameMemory, MemoryState
+from alpasim_plugin.nets.pixel_layers import (
+    Conv3,
+    Downsample,
+    FrameMemory,
+    MemoryState,
+    ResidualBlock,
+    Upsample,
+    activation,
+    cells,
+    pixels,
+    repeat_per_pixel,
+    small,
+)
 
 GRID_PX = 16  # sides are multiples of it
 CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
@@ -41,7 +52,7 @@ class PixelSizes:
         blocks: Residual blocks at 1/4, 1/8, 1/16, and on the way back at 1/8 and 1/4.
         detail: Channels of the detail path at 1/2.
         hidden: Recurrent channels at 1/4; 0: none.
-        memory: Past frames that are attended to at 1/16 (`nets.pixel_memory`); 0: none.
+        memory: Past frames that are attended to at 1/16 (`nets.pixel_layers`); 0: none.
     """
 
     widths: tuple[int, int, int] = (48, 80, 160)

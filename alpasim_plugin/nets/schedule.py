@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from torch import Tensor
+
 from alpasim_plugin.core.errors import InputError
 
 SHIFT = 5.0
 TABLE = 1000
-CONTEXT_STEP = 128.0
 
 
 @dataclass(frozen=True)
@@ -26,43 +27,6 @@ class NoiseLevel:
 
     t: float  # time input of the network, 0 to 1000
     sigma: float  # noise weight of the interpolant, 0 to 1
-
-
-@dataclass(frozen=True)
-class RenderLevel:
-    """The noise level that a render is taken to have: ``z_r = alpha z_0 + sigma eps``.
-
-    Example:
-        >>> harmonizer = RenderLevel(1.0, 0.25)
-        >>> harmonizer.t, harmonizer.scale, harmonizer.network_t
-        (0.2, 0.8, 200.0)
-
-    Raises:
-        InputError: Values that are not positive.
-    """
-
-    alpha: float
-    sigma: float
-
-    def __post_init__(self) -> None:
-        if not (self.alpha > 0 and self.sigma > 0):
-            found = f"alpha {self.alpha:g}, sigma {self.sigma:g}"
-            raise InputError("choosing the noise level of a render", "alpha and sigma", found, "give values above 0")
-
-    @property
-    def t(self) -> float:
-        """Time on the straight path, 0 to 1."""
-        return self.sigma / (self.alpha + self.sigma)
-
-    @property
-    def scale(self) -> float:
-        """Factor from the render's latents to the point on the path."""
-        return 1 / (self.alpha + self.sigma)
-
-    @property
-    def network_t(self) -> float:
-        """Time input of the network, a whole number of 0 to 1000."""
-        return float(round(TABLE * self.t))
 
 
 def shifted(u: float) -> float:
@@ -85,17 +49,6 @@ def named(step: float) -> NoiseLevel:
         raise InputError("choosing denoising steps", "named step", f"{step:g}", f"use steps above 0 and up to {TABLE}")
     sigma = shifted(step / TABLE)
     return NoiseLevel(TABLE * sigma, sigma)
-
-
-def context_level(t: float = CONTEXT_STEP) -> NoiseLevel:
-    """Return the noise level of the cache write: time input ``t``, sigma of the table's nearest entry.
-
-    Example:
-        >>> round(context_level().sigma, 5)
-        0.12993
-    """
-    table = (shifted(1 - i / TABLE) for i in range(TABLE))
-    return NoiseLevel(t, min(table, key=lambda sigma: abs(TABLE * sigma - t)))
 
 
 def names(count: int) -> tuple[float, ...]:
@@ -124,3 +77,8 @@ def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:
     if not names or any(b >= a for a, b in pairwise(names)):
         raise InputError("choosing denoising steps", "named steps", str(list(names)), "give at least one step, strictly falling from 1000")
     return tuple(named(step) for step in names)
+
+
+def interpolant(z_0: Tensor, z_1: Tensor, t: Tensor | float) -> Tensor:
+    """Return ``z_t = (1 - t) z_0 + t z_1``, the straight path from the clean latents to the source."""
+    return (1 - t) * z_0 + t * z_1

@@ -36,7 +36,7 @@ def make_renderer(
     base: Renderer = build(spec.base, scenario=scenario, **session)
     if spec.fixer is None:
         return base
-    from alpasim_plugin.fixers.blocks import fixed_renderer
+    from alpasim_plugin.fixers.loop import fixed_renderer
     from alpasim_plugin.fixers.settings import FixerSettings
 
     fixer, settings = spec.fixer, spec.fixer.settings

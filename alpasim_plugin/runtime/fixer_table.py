@@ -12,7 +12,7 @@ def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and ``frames``; ``blocks`` unless the
     mode is ``frame``.
 
-    In speculative mode also the counts of `alpasim_plugin.fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
+    In speculative mode also the counts of `block_fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
     predicted frames within tolerance), and the largest ``forecast_error`` and ``shown_error``.
 
     Args:

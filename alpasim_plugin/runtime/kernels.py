@@ -27,7 +27,7 @@ KIND = "kernels"
 SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
     "rasteriser": "alpasim_plugin.renderers.kernels:rasterise",
     "gradient": "alpasim_plugin.renderers.kernels:fit",
-    "map": "alpasim_plugin.fixers.kernels:draw_and_gather",
+    "map": "alpasim_plugin.fixers.gather:draw_and_gather",
 }
 SOURCES = ("gaussians", "semantic_map", "fixers")  # where kernels are
 GAUSSIANS = ("clean", "3dgs")  # base renderers that draw Gaussians themselves

@@ -13,7 +13,7 @@ import torch
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Frame
-from alpasim_plugin.fixers.base import fixer_settings, make_fixer
+from alpasim_plugin.fixers import fixer_settings, make_fixer
 
 WIDTHS = ("64,96,96,64,48", "48,64,64,48,32", "32,64,64,32,32", "32,48,48,32,16")
 UNTRAINED = ("weights.bundle=null", "untrained=random", "holes=render", "history=last-forward")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from alpasim_plugin.alpasim.server.hosting import Host
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from tests.alpasim.service_cases import StandInRenderer, hosted

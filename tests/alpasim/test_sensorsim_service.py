@@ -13,7 +13,7 @@ from alpasim_plugin.alpasim.server.reliability import opacity
 from alpasim_plugin.alpasim.server.status import CallTime
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.types import Frame
-from alpasim_plugin.fixers.base import fixer_settings, make_fixer
+from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.wire import common_pb2, sensorsim_pb2
 from alpasim_plugin.wire.services import Stub

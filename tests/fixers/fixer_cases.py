@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.block_fixers.onefixer import OneFixer
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.onefixer import OneFixer
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers import fixer_settings
 
 SMALL_DIT = (
     "weights.bundle=null", "history=last-forward", "holes=render",

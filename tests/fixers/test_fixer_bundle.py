@@ -10,13 +10,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import read_bundle, save_bundle
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.headers import read_metadata
-from alpasim_plugin.nets.init import initial_weights
 from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 
 FRAMES = moving_picture(13)

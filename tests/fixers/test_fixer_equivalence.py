@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.clips import to_clip
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.block_fixers.whole_clip import refine_clip, whole_clip
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.noise import latent_noise
-from alpasim_plugin.fixers.views import group_views, to_clip
+from alpasim_plugin.fixers.views import group_views
 from tests.examples import first_of
 from tests.fixers.fixer_cases import Recorded, busy_settings, fixer, maps_of, moving_picture, pixels, record_videos, run_blocks
 

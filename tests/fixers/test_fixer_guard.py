@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.fixers import guard, onefixer
+from alpasim_plugin.block_fixers import onefixer
+from alpasim_plugin.fixers import guard
 from tests.fixers.fixer_cases import busy_settings, fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 
 FRAMES = moving_picture(29)

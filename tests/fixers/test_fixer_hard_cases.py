@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.onefixer import OneFixer
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.onefixer import OneFixer
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers import fixer_settings
 from tests.fixers.fixer_cases import SIZE, STEP_US, busy_settings, fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 
 TINY = (16, 32)  # height, width, for long rollouts

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import FixerError, InputError
 from alpasim_plugin.core.types import BlockRule
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.settings import FixerSettings, OneFixerSettings, WeightsSettings, load_settings
-from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
+from alpasim_plugin.fixers.settings import FixerSettings, WeightsSettings, load_settings
 from alpasim_plugin.plugins.parts import names
 from tests.fixers.fixer_cases import small_settings
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from alpasim_plugin.block_fixers.clips import to_clip, to_images
 from alpasim_plugin.core.types import Frame
-from alpasim_plugin.fixers.views import group_views, to_clip, to_images
+from alpasim_plugin.fixers.views import group_views
 from tests.fixers.fixer_cases import maps_of, moving_picture
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.block_fixers.whole_clip import whole_clip
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.io.atomic import write_safetensors
 from tests.examples import first_of
 from tests.fixers.fixer_cases import Recorded, fixer, maps_of, moving_picture, pixels, run_blocks

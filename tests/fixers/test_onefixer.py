@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.types import Fixer, Frame
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from tests.fixers.fixer_cases import (
     SIZE,
     busy_settings,

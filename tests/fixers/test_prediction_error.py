@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
+from alpasim_plugin.block_fixers.speculation import deviation, rotation_rad, same_view
 from alpasim_plugin.core.geometry import se2, se3
 from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest
-from alpasim_plugin.fixers.prediction_error import deviation, rotation_rad, same_view
 
 CAMERA = CameraSpec("front", 8, 8, np.eye(3), np.eye(4))
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from alpasim_plugin.fixers.pipeline import BlockPipeline
-from alpasim_plugin.nets.graphs import CudaRecorder, GraphedFunction
+from alpasim_plugin.block_fixers.graphs import CudaRecorder, GraphedFunction
+from alpasim_plugin.block_fixers.pipeline import BlockPipeline
 from tests.examples import first_of
 from tests.fixers.fixer_cases import busy_settings, fixer, maps_of, moving_picture, run_blocks
 from tests.nets.eager_recorder import EagerRecorder

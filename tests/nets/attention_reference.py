@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.attention import visible_latents
+from alpasim_plugin.block_fixers.attention import visible_latents
 
 
 def block_causal_reference(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.kv_cache import BlockCache, GraphCache, RollingCache
+from alpasim_plugin.block_fixers.kv_cache import BlockCache, GraphCache, RollingCache
 
 
 def history(cache: BlockCache, layer: int) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 from alpasim_plugin.core import seeding
-from alpasim_plugin.nets.wan_vae_layout import WanLayout
 
 SMALL = WanLayout.of_base(8)
 UNEVEN = WanLayout(colours=3, latent=16, stem=4, encoder=(8, 12, 20, 24), decoder_in=(28, 12, 8, 6), decoder_out=(20, 16, 10, 4))

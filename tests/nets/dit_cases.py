@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from tests.nets.dit_reference import random_weights
 
 SMALL = DiTSizes(

@@ -10,7 +10,7 @@ import math
 import torch
 from einops import rearrange, repeat
 
-from alpasim_plugin.nets import DiTSizes
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 
 
 def random_weights(sizes: DiTSizes, seed: int = 0) -> dict[str, torch.Tensor]:

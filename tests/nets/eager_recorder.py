@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_flatten, tree_map_only
 
-from alpasim_plugin.nets.graphs import Recording
+from alpasim_plugin.block_fixers.graphs import Recording
 
 
 class EagerRecorder:

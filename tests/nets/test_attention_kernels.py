@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.attention import attention_kernel
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.attention_kernels import attention_kernel
 from tests.nets.dit_cases import clip, furthest, network, stream
 
 

@@ -11,8 +11,8 @@ PROGRAM = """
 import sys
 import torch
 from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyDecoder, TinyVAE, WanVAE
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.wan_vae_layout import WanLayout
+from alpasim_plugin.block_fixers.sizes import initial_weights
+from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout
 TinyVAE.from_state_dict(TinyVAE.random().state_dict())
 WanVAE.random(WanLayout.of_base(4)), TinyDecoder.random(16, (4, 4, 4, 4))
 CosmosCausalDiT.from_state_dict(initial_weights(DiTSizes(16, 1, 8, 16, 2, 2, 2), 0)).folded(1000.0)

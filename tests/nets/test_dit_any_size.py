@@ -7,7 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from tests.examples import examples
 from tests.nets.dit_cases import clip, furthest, stream
 from tests.nets.dit_reference import random_weights, velocity

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
-from alpasim_plugin.nets.precision import Precision, at_precision, text_at_precision
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.networks import Precision, at_precision, text_at_precision
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from tests.nets.dit_cases import clip
 from tests.nets.dit_reference import random_weights, velocity
 

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.nets import DiTSizes
-from alpasim_plugin.nets.attention import block_causal_attention
+from alpasim_plugin.block_fixers.attention import block_causal_attention
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from tests.examples import examples
 from tests.nets.attention_reference import block_causal_reference
 from tests.nets.cache_history import history

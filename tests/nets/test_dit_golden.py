@@ -6,12 +6,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from alpasim_plugin.nets import CosmosCausalDiT
-from alpasim_plugin.nets.embeddings import embed_latents, sinusoid
-from alpasim_plugin.nets.layers import patchify
-from alpasim_plugin.nets.rope import rotate
-from alpasim_plugin.nets.sampling import sample_block
-from alpasim_plugin.nets.schedule import context_level, from_names
+from alpasim_plugin.block_fixers.attention import rotate
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.layers import embed_latents, patchify, sinusoid
+from alpasim_plugin.block_fixers.sampling import context_level, sample_block
+from alpasim_plugin.nets.schedule import from_names
 from tests.nets.cache_history import history
 from tests.nets.dit_cases import furthest, stream
 

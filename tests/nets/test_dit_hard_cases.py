@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.attention import Rope3D, axis_widths
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.layers import Float32Linear
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.layers import Float32Linear
-from alpasim_plugin.nets.rope import Rope3D, axis_widths
 from tests.nets.dit_cases import SMALL, clip, furthest, network, stream
 from tests.nets.dit_reference import random_weights, rope_angles, velocity
 

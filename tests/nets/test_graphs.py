@@ -5,13 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.graphs import CudaRecorder, GraphedFunction
+from alpasim_plugin.block_fixers.networks import at_precision, codec_at_precision, text_at_precision
+from alpasim_plugin.block_fixers.sampling import finalise, mixed_source, sample_block
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
-from alpasim_plugin.nets.graphs import CudaRecorder, GraphedFunction
-from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision
-from alpasim_plugin.nets.sampling import finalise, mixed_source, sample_block
 from alpasim_plugin.nets.schedule import steps
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.examples import first_of
 from tests.nets.cache_history import history
 from tests.nets.dit_reference import random_weights

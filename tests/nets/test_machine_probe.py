@@ -7,9 +7,8 @@ import torch
 
 from alpasim_plugin.io import measured
 from alpasim_plugin.io.measured import share_measurements
-from alpasim_plugin.nets import machine_probe, precision
-from alpasim_plugin.nets.machine_probe import Probe, choose_threads, probe_precision
-from alpasim_plugin.nets.precision import choose_precision
+from alpasim_plugin.nets import machine_probe
+from alpasim_plugin.nets.machine_probe import Probe, choose_precision, choose_threads, probe_precision
 
 
 def test_the_probe_measures_time_and_error_of_both_precisions():
@@ -21,8 +20,8 @@ def test_the_probe_measures_time_and_error_of_both_precisions():
 
 @pytest.mark.parametrize(("bf16_ms", "name"), [(1.0, "bf16"), (6.0, "bf16"), (6.2, "fp32"), (9.0, "fp32"), (80.0, "fp32")])
 def test_the_faster_precision_is_taken_and_its_error_recorded(monkeypatch, bf16_ms, name):
-    monkeypatch.setattr(precision, "probe_precision", lambda: Probe(9.0, bf16_ms, 1e-7, 3e-3))
-    choice = precision.choose_precision("auto")
+    monkeypatch.setattr(machine_probe, "probe_precision", lambda: Probe(9.0, bf16_ms, 1e-7, 3e-3))
+    choice = machine_probe.choose_precision("auto")
     assert choice.name == name
     assert choice.as_dict()["error"] == (3e-3 if name == "bf16" else 1e-7)
     assert choice.as_dict()["probe"]["bf16_ms"] == bf16_ms

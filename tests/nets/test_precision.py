@@ -5,9 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.networks import at_precision, codec_at_precision, text_at_precision, weight_bytes
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.block_fixers.taehv import TinyDecoder
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.wan_vae import WanVAE
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyDecoder, TinyVAE, WanVAE
-from alpasim_plugin.nets.precision import at_precision, codec_at_precision, text_at_precision, weight_bytes
 from tests.nets.codec_cases import SMALL as SMALL_WAN
 from tests.nets.codec_cases import clip as video_clip
 from tests.nets.dit_cases import clip, stream

@@ -5,9 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.sampling import (
+    context_level,
+    flow_step,
+    mixed_source,
+    opacity_mask,
+    opacity_values,
+    sample_block,
+    sources_needed,
+)
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.sampling import flow_step, interpolant, mixed_source, opacity_mask, opacity_values, sample_block, sources_needed
-from alpasim_plugin.nets.schedule import context_level, from_names, named, shifted, steps
+from alpasim_plugin.nets.schedule import from_names, interpolant, named, shifted, steps
 from tests.nets.cache_history import history
 from tests.nets.dit_cases import clip, furthest, network
 

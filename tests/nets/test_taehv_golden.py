@@ -10,9 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.frame_layers import channels_last, run_layers
-from alpasim_plugin.nets.streaming_state import StreamingState
-from alpasim_plugin.nets.taehv import TinyDecoder
+from alpasim_plugin.block_fixers.streaming import StreamingState, channels_last, run_layers
+from alpasim_plugin.block_fixers.taehv import TinyDecoder
 from tests.nets.codec_cases import golden
 
 TOLERANCE = 2e-5

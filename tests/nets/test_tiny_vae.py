@@ -9,12 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import COMPONENTS, CosineTransform, TinySizes, from_grid, to_grid
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.clips import crop_clip, pad_clip
-from alpasim_plugin.nets.tiny_vae import TinyVAE
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
-from alpasim_plugin.nets.tiny_vae_transform import COMPONENTS, CosineTransform, from_grid, to_grid
 from tests.nets.codec_cases import clip, noise
 
 SIZES = TinySizes(encoder_quarter=8, encoder_eighth=12, decoder_eighth=16, decoder_quarter=10, decoder_frame=6)

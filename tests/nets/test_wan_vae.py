@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
+from alpasim_plugin.block_fixers.wan_vae import WanVAE
+from alpasim_plugin.block_fixers.wan_vae_blocks import WanLayout, causal_conv, causal_conv3d, read_layout
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.clips import crop_clip, pad_clip
-from alpasim_plugin.nets.wan_vae import WanVAE
-from alpasim_plugin.nets.wan_vae_blocks import causal_conv, causal_conv3d
-from alpasim_plugin.nets.wan_vae_layout import WanLayout, read_layout
 from tests.examples import examples, first_of
 from tests.nets.codec_cases import DEEPER, SMALL, UNEVEN, clip, noise
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin import make_renderer
+from alpasim_plugin.block_fixers.chunk import ChunkRenderer
+from alpasim_plugin.block_fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.fixers.chunk import ChunkRenderer
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.fixers.speculation import SpeculativeRenderer
 from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.plugins.parts import resolve, resolve_renderer, spec
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan

@@ -11,9 +11,21 @@ import pytest
 
 from alpasim_plugin import make_policy, run_rollout
 from alpasim_plugin.core.errors import FixerError, InputError, RendererError
-from alpasim_plugin.core.types import CameraSpec, Frame, Latency, Observation, Plan, Rates, RenderRequest, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import (
+    CameraSpec,
+    Frame,
+    Latency,
+    Observation,
+    Plan,
+    Rates,
+    Renderer,
+    RenderRequest,
+    Route,
+    Scenario,
+    SensorSpec,
+)
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
+from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
@@ -54,7 +66,7 @@ class Drive:
     """A rollout behind a fixer, with everything that went through it."""
 
     recorder: Recorder
-    session: FixedRenderer
+    session: Renderer
     fixers: list[Blend]
     policy: Watching
     requests: list[RenderRequest]
@@ -86,7 +98,7 @@ def drive(scenario: Scenario, policy: type[Watching] = Watching, fixer: Callable
     return Drive(done, session, fixers, driver, [r for call in calls for r in call], frames, calls)
 
 
-def session_of(scenario: Scenario, make: Callable[[], Blend], **settings: object) -> FixedRenderer:
+def session_of(scenario: Scenario, make: Callable[[], Blend], **settings: object) -> Renderer:
     base = make_renderer("clean", scenario, 0, threads=1)
     return fixed_renderer(base.render, make, FixerSettings(name="test", **settings), scenario, 1)  # type: ignore[arg-type]
 

@@ -10,7 +10,7 @@ import numpy as np
 from alpasim_plugin import run_rollout
 from alpasim_plugin.core.types import F64, CameraSpec, Frame, Latency, Scenario
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.per_frame import PerFrameRenderer
+from alpasim_plugin.fixers.loop import PerFrameRenderer
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from tests.runtime.grey_renderer import Grey
 from tests.runtime.test_fixed_rollouts import Watching, Zigzag, assert_same_pictures, drive, rendered

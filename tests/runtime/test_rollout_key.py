@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from policies.learned import Learned
 from scenarios.suite import expand

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 import torch
 
+from alpasim_plugin.block_fixers.settings import STYLES
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8, CameraSpec
 from alpasim_plugin.fixers.bundle import bundle_fixer
@@ -40,7 +41,6 @@ from alpasim_plugin.lab.training.seen_scene import restyle_video, scene_of, seen
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.lab.video_metrics.sheet import sheet
-from alpasim_plugin.nets.styles import STYLES
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.runtime.parallel import parallel_map
 from alpasim_plugin.runtime.store import read_json

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
+from alpasim_plugin.block_fixers.attention import Kernel, attention_kernel
+from alpasim_plugin.block_fixers.graphs import GraphedFunction
+from alpasim_plugin.block_fixers.networks import DTYPES
+from alpasim_plugin.block_fixers.pipeline import BlockPipeline, StageClock
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import FixerError
-from alpasim_plugin.fixers.pipeline import BlockPipeline
-from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.stage_clock import StageClock
 from alpasim_plugin.lab.bench.random_networks import random_networks
 from alpasim_plugin.lab.bench.roofline import TEXT_TOKENS, BlockWork, run_block, steady_after
-from alpasim_plugin.nets.attention_kernels import Kernel, attention_kernel
-from alpasim_plugin.nets.graphs import GraphedFunction
-from alpasim_plugin.nets.precision import DTYPES
 
 CONTEXT_BYTES = 0.7e9  # what a process holds on a GPU before the first tensor
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.io.reading import parsing, read_json_object
 from alpasim_plugin.lab.bench.quality import Variant
 from alpasim_plugin.lab.bench.quality_run import evenly

@@ -11,7 +11,7 @@ import numpy as np
 
 from alpasim_plugin.core.types import U8, CameraSpec, Fixer, Frame, Renderer, RenderRequest
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.fixers.blocks import FixedRenderer, fixed_renderer
+from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.lab.bench.fixer_speed import Clip
 from alpasim_plugin.renderers import make_renderer
@@ -127,7 +127,7 @@ class _RecordingFixer(Fixer):
 class _RecordingRenderer(Renderer):
     """A renderer that records its frames and, per frame, the milliseconds by stage."""
 
-    def __init__(self, renderer: FixedRenderer) -> None:
+    def __init__(self, renderer: Renderer) -> None:
         self._renderer = renderer
         self.lookahead, self.block = renderer.lookahead, renderer.block
         self.frames: list[Frame] = []
@@ -141,7 +141,7 @@ class _RecordingRenderer(Renderer):
         return self.render_batch([request])[0]
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
-        frames = self._renderer.render_batch(requests)
+        frames = list(self._renderer.render_batch(requests))
         self.frames += frames
         self.ms += [{stage: ms / len(frames) for stage, ms in self.stage_ms.items()}] * len(frames)
         return frames

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from alpasim_plugin.block_fixers.onefixer import OneFixer
+from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock, no_clock
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.types import F32, I64, U8, Bool, Frame
-from alpasim_plugin.fixers.onefixer import OneFixer
-from alpasim_plugin.fixers.pipeline import no_clock
-from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.process.processes import resident_mb
 
 MB = 1e6

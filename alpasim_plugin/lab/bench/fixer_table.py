@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from alpasim_plugin.fixers.stage_clock import TIMED
+from alpasim_plugin.block_fixers.pipeline import TIMED
 from alpasim_plugin.lab.bench.fixer_rows import Row
 
 HEAD = (

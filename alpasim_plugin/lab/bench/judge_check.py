@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
+from alpasim_plugin.block_fixers.settings import STYLES
 from alpasim_plugin.core.types import F64, U8, CameraSpec
 from alpasim_plugin.lab.learned_metrics.clip import cuboid_values, lane_values
 from alpasim_plugin.lab.learned_metrics.cuboids import cuboid_f1
@@ -23,7 +24,6 @@ from alpasim_plugin.lab.learned_metrics.nets.style_net import StyleNet, style_pr
 from alpasim_plugin.lab.learned_metrics.nets.video_net import VideoNet, window_features
 from alpasim_plugin.lab.learned_metrics.types import Cuboid, Lane3D
 from alpasim_plugin.lab.training.learned_metrics.labels import Labels
-from alpasim_plugin.nets.styles import STYLES
 
 NEAR_M = 30.0
 # What must worsen with which damage. Jitter is left out for blur: a blurred line may stand still.

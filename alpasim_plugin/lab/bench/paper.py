@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.lab.bench.appearance import JUDGE_SEEDS, AppearanceRun, measure_appearance

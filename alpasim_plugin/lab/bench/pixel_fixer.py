@@ -11,7 +11,7 @@ import torch
 
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import U8
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_fixer import PixelFixer
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.bench.fixer_rows import SCENE, BenchOptions, Case, Row, difference, in_own_process, p50_p95

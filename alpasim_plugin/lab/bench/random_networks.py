@@ -11,9 +11,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.networks import Networks, Parts, build_networks
-from alpasim_plugin.fixers.settings import OneFixerSettings, WeightsSettings
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TextContext
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
+from alpasim_plugin.block_fixers.networks import Networks, Parts, build_networks
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.fixers.settings import WeightsSettings
 
 
 class _RandomParts(Parts):

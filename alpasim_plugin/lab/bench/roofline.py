@@ -12,15 +12,13 @@ from dataclasses import dataclass
 
 import torch
 
+from alpasim_plugin.block_fixers.clips import SIDE
+from alpasim_plugin.block_fixers.networks import LATENT, Networks, weight_bytes
+from alpasim_plugin.block_fixers.pipeline import STAGES, BlockPipeline, PipelineState
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.networks import LATENT, Networks
-from alpasim_plugin.fixers.pipeline import BlockPipeline, PipelineState
-from alpasim_plugin.fixers.settings import OneFixerSettings
-from alpasim_plugin.fixers.stage_clock import STAGES
 from alpasim_plugin.lab.bench.op_counter import Op, OpCounter
 from alpasim_plugin.lab.bench.random_networks import random_networks
-from alpasim_plugin.nets.clips import SIDE
-from alpasim_plugin.nets.precision import weight_bytes
 
 TEXT_TOKENS = 512  # of the original's prompt
 HEADROOM = 1.15  # an allocator's rounding, libraries' workspaces

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
-from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.process.processes import resident_mb
 from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import SIDE, Clip, crop_clip, pad_clip, to_clip, to_images
+from alpasim_plugin.block_fixers.clips import TOKEN_PX as TOKEN
+from alpasim_plugin.block_fixers.networks import LATENT, Networks, decode, load_networks
+from alpasim_plugin.block_fixers.onefixer import latent_noise
 from alpasim_plugin.core.types import U8, Frame
-from alpasim_plugin.fixers.image_settings import MaplessSettings, NoiseWindowSettings, RenderStepSettings
-from alpasim_plugin.fixers.networks import LATENT, Networks, decode, load_networks
-from alpasim_plugin.fixers.noise import latent_noise
-from alpasim_plugin.fixers.views import HALF, Clip, group_views, to_clip, to_images
-from alpasim_plugin.fixers.views import SIDE as TOKEN
-from alpasim_plugin.fixers.windows import fade_weights, windows
-from alpasim_plugin.nets.clips import SIDE, ClipSize, crop_clip, pad_clip
+from alpasim_plugin.fixers.views import HALF, ClipSize, group_views
+from alpasim_plugin.lab.image_fixers.settings import MaplessSettings, NoiseWindowSettings, RenderStepSettings
+from alpasim_plugin.lab.image_fixers.window_fixer import fade_weights, windows
 
 
 @torch.inference_mode()

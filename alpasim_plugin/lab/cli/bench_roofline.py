@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.cli.refine import fixer_overrides
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.bench.block_speed import BlockTimes, measure_blocks
 from alpasim_plugin.lab.bench.roofline import TEXT_TOKENS, BlockWork, Device, block_work, device_of
 from alpasim_plugin.lab.cli.image_sizes import parse_size

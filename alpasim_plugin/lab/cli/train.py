@@ -11,7 +11,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from alpasim_plugin.fixers.bundle import load_tiny_vae
+from alpasim_plugin.block_fixers.codec_weights import LatentStats
+from alpasim_plugin.block_fixers.networks import load_tiny_vae
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.lab.cli import train_pairs, train_scenes
 from alpasim_plugin.lab.cli.train_arms import EPILOG as ARMS_EXAMPLES
 from alpasim_plugin.lab.cli.train_arms import arms
@@ -36,9 +39,6 @@ from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe, VaeTask, measure_stats
 from alpasim_plugin.lab.training.vae_quality import quality, round_trip
-from alpasim_plugin.nets.latent_stats import LatentStats
-from alpasim_plugin.nets.tiny_vae import TinyVAE
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 
 app = typer.Typer(no_args_is_help=True, help="Make training data and train networks.")
 WIDTH, HEIGHT = 256, 144

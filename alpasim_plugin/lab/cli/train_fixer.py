@@ -11,9 +11,9 @@ from typing import Annotated
 import torch
 import typer
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.settings import OneFixerSettings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.bench.training_memory import measure_memory, memory_table
 from alpasim_plugin.lab.cli import training_options as options
 from alpasim_plugin.lab.cli.image_sizes import parse_size

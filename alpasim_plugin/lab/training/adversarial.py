@@ -20,9 +20,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.block_fixers.attention import attend
+from alpasim_plugin.block_fixers.layers import RMSNorm
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.attention import attend
-from alpasim_plugin.nets.layers import RMSNorm
 
 TOKEN_STD = 0.02
 Logits = Callable[[Tensor], Tensor]  # noised latents (B, C, N, H, W) -> (B,)

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alpasim_plugin.block_fixers.settings import CLEAR, STYLES
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8
-from alpasim_plugin.nets.styles import CLEAR, STYLES
 
 VERSION = 1  # of the formulas: targets of another version are made anew
 FAR_M = 1000.0  # depth of what has none

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import GROUP, SIDE
+from alpasim_plugin.block_fixers.sampling import opacity_values
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.latent_clips import LatentClip, LatentClips
 from alpasim_plugin.lab.training.shared_rollout import Sample
-from alpasim_plugin.nets.clips import GROUP, SIDE
-from alpasim_plugin.nets.sampling import opacity_values
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 PATCH = 2  # latents along a side of a token; crops consist of whole tokens
 

@@ -17,6 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import GROUP, SIDE
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.seeding import stream
@@ -27,9 +30,6 @@ from alpasim_plugin.lab.training.perceptual_term import Distance, flatten_frames
 from alpasim_plugin.lab.training.shared_rollout import roll_out
 from alpasim_plugin.lab.training.trainer import Loss
 from alpasim_plugin.lab.training.vae import reconstruction_loss
-from alpasim_plugin.nets.clips import GROUP, SIDE
-from alpasim_plugin.nets.dit import CosmosCausalDiT
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.sampling import flow_step
 from alpasim_plugin.lab.training.shared_rollout import channel_weighted
-from alpasim_plugin.nets.sampling import flow_step, interpolant
-from alpasim_plugin.nets.schedule import SHIFT, TABLE
+from alpasim_plugin.nets.schedule import SHIFT, TABLE, interpolant
 
 Score = Callable[[Tensor, Tensor], Tensor]  # x (B, C, N, H, W), sigma (B,) -> velocity like x
 NORMALISER_FLOOR = 1e-6

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from alpasim_plugin.block_fixers.clips import GROUP
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.clip_batches import ClipBatches
 from alpasim_plugin.lab.training.perceptual_term import DecodedDistance
@@ -16,7 +17,6 @@ from alpasim_plugin.lab.training.recipes.recipe import StageInputs
 from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transformer_of
 from alpasim_plugin.lab.training.shared_rollout import Losses, Objectives, Perceptual, Sample, losses
 from alpasim_plugin.lab.training.trainer import Loss
-from alpasim_plugin.nets.clips import GROUP
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,15 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import GROUP
+from alpasim_plugin.block_fixers.sampling import opacity_mask
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.io.atomic import write_array
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.lab.training.clips import to_tensor
 from alpasim_plugin.lab.training.pair_store import PairSequence, listed_sizes, pairs_digest
-from alpasim_plugin.nets.clips import GROUP
-from alpasim_plugin.nets.sampling import opacity_mask
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 F16 = npt.NDArray[np.float16]
 DOING = "encoding training clips"

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.fixers.image_settings import NoiseWindowSettings
+from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings
 from alpasim_plugin.lab.training.cut_outs import cut_out
 from alpasim_plugin.lab.training.multi_resolution_noise import multi_resolution_noise
 from alpasim_plugin.lab.training.noise_window import (

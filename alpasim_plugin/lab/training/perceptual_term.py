@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from alpasim_plugin.nets.clips import GROUP
-from alpasim_plugin.nets.streaming_state import State
-from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.clips import GROUP
+from alpasim_plugin.block_fixers.streaming import State
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # frames (F, 3, H, W) in [-1, 1], twice -> (F,)
 

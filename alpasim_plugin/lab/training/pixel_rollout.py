@@ -24,7 +24,7 @@ from torch import Tensor
 from alpasim_plugin.lab.training.grid_term import grid_term
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelState
 from alpasim_plugin.nets.pixel_source import pixel_source
-from alpasim_plugin.nets.sampling import interpolant
+from alpasim_plugin.nets.schedule import interpolant
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)

@@ -1,6 +1,6 @@
 """DiFix3D+ and DiffusionHarmonizer: the deployed step from the render, with losses on the picture.
 
-    z_r = E(r),  x = z_r / (alpha + sigma),  z_0 = x - t v(x, t),  y' = D(z_0)          `nets.fixed_step`
+    z_r = E(r),  x = z_r / (alpha + sigma),  z_0 = x - t v(x, t),  y' = D(z_0)          `lab.image_fixers.pipeline`
     L   = | y' - y |^2  +  lambda min(d(y', y), c)  +  w L_warp(y')                      on values in [-1, 1]
 
 ``r`` render, ``y`` clean frame, ``d`` perceptual distance of a picture, ``c`` the largest value that counts (DiffusionHarmonizer: beyond it
@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.lab.image_fixers.pipeline import fixed_step
+from alpasim_plugin.lab.image_fixers.settings import RenderLevel
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.warping import flow_between, warping_loss
-from alpasim_plugin.nets.dit import CosmosCausalDiT
-from alpasim_plugin.nets.fixed_step import fixed_step
-from alpasim_plugin.nets.schedule import RenderLevel
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 GREY = 127.5  # levels from 0 to 1 on the scale of [-1, 1]
 REFERENCES = 4  # frames of one latent

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.fixers.image_settings import RenderStepSettings
+from alpasim_plugin.lab.image_fixers.settings import RenderStepSettings
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.picture_batches import PictureBatches, Pictures
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs

@@ -19,10 +19,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
+from alpasim_plugin.block_fixers.kv_cache import GraphCache
+from alpasim_plugin.block_fixers.sampling import finalise, flow_step, mixed_source
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.nets.dit import CosmosCausalDiT, TextContext
-from alpasim_plugin.nets.kv_cache import GraphCache
-from alpasim_plugin.nets.sampling import finalise, flow_step, interpolant, mixed_source
+from alpasim_plugin.nets.schedule import interpolant
 
 FlowHistory = Literal["own", "clean", "redenoised"]
 Predicted = Literal["own", "redenoised"]

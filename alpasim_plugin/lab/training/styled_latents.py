@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.settings import STYLES
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.io.atomic import write_array
@@ -20,8 +22,6 @@ from alpasim_plugin.lab.training.appearance import VERSION
 from alpasim_plugin.lab.training.clips import to_tensor
 from alpasim_plugin.lab.training.latent_clips import F16, LatentClip, LatentClips
 from alpasim_plugin.lab.training.seen_scene import restyle_video, scene_of, seen_frames
-from alpasim_plugin.nets.styles import STYLES
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 FORMULAS = STYLES[1:]  # the clear style's latents are the clip's own
 

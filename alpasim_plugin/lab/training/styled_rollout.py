@@ -14,6 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from alpasim_plugin.block_fixers.clips import GROUP
+from alpasim_plugin.block_fixers.settings import CLEAR, STYLES
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.appearance import VERSION
 from alpasim_plugin.lab.training.clip_batches import ClipBatches
@@ -24,9 +27,6 @@ from alpasim_plugin.lab.training.recipes.start import channel_weights_of, transf
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Perceptual, Sample, losses
 from alpasim_plugin.lab.training.styled_latents import StyledLatents
 from alpasim_plugin.lab.training.trainer import Loss
-from alpasim_plugin.nets.clips import GROUP
-from alpasim_plugin.nets.styles import CLEAR, STYLES
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from alpasim_plugin.block_fixers.clips import GROUP
+from alpasim_plugin.block_fixers.sampling import OPACITY_CHANNELS
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.shared_rollout import Sample
-from alpasim_plugin.nets.clips import GROUP
-from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
 
 
 @dataclass(frozen=True)

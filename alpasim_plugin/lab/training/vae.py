@@ -15,13 +15,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import LATENT
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.clips import Clip, CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.lab.training.pair_store import PairSequence, pairs_digest
 from alpasim_plugin.lab.training.trainer import Loss
-from alpasim_plugin.nets.tiny_vae import TinyVAE
-from alpasim_plugin.nets.tiny_vae_nets import LATENT
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import crop_clip, pad_clip
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.image_metrics import CAP_DB, decibels
-from alpasim_plugin.nets.clips import crop_clip, pad_clip
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-_PER_FRAME = "alpasim_plugin.fixers.factory:per_frame"
-_BLOCKS = "alpasim_plugin.fixers.factory:onefixer"
-_IMAGE = "alpasim_plugin.fixers.factory:image"
-_WINDOWS = "alpasim_plugin.fixers.factory:windows"
+_PER_FRAME = "alpasim_plugin.fixers.pixel_settings:per_frame"
 _BROKEN = "alpasim_plugin.renderers.broken:"
 
 BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
@@ -26,28 +23,6 @@ BUILTIN: dict[str, dict[str, tuple[str, str]]] = {
     "fixer": {
         "onefixer": (_PER_FRAME, "one-step causal generator in pixels, frame by frame, for a CPU"),
         "onefixer-m": (_PER_FRAME, "the same at three times the work, for bfloat16 instructions or a GPU"),
-        "onefixer-dit-tiny": (_BLOCKS, "one-step causal transformer on latents, block by block, for a CPU at 256x144"),
-        "onefixer-dit-s": (_BLOCKS, "the same for a small GPU"),
-        "onefixer-2b": (_BLOCKS, "the same at the size of OmniDreams single view; needs its weights"),
-        "difix": (_IMAGE, "arm of the comparison: DiFix3D+, one step from the render, frame by frame; to be trained"),
-        "harmonizer": (
-            _IMAGE,
-            "arm of the comparison: DiffusionHarmonizer, one step from the render, frame by frame; to be trained",
-        ),
-        "harmonizer-temporal": (_IMAGE, "arm of the comparison: the same, looking at its last four outputs; to be trained"),
-        "gsfix3d": (
-            _WINDOWS,
-            "arm of the comparison: GSFix3D, eight steps from noise, frame by frame; to be trained",
-        ),
-        "3dgs-enhancer": (
-            _WINDOWS,
-            "arm of the comparison: 3DGS-Enhancer, the same in windows; recorded clips only; to be trained",
-        ),
-        "omnidreams": (_BLOCKS, "arm of the comparison: diffusion forcing from the mixed source; to be trained"),
-        "self-forcing": (_BLOCKS, "arm of the comparison: distilled on its own rollouts; to be trained"),
-        "one-forcing": (_BLOCKS, "arm of the comparison: the same with an adversarial head; to be trained"),
-        "artifixer-pre": (_BLOCKS, "arm of the comparison: opacity in every block, long blocks; to be trained"),
-        "artifixer": (_BLOCKS, "arm of the comparison: the same, distilled; to be trained"),
         "identity": ("alpasim_plugin.fixers.identity:IdentityFixer", "passes frames on unchanged"),
     },
     "policy": {

@@ -17,13 +17,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.lazy import installed
 from alpasim_plugin.io.config import apply_overrides, validate
 from alpasim_plugin.io.yaml_positions import Document
 from alpasim_plugin.plugins.interfaces import Declaration
 from alpasim_plugin.plugins.parts.builtin import BUILTIN
 from alpasim_plugin.plugins.parts.loading import absolute_target, file_of, is_target, load, require_unedited, split_address
 from alpasim_plugin.plugins.parts.source import code_digest
-from alpasim_plugin.plugins.parts.spec import KINDS, KindName, PartSpec, digest, file_digest, part_digest
+from alpasim_plugin.plugins.parts.spec import KINDS, MODES, KindName, PartSpec, digest, file_digest, part_digest
 
 
 @dataclass(frozen=True)
@@ -246,6 +247,9 @@ def _described(spec: PartSpec, factory: Any) -> PartSpec:
     if inspect.isclass(factory) or inspect.isfunction(factory):  # a package may only pass on what another module defines
         home = getattr(sys.modules.get(factory.__module__), "__file__", None)
         modules += [Path(home)] if home is not None and Path(home) not in modules else []
+    mode = installed(MODES).get(str(getattr(spec.settings, "loop_mode", "")))
+    if mode is not None:  # what calls a fixer of blocks shapes its frames, and no import leads there
+        modules += [file for file in [file_of(mode.value)] if file is not None]
     for file in modules if factory is not None else ():
         require_unedited(file, code_digest(file))
     declared = declaration_of(factory, spec.settings, module.parent if module else Path())

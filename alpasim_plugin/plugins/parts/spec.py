@@ -18,6 +18,7 @@ from alpasim_plugin.plugins.interfaces import MetricInfo
 from alpasim_plugin.plugins.parts.loading import make_importable
 from alpasim_plugin.plugins.parts.source import code_digest
 
+MODES = "simrun.fixer_modes"  # entry points of what calls a fixer of blocks: (runner, make_fixer, settings, first) -> Renderer
 KindName = Literal["renderer", "fixer", "policy", "controller", "evaluator", "source"]
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from alpasim_plugin.nets.sizes import AREA, DiTSizes
+from alpasim_plugin.block_fixers.sizes import AREA, DiTSizes
 
 
 @dataclass(frozen=True)

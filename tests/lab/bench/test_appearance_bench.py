@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.settings import STYLES
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench.appearance import AppearanceRun, measure_appearance
 from alpasim_plugin.lab.bench.judged import Judging
 from alpasim_plugin.lab.training.pair_store import PairSequence
-from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.styles import STYLES
 from tests.fixers.fixer_cases import small_settings
 from tests.lab.training.corner import make_corner
 

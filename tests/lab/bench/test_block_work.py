@@ -8,16 +8,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from alpasim_plugin.block_fixers.pipeline import STAGES, BlockPipeline
+from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
-from alpasim_plugin.fixers.base import fixer_settings
-from alpasim_plugin.fixers.pipeline import BlockPipeline
-from alpasim_plugin.fixers.stage_clock import STAGES
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.bench.block_speed import measure_blocks, require_memory
 from alpasim_plugin.lab.bench.op_counter import OpCounter
 from alpasim_plugin.lab.bench.random_networks import random_networks
 from alpasim_plugin.lab.bench.roofline import DEVICES, block_work, device_of, networks_bytes, run_block
 from alpasim_plugin.lab.cli.bench import app
-from alpasim_plugin.nets import DiTSizes
 from tests.examples import first_of
 from tests.fixers.fixer_cases import SMALL_DIT, small_settings
 from tests.lab.bench.dit_work import cache_bytes, forward_work

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock
 from alpasim_plugin.block_fixers.stand_in import save_stand_in
 from alpasim_plugin.fixers import make_fixer
-from alpasim_plugin.fixers.stage_clock import TIMED, StageClock
 from alpasim_plugin.lab.bench.fixer_speed import measure
 from alpasim_plugin.nets.checkpoints import load_weights
 from tests.fixers.fixer_cases import small_settings as settings

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.types import F64, U8, Scenario
 from alpasim_plugin.fixers import fixer_settings
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.gaussians.scene.degrade import log_actors
 from alpasim_plugin.lab.bench.map_error import CONFIGURATIONS, MapShift, shifted_maps
 from alpasim_plugin.lab.bench.paper import Compared, black_map, findings, grouped

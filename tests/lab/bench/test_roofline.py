@@ -8,11 +8,15 @@ from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sizes import DiTSizes
+from alpasim_plugin.block_fixers.taehv import TinyDecoder
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.wan_vae import WanVAE
+from alpasim_plugin.block_fixers.wan_vae_blocks import ChannelNorm
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.op_counter import Op, OpCounter
 from alpasim_plugin.lab.bench.roofline import DEVICES, device_of
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyDecoder, TinyVAE, WanVAE
-from alpasim_plugin.nets.wan_vae_blocks import ChannelNorm
 from tests.examples import first_rows_of
 from tests.lab.bench.dit_work import cache_bytes, forward_work
 from tests.nets.codec_cases import SMALL, noise

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench import paper as bench_paper
 from alpasim_plugin.lab.bench import transfer as bench_transfer
 from alpasim_plugin.lab.bench.training_memory import MemoryCell
-from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.init import initial_weights
 from tests.fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer, save_bundle
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.lab.bench.quality_run import Work, finish, identity, lose_resolution, shown_frames
 from alpasim_plugin.lab.cli.quality import parse_variants
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import summarise
-from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.init import initial_weights
 from tests.fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 

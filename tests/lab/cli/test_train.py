@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from alpasim_plugin.block_fixers.networks import load_tiny_vae
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.bundle import load_tiny_vae, save_bundle
+from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.cli.train import app
 from alpasim_plugin.lab.cli.training_options import scene_files, whole_numbers
-from alpasim_plugin.nets import DiTSizes, TinyVAE
-from alpasim_plugin.nets.init import initial_weights
 from policies.learned_net import load_net
 from tests.fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make

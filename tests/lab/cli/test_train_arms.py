@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.cost import cost_curves
@@ -20,8 +22,6 @@ from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.latent_clips import ClipForm
 from alpasim_plugin.lab.training.snapshots import core_seconds, snapshots_of
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets import TinyVAE
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.lab.training.pair_files import make
 
 CLIPS = ["--latents", "2", "--stride", "4", "--clips", "1", "--size", "48x32"]

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.block_fixers.codec_weights import fill_random
+from alpasim_plugin.block_fixers.networks import Parts
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
-from alpasim_plugin.fixers.networks import Parts
-from alpasim_plugin.nets.codec_weights import fill_random
+from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
 
 SMALL = (
     "vae.widths=[16,16,16,16,16]", "dit.width=24", "dit.blocks=2", "dit.head_width=12", "dit.mlp_width=40", "dit.adaln_rank=5",

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.settings import CLEAR, STYLES, OneFixerSettings
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.gaussians.scene.builder import street_lights
 from alpasim_plugin.lab.training.appearance import lights_of_posts
 from alpasim_plugin.lab.training.clip_batches import BatchForm
@@ -24,10 +26,7 @@ from alpasim_plugin.lab.training.pair_store import PairDataset, PairSequence
 from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_attention
 from alpasim_plugin.lab.training.seen_scene import restyle_video, scene_of, seen_frames
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets import TinyVAE
 from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.styles import CLEAR, STYLES
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.onefixer import OneFixer
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.onefixer import OneFixer
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
 from alpasim_plugin.lab.training.clip_batches import BatchForm
 from alpasim_plugin.lab.training.distillation import Distillation

@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.adversarial import AdversarialHead, AdversarialTerm
 from alpasim_plugin.lab.training.causal_rollout import causal_rollout
@@ -19,10 +21,7 @@ from alpasim_plugin.lab.training.recipes.causal_arms import long_blocks
 from alpasim_plugin.lab.training.recipes.recipe import Attention
 from alpasim_plugin.lab.training.shared_rollout import Sample
 from alpasim_plugin.lab.training.tail_drop import TailDrop, visible_share
-from alpasim_plugin.nets import CosmosCausalDiT
-from alpasim_plugin.nets.init import initial_weights
 from alpasim_plugin.nets.schedule import steps
-from alpasim_plugin.nets.sizes import DiTSizes
 
 N = 4
 TEXT = torch.zeros(1, 1, 8)

@@ -12,11 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.networks import load_networks
+from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer
-from alpasim_plugin.fixers.networks import load_networks
-from alpasim_plugin.fixers.settings import OneFixerSettings
 from alpasim_plugin.lab.bench.training_memory import MemoryCell, measure_memory, memory_table, monotone
 from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
 from alpasim_plugin.lab.training.fixer_run import FixerRun, stage_inputs, train_fixer
@@ -29,11 +33,8 @@ from alpasim_plugin.lab.training.recipes.registry import recipe_of, with_attenti
 from alpasim_plugin.lab.training.recipes.start import widen_map
 from alpasim_plugin.lab.training.shared_rollout import Objectives
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes, TinyVAE
 from alpasim_plugin.nets.checkpoints import load_weights
 from alpasim_plugin.nets.headers import read_metadata
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.fixers.fixer_cases import fixer, maps_of, moving_picture, pixels, run_blocks, small_settings
 from tests.lab.training.pair_files import make, pair
 

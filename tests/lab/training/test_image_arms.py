@@ -12,6 +12,9 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings, make_fixer
@@ -23,10 +26,7 @@ from alpasim_plugin.lab.training.recipes.image_arms import IMAGE_ARMS
 from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
 from alpasim_plugin.lab.training.trainer import Schedule
-from alpasim_plugin.nets import DiTSizes, TinyVAE
 from alpasim_plugin.nets.checkpoints import load_weights
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.fixers.fixer_cases import moving_picture, pixels
 from tests.lab.training.pair_files import make
 

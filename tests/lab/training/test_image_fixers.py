@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.networks import load_networks
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import BlockRule, Fixer, Frame
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle
-from alpasim_plugin.fixers.image_fixer import ImageFixer
-from alpasim_plugin.fixers.image_settings import NoiseWindowSettings, RenderStepSettings
-from alpasim_plugin.fixers.networks import load_networks
 from alpasim_plugin.fixers.refine import refine_frames
 from alpasim_plugin.fixers.settings import Unit
-from alpasim_plugin.fixers.window_fixer import WindowFixer
-from alpasim_plugin.fixers.windows import fade_weights, windows
 from alpasim_plugin.lab.bench.whole_clip_images import whole_clip_images
+from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
+from alpasim_plugin.lab.image_fixers.settings import NoiseWindowSettings, RenderStepSettings
+from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer, fade_weights, windows
 from alpasim_plugin.plugins.parts import resolve_renderer
 from tests.fixers.fixer_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings, image_settings

@@ -9,11 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.networks import Parts
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.fixers import fixer_settings, make_fixer
-from alpasim_plugin.fixers.image_settings import RenderStepSettings
-from alpasim_plugin.fixers.networks import Parts
+from alpasim_plugin.lab.image_fixers.pipeline import CONDITION_KEY, LATENT_KEY, euler, fixed_step, share_embedding
+from alpasim_plugin.lab.image_fixers.settings import RenderLevel, RenderStepSettings
 from alpasim_plugin.lab.training.cut_outs import cut_out, soft_mask
 from alpasim_plugin.lab.training.multi_resolution_noise import multi_resolution_noise
 from alpasim_plugin.lab.training.noise_window import (
@@ -26,12 +30,7 @@ from alpasim_plugin.lab.training.noise_window import (
 )
 from alpasim_plugin.lab.training.render_step import RenderStep, picture_losses, warp_term
 from alpasim_plugin.lab.training.warping import flow_between, warping_loss
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
-from alpasim_plugin.nets.euler import CONDITION_KEY, LATENT_KEY, euler, share_embedding
-from alpasim_plugin.nets.fixed_step import fixed_step
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.schedule import RenderLevel, names
-from alpasim_plugin.nets.tiny_vae import TinyVAE
+from alpasim_plugin.nets.schedule import names
 from tests.fixers.fixer_cases import moving_picture, pixels
 from tests.lab.training.image_cases import busy_settings
 

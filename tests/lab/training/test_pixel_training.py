@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.bundle import bundle_fixer, parts_of
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.grid_term import grid_term

@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sampling import CONTEXT_STEP, context_level, mixed_source
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.training.perceptual_term import DecodedDistance
 from alpasim_plugin.lab.training.shared_rollout import Objectives, Sample, losses
-from alpasim_plugin.nets import CosmosCausalDiT, TinyVAE
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.sampling import interpolant, mixed_source
-from alpasim_plugin.nets.schedule import CONTEXT_STEP, context_level
-from alpasim_plugin.nets.sizes import DiTSizes
+from alpasim_plugin.nets.schedule import interpolant
 from tests.examples import first_of
 
 N, H, W = 8, 4, 4

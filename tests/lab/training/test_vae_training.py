@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.block_fixers.codec_weights import LatentStats
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
+from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.clips import CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
 from alpasim_plugin.lab.training.vae import VaeRecipe, VaeTask, channel_amplitudes, measure_stats
 from alpasim_plugin.lab.training.vae_quality import quality, round_trip
-from alpasim_plugin.nets.latent_stats import LatentStats
-from alpasim_plugin.nets.tiny_vae import TinyVAE
-from alpasim_plugin.nets.tiny_vae_nets import TinySizes
 from tests.lab.training.pair_files import make
 
 SIZE = CropSize(5, 16, 32)

@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from alpasim_plugin.block_fixers.settings import STYLES
 from alpasim_plugin.core.types import F32, F64, U8
-from alpasim_plugin.nets.styles import STYLES
 
 HEIGHT, WIDTH = 72, 128
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.base import fixer_settings
+from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.training.recipes.ablation import BASE, BASE_BI, IMAGE
 from alpasim_plugin.lab.training.recipes.recipe import INIT, INIT_BI, Recipe, Stage
 from alpasim_plugin.lab.training.recipes.registry import RECIPES

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.settings import STYLES
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, U8, Scenario
@@ -25,7 +26,6 @@ from alpasim_plugin.lab.training.learned_metrics.labels import TRAINING_SPLITS
 from alpasim_plugin.lab.training.pairs import offset_from_log
 from alpasim_plugin.lab.training.seen_scene import SeenScene
 from alpasim_plugin.lab.training.trainer import Loss
-from alpasim_plugin.nets.styles import STYLES
 from scenarios.load import load_scenario
 
 FRAMES_A_SCENE = 6

@@ -5,10 +5,10 @@ Four times OneFixer's updates, so that every style sees as many clips as OneFixe
 
 from __future__ import annotations
 
+from alpasim_plugin.block_fixers.settings import CLEAR, STYLES
 from alpasim_plugin.lab.training.recipes.recipe import Recipe, Stage
 from alpasim_plugin.lab.training.styled_rollout import StyledRollout
 from alpasim_plugin.lab.training.trainer import PartSchedule
-from alpasim_plugin.nets.styles import CLEAR, STYLES
 
 NAME = "appearance"
 PROMPT_RATE = 10.0  # a prompt is 64 numbers of unit variance, and only the clips of its style move it

@@ -15,13 +15,13 @@ from typing import Any, Literal, Protocol
 
 from torch import Tensor, nn
 
+from alpasim_plugin.block_fixers.settings import DiTSettings, LatentFixerSettings
+from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.settings import DiTSettings, LatentFixerSettings
 from alpasim_plugin.lab.training.clip_batches import BatchForm, Seen
 from alpasim_plugin.lab.training.latent_clips import LatentClips
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.trainer import Loss, PartSchedule
-from alpasim_plugin.nets.tiny_vae import TinyVAE
 
 INIT, INIT_BI = "init", "init-bi"
 GIVEN = (INIT, INIT_BI)  # weights that a run is given; all others are made by an earlier stage

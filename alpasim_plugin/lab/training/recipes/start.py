@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.dit import CosmosCausalDiT
+from alpasim_plugin.block_fixers.sampling import OPACITY_CHANNELS
+from alpasim_plugin.block_fixers.sizes import DiTSizes, initial_weights
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
+from alpasim_plugin.lab.image_fixers.pipeline import share_embedding
 from alpasim_plugin.lab.training.recipes.recipe import StageInputs
 from alpasim_plugin.lab.training.vae import channel_amplitudes
-from alpasim_plugin.nets import CosmosCausalDiT, DiTSizes
-from alpasim_plugin.nets.euler import share_embedding
-from alpasim_plugin.nets.init import initial_weights
-from alpasim_plugin.nets.sampling import OPACITY_CHANNELS
 
 MAP_KEY = "additional_patch_embedding.proj.1.weight"
 OPACITY_KEY = "blocks.{}.opacity_embed.weight"

@@ -1,0 +1,307 @@
+"""3D rotary position embedding (RoPE) over (time, height, width), with NTK-scaled frequencies and rotate-half pairing.
+
+Each head's channels are split ``h = w = 2 * (head_width // 6)``, ``t = rest``. An axis of width ``d`` has the frequencies ``theta **
+(-2k / d)`` for ``k < d / 2`` with ``theta = 10000 * ratio ** (d / (d - 2))``. The angles of a token are concatenated in the order t, h,
+w and repeated twice; channel ``j`` is rotated together with channel ``j + head_width / 2``.
+
+Source: Cosmos-Predict2 rotary embedding as released with OmniDreams. The released table has 128 latents; here positions are
+unbounded. Tables are computed on the CPU, also under a default device of ``meta``, and then moved. Angles are float64: at position 10,000
+float32 has an error of 6e-4 rad.
+
+Attention over latents: block-causal over a whole clip, over a cache, and over the text.
+
+Block-causal mask: a token attends to every token of its own block and of earlier blocks. A sliding window restricts this to the last
+``window - sink`` latents up to the end of the own block, plus the first ``sink`` latents of the rollout (attention sink); the own block
+is always visible, even when the window is smaller.
+
+Select torch's attention kernel, for benchmarks; the networks work with any.
+
+No mask is built (`attention`), so every kernel applies: flash, cuDNN, memory-efficient, and `math` (plain matrix products that hold all
+scores), which is the reference of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from alpasim_plugin.block_fixers.layers import RMSNorm
+from alpasim_plugin.core.errors import InputError
+
+BASE = 10000.0
+RopeTable = tuple[Tensor, Tensor]  # cos, sin: (L, head_width / 2) float32
+Attend = Callable[[Tensor, Tensor, Tensor], Tensor]  # q, k, v (B, L, heads, head_width) -> (B, L, heads * head_width)
+Kernel = Literal["auto", "flash", "cudnn", "efficient", "math"]
+BACKENDS = {
+    "flash": SDPBackend.FLASH_ATTENTION,
+    "cudnn": SDPBackend.CUDNN_ATTENTION,
+    "efficient": SDPBackend.EFFICIENT_ATTENTION,
+    "math": SDPBackend.MATH,
+}
+
+
+def axis_widths(head_width: int) -> tuple[int, int, int]:
+    """Return the number of a head's channels for time, height and width.
+
+    Example:
+        >>> axis_widths(128)
+        (44, 42, 42)
+    """
+    if head_width < 2 or head_width % 2:
+        raise InputError("splitting a head for rotary positions", "head width", str(head_width), "use an even head width")
+    spatial = 2 * (head_width // 6)
+    return head_width - 2 * spatial, spatial, spatial
+
+
+def frequencies(width: int, ratio: float) -> Tensor:
+    """Return one axis' angular frequencies.
+
+    Args:
+        width: Channels of the axis, even.
+        ratio: NTK scaling; 1 leaves the base at 10000.
+
+    Returns:
+        ``(width / 2,)`` float64, radians per position.
+    """
+    exponent = torch.arange(0, width, 2, dtype=torch.float64, device="cpu") / max(width, 1)
+    # With two channels the only exponent is zero, so the base (whose NTK power is singular) has no effect.
+    theta = BASE * ratio ** (width / (width - 2)) if width > 2 else BASE
+    return torch.pow(torch.tensor(theta, dtype=torch.float64, device="cpu"), -exponent)
+
+
+class Rope3D:
+    """Compute rotary tables for blocks of latents.
+
+    Args:
+        head_width: Channels of one attention head, even.
+        ratios: NTK ratios in the order height, width, time.
+    """
+
+    def __init__(self, head_width: int, ratios: tuple[float, float, float]) -> None:
+        widths = axis_widths(head_width)
+        height_ratio, width_ratio, time_ratio = ratios
+        pairs = zip(widths, (time_ratio, height_ratio, width_ratio), strict=True)
+        self.head_width, self.ratios = head_width, ratios
+        self.freq_t, self.freq_h, self.freq_w = (frequencies(width, ratio) for width, ratio in pairs)
+
+    def angles(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
+        """Return the angle of every token and channel.
+
+        Args:
+            start: Absolute latent index of the first frame in its rollout.
+            frames, rows, columns: Token grid of the block.
+
+        Returns:
+            ``(frames, rows, columns, head_width)`` float64 radians, the second half repeating the first.
+        """
+        half = self._half(start, frames, rows, columns)
+        return torch.cat([half, half], dim=-1)
+
+    def table(self, start: int, frames: int, rows: int, columns: int, device: torch.device | str = "cpu") -> RopeTable:
+        """Return ``cos`` and ``sin`` of a block's tokens in (t, h, w) order, each ``(frames * rows * columns, head_width / 2)`` float32."""
+        half = self._half(start, frames, rows, columns).reshape(-1, self.head_width // 2)
+        return half.cos().float().to(device), half.sin().float().to(device)
+
+    def move(self, table: RopeTable, start: int, frames: int) -> None:
+        """Update a table of `table` to another start, in place: only the time columns change.
+
+        Bit-identical to a new table, with less arithmetic and less data moved to the device.
+        """
+        angle = torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None] * self.freq_t
+        for kept, new in zip(table, (angle.cos(), angle.sin()), strict=True):
+            columns = kept.view(frames, -1, self.head_width // 2)[..., : len(self.freq_t)]
+            columns.copy_(new.float().to(kept.device)[:, None].expand(columns.shape))
+
+    def _half(self, start: int, frames: int, rows: int, columns: int) -> Tensor:
+        t = torch.arange(start, start + frames, dtype=torch.float64, device="cpu")[:, None] * self.freq_t
+        h = torch.arange(rows, dtype=torch.float64, device="cpu")[:, None] * self.freq_h
+        w = torch.arange(columns, dtype=torch.float64, device="cpu")[:, None] * self.freq_w
+        shape = (frames, rows, columns, -1)
+        return torch.cat([t[:, None, None].expand(shape), h[None, :, None].expand(shape), w[None, None].expand(shape)], dim=-1)
+
+
+def rotate(x: Tensor, table: RopeTable) -> Tensor:
+    """Apply the rotary embedding to queries or keys, in float32.
+
+    Args:
+        x: ``(B, L, heads, head_width)``.
+        table: From `Rope3D.table`, ``L`` rows.
+
+    Returns:
+        Same shape and dtype as ``x``.
+    """
+    cos, sin = (part[:, None, :] for part in table)  # (L, 1, head_width / 2)
+    first, second = x.float().chunk(2, dim=-1)
+    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1).to(x.dtype)
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """Attend from every query to every key, without a mask.
+
+    Args:
+        q: ``(B, Lq, heads, head_width)``.
+        k, v: ``(B, Lk, heads, head_width)``.
+
+    Returns:
+        ``(B, Lq, heads * head_width)``.
+    """
+    out = F.scaled_dot_product_attention(q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2))
+    return out.transpose(1, 2).flatten(2)
+
+
+def visible_latents(start: int, end: int, window: int | None, sink: int) -> list[int]:
+    """Return the latents that are visible to the block ``[start, end)``, oldest first.
+
+    Example:
+        >>> visible_latents(8, 10, 6, 2)
+        [0, 1, 6, 7, 8, 9]
+        >>> visible_latents(8, 10, 1, 0)
+        [8, 9]
+    """
+    if window is None:
+        return list(range(end))
+    oldest = min(start, end - (window - sink))
+    return [i for i in range(end) if i < sink or i >= oldest]
+
+
+def block_causal_attention(
+    q: Tensor, k: Tensor, v: Tensor, tokens: int, block_latents: int, window: int | None = None, sink: int = 0
+) -> Tensor:
+    """Attend block by block without building a mask.
+
+    Args:
+        q, k, v: ``(B, T * tokens, heads, head_width)``.
+        tokens: Tokens of one latent.
+        block_latents: Latents of a block; the last block may be shorter.
+        window, sink: See the module text; None for the whole past.
+
+    Returns:
+        ``(B, T * tokens, heads * head_width)``.
+    """
+    frames = q.shape[1] // tokens
+    out = []
+    for start in range(0, frames, block_latents):
+        end = min(start + block_latents, frames)
+        first = 0 if window is None else max(0, min(start, end - (window - sink)))
+        keys, values = (part[:, first * tokens : end * tokens] for part in (k, v))
+        kept = min(sink, first) if window is not None else 0  # sink latents outside the contiguous range
+        if kept:
+            keys, values = (torch.cat([part[:, : kept * tokens], run], dim=1) for part, run in ((k, keys), (v, values)))
+        out.append(attend(q[:, start * tokens : end * tokens], keys, values))
+    return torch.cat(out, dim=1)
+
+
+class SelfAttention(nn.Module):
+    """Attention of latent tokens on latent tokens, with RMS-normed and rotated queries and keys.
+
+    After folding (`fuse`) the three projections are one linear with bias.
+    """
+
+    def __init__(self, width: int, head_width: int) -> None:
+        super().__init__()
+        self.head_width = head_width
+        self.q_proj = nn.Linear(width, width, bias=False)
+        self.k_proj = nn.Linear(width, width, bias=False)
+        self.v_proj = nn.Linear(width, width, bias=False)
+        self.output_proj = nn.Linear(width, width, bias=False)
+        self.q_norm = RMSNorm(head_width)
+        self.k_norm = RMSNorm(head_width)
+        self.qkv_proj: nn.Linear | None = None
+
+    def fuse(self, qkv: nn.Linear) -> None:
+        """Replace the three projections by one."""
+        self.qkv_proj = qkv
+        del self.q_proj, self.k_proj, self.v_proj
+
+    def project(self, x: Tensor, added: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Map tokens ``(B, L, width)`` to normed queries and keys, and values, each ``(B, L, heads, head_width)``.
+
+        ``added (B, L, width)`` is added to the tokens; once the projections are fused it is ``(B, L, 3 * width)``, already projected.
+        """
+        if self.qkv_proj is None:
+            x = x if added is None else x + added
+            parts = self.q_proj(x), self.k_proj(x), self.v_proj(x)
+        else:
+            qkv = self.qkv_proj(x)
+            parts = (qkv if added is None else qkv + added).chunk(3, dim=-1)
+        q, k, v = (part.unflatten(-1, (-1, self.head_width)) for part in parts)
+        return self.q_norm(q), self.k_norm(k), v
+
+    def forward(self, x: Tensor, table: RopeTable, attention: Attend, added: Tensor | None = None) -> Tensor:
+        """Apply self-attention.
+
+        Args:
+            x: ``(B, T, N, width)``.
+            table: Rotation of the ``T * N`` tokens.
+            attention: Attention of the block's q, k, v and the cached past.
+            added: See `project`, ``(B, T, N, ...)``.
+        """
+        q, k, v = self.project(x.flatten(1, 2), None if added is None else added.flatten(1, 2))
+        out: Tensor = self.output_proj(attention(rotate(q, table), rotate(k, table), v))
+        return out.view(x.shape)
+
+
+class CrossAttention(nn.Module):
+    """Attention of latent tokens on text tokens; no positions, no mask."""
+
+    def __init__(self, width: int, context_width: int, head_width: int) -> None:
+        super().__init__()
+        self.head_width = head_width
+        self.q_proj = nn.Linear(width, width, bias=False)
+        self.k_proj = nn.Linear(context_width, width, bias=False)
+        self.v_proj = nn.Linear(context_width, width, bias=False)
+        self.output_proj = nn.Linear(width, width, bias=False)
+        self.q_norm = RMSNorm(head_width)
+        self.k_norm = RMSNorm(head_width)
+
+    def keys_values(self, context: Tensor) -> tuple[Tensor, Tensor]:
+        """Map the context ``(B, tokens, context_width)`` to keys and values ``(B, tokens, heads, head_width)``; once per prompt."""
+        k, v = (part.unflatten(-1, (-1, self.head_width)) for part in (self.k_proj(context), self.v_proj(context)))
+        return self.k_norm(k), v
+
+    def forward(self, x: Tensor, keys_values: tuple[Tensor, Tensor]) -> Tensor:
+        """Attend from ``x (B, T, N, width)`` to the text.
+
+        With a single text token the softmax is 1, so the output is that token's value for every query.
+        """
+        k, v = (part.expand(x.shape[0], *part.shape[1:]) for part in keys_values)
+        if k.shape[1] == 1:
+            value: Tensor = self.output_proj(v.flatten(2))
+            return value[:, :, None].expand(x.shape)
+        q = self.q_norm(self.q_proj(x.flatten(1, 2)).unflatten(-1, (-1, self.head_width)))
+        out: Tensor = self.output_proj(attend(q, k, v))
+        return out.view(x.shape)
+
+
+@contextmanager
+def attention_kernel(
+    name: Kernel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, head_width: int = 64
+) -> Iterator[None]:
+    """Run attention with one kernel and no other; ``auto`` leaves the choice to torch.
+
+    Args:
+        name: The kernel.
+        device, dtype, head_width: Of the inputs; the kernel is tried on them once.
+
+    Raises:
+        InputError: The kernel is unknown or does not support these inputs.
+    """
+    if name not in get_args(Kernel):
+        raise InputError("choosing an attention kernel", name, "no such kernel", f"take one of {', '.join(get_args(Kernel))}")
+    if name == "auto":
+        yield
+        return
+    with sdpa_kernel(BACKENDS[name]):
+        x = torch.zeros(1, 2, 16, head_width, device=device, dtype=dtype)
+        try:
+            F.scaled_dot_product_attention(x, x, x)
+        except RuntimeError as error:
+            found = f"{str(error).splitlines()[0]} ({device}, {dtype}, head width {head_width})"
+            raise InputError("choosing an attention kernel", name, found, "use auto, or another precision") from error
+        yield

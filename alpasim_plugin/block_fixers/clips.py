@@ -1,0 +1,166 @@
+"""Valid clip sizes of video autoencoders (1 + 4k frames, sides in multiples of 8), and padding to them.
+
+Padding is explicit: `pad_clip` repeats the last frame and the right and bottom edges, and returns the size to crop to after decoding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.types import F32, U8
+from alpasim_plugin.fixers.views import HALF, ClipSize, Views
+
+GROUP = 4  # temporal compression: frames of every latent but the first
+SIDE = 8  # spatial compression: pixels per latent along a side
+TOKEN_PX = 16  # side of a token
+
+
+def on_grid(frames: int, group: int = GROUP) -> int:
+    """Return the smallest 1 + ``group`` * k that is not below ``frames``.
+
+    Example:
+        >>> [on_grid(n) for n in (1, 2, 5, 6)]
+        [1, 5, 5, 9]
+    """
+    return 1 + -(-(frames - 1) // group) * group
+
+
+def group_ends(frames: int, first: bool, groups: int | None = 1) -> list[int]:
+    """Return where each pass over an encoder ends.
+
+    Args:
+        frames: Frames at hand.
+        first: Whether they start a video, so that the first latent holds one frame.
+        groups: Latents of a pass; None for all in one.
+
+    Example:
+        >>> group_ends(13, first=True), group_ends(12, first=False), group_ends(13, first=True, groups=2)
+        ([1, 5, 9, 13], [4, 8, 12], [5, 13])
+    """
+    latents = frames // GROUP + first
+    ends = [GROUP * n - (GROUP - 1 if first else 0) for n in range(1, latents + 1)]
+    step = groups or latents
+    return [*ends[step - 1 : -1 : step], ends[-1]]
+
+
+def pass_ends(latents: int, size: int | None = 1) -> list[int]:
+    """Return where each pass over a decoder ends, ``size`` latents a pass (None: all in one)."""
+    step = size or latents
+    return [*range(step, latents, step), latents]
+
+
+def pad_clip(video: Tensor, group: int = GROUP, side: int = SIDE) -> tuple[Tensor, ClipSize]:
+    """Pad a clip to a valid size by repeating the last frame, row and column.
+
+    Args:
+        video: ``(B, C, T, H, W)``, T at least 1.
+        group: Frames of a latent after the first.
+        side: Pixels that height and width must be a multiple of (16 for a network that works on 2x2 latents).
+
+    Returns:
+        The padded clip and the size to crop to (`crop_clip`).
+    """
+    size = ClipSize(*video.shape[2:])
+    extra = (-size.width % side, -size.height % side, on_grid(size.frames, group) - size.frames)
+    if any(extra):
+        video = F.pad(video, (0, extra[0], 0, extra[1], 0, extra[2]), mode="replicate")
+    return video, size
+
+
+def crop_clip(video: Tensor, size: ClipSize) -> Tensor:
+    """Return the top left ``size`` of ``(B, C, T, H, W)``; undoes `pad_clip`."""
+    return video[:, :, : size.frames, : size.height, : size.width]
+
+
+def check_frames(video: Tensor, doing: str, first: bool, group: int = GROUP, side: int = SIDE, channels: int = 3) -> None:
+    """Refuse clips of an invalid size.
+
+    Args:
+        video: Meant to be ``(B, channels, T, H, W)`` floating point.
+        doing: For the message.
+        first: Whether these frames start the video (1 + group * k) or continue it (group * k).
+        group: Frames of a latent after the first.
+        side: What height and width must be a multiple of.
+        channels: Colour channels.
+
+    Raises:
+        InputError: The found size, with the nearest valid one.
+    """
+    shape = list(video.shape)
+    if video.ndim != 5 or shape[1] != channels or not video.is_floating_point():
+        do = f"give (B, {channels}, T, H, W) with values in [-1, 1]"
+        raise InputError(doing, f"a tensor {shape} of {video.dtype}", "not a floating-point video", do)
+    frames, height, width = shape[2:]
+    if height < side or width < side or height % side or width % side:
+        raise InputError(
+            doing,
+            f"frames of {height} x {width} pixels (height x width)",
+            f"height and width must be multiples of {side}",
+            f"pad to {max(side, height + -height % side)} x {max(side, width + -width % side)} (pad_clip), crop the result (crop_clip)",
+        )
+    if first and (frames < 1 or (frames - 1) % group):
+        raise InputError(
+            doing,
+            f"{frames} frames at the start of a video",
+            f"the first latent holds 1 frame and every later one {group}: 1 + {group}k frames are needed",
+            f"give {max(1, 1 + (frames - 1) // group * group)} or {on_grid(max(1, frames), group)} frames (pad_clip repeats the last one)",
+        )
+    if not first and (frames < 1 or frames % group):
+        raise InputError(
+            doing,
+            f"{frames} frames in the middle of a stream",
+            f"every latent after the first holds {group} frames",
+            f"push a multiple of {group} frames, or start a new stream for a new video",
+        )
+
+
+def check_latents(z: Tensor, doing: str, channels: int) -> None:
+    """Refuse other tensors than ``(B, channels, t, h, w)`` floating point with at least one latent.
+
+    Raises:
+        InputError: Another shape or dtype.
+    """
+    if z.ndim != 5 or z.shape[1] != channels or not z.is_floating_point() or 0 in z.shape:
+        do = f"give (B, {channels}, t, h, w) floating point, t at least 1"
+        raise InputError(doing, f"a tensor {list(z.shape)} of {z.dtype}", "not a video latent", do)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One block as the networks take it, padded in time and space."""
+
+    rgb: Tensor  # (B, 3, T, H, W) in [-1, 1]
+    alpha: Tensor | None  # (B, 1, T, H, W), 0 to 1; None where every pixel is opaque
+    maps: Tensor | None  # (B, 3, T, H, W) in [-1, 1]
+
+
+def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -> Clip:
+    """Convert views to tensors: ``x / 127.5 - 1``, the last frame repeated up to ``frames_due``, edges padded to multiples of 16."""
+
+    def video(images: U8 | F32) -> Tensor:
+        x = torch.from_numpy(images).to(device).float()
+        x = x if images.dtype == np.float32 else x.div_(HALF).sub_(1)
+        x = x.permute(0, 4, 1, 2, 3)
+        short = frames_due - x.shape[2]
+        if short:
+            x = torch.cat([x, x[:, :, -1:].expand(-1, -1, short, -1, -1)], dim=2)
+        return pad_clip(x, group=1, side=TOKEN_PX)[0]
+
+    return Clip(
+        video(views.rgb),
+        None if views.alpha is None else video(views.alpha[..., None]),
+        None if views.maps is None else video(views.maps),
+    )
+
+
+def to_images(video: Tensor, size: ClipSize) -> U8:
+    """Crop ``(B, 3, T, H, W)`` in [-1, 1] and round it to images ``(B, T, H, W, 3)``; values are clipped to the range."""
+    levels = crop_clip(video, size).float().clamp(-1, 1).add_(1).mul_(HALF).round_()
+    images: U8 = levels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous().cpu().numpy()
+    return images

@@ -1,0 +1,225 @@
+"""KV caches: a fixed rolling buffer for inference and a list with gradients for training.
+
+Both have the same visibility rule (see `attention`): the window includes the sink and the own block. Keys are stored after the rotary
+embedding at their absolute positions.
+
+`RollingCache` allocates once. Latent ``i`` is in slot ``i`` if it is a sink, else in slot ``sink + (i - sink) % (window - sink)``, so the
+newest latents overwrite the oldest without moves. Attention is invariant to the order of keys, so the buffer is used unsorted.
+`GraphCache` keeps the tensors of every block with their gradients and grows. It is the reference implementation of the rolling cache.
+
+A block is a series of forwards at one position: `begin` opens or reopens it, `attend` serves one layer, `commit` keeps the keys and values
+of the last forward and advances.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from alpasim_plugin.block_fixers.attention import Rope3D, RopeTable, attend, visible_latents
+from alpasim_plugin.core.errors import InputError
+
+
+class BlockCache(ABC):
+    """Base class: position in the rollout and the rotary table of the open block.
+
+    Args:
+        rope: The network's rotary positions.
+        batch: Sequences side by side.
+        height, width: Latent size, even.
+        window: Latents that a token attends to, own block and sink included; None for all.
+        sink: First latents of the rollout that stay visible (attention sink).
+        device: Of keys and values.
+    """
+
+    keeps_graph: bool = False
+
+    def __init__(self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device) -> None:
+        doing = "making a cache for a causal network"
+        if batch < 1 or height < 2 or width < 2 or height % 2 or width % 2:
+            found = f"batch {batch}, latent size {height} x {width}"
+            raise InputError(doing, "batch, height, width", found, "give a positive batch and even latent sizes (pixels / 8)")
+        if sink < 0 or (window is not None and (window < 1 or sink > window)):
+            found = f"window {window}, sink {sink}"
+            raise InputError(doing, "window and sink, in latents", found, "use window >= 1 and 0 <= sink <= window")
+        self.rope, self.batch, self.height, self.width = rope, batch, height, width
+        self.window, self.sink, self.device = window, sink, device
+        self.rows, self.columns = height // 2, width // 2
+        self.tokens = self.rows * self.columns
+        self.position = 0  # absolute index of the open block's first latent
+        self.filled = 0  # latents committed since reset; differs from position in a rollout that does not start at 0
+        self.open_latents = 0  # length of the open block; 0 between blocks
+        self._tables: dict[int, tuple[int, RopeTable]] = {}
+
+    def reset(self, position: int = 0) -> None:
+        """Clear the cache and start at an absolute latent index."""
+        self.position, self.filled, self.open_latents = position, 0, 0
+
+    def begin(self, latents: int) -> RopeTable:
+        """Open or reopen the block at the current position, and return the rotary table of its tokens.
+
+        In a rolling cache the returned tensors keep their storage for all blocks of one length.
+        """
+        self.open_latents = latents
+        at, table = self._tables.get(latents, (-1, None))
+        with torch.inference_mode(False):  # tensors created in inference mode cannot be written to outside of it
+            if table is None or (at != self.position and self.keeps_graph):  # the backward pass of earlier blocks needs their tables
+                table = self.rope.table(self.position, latents, self.rows, self.columns, self.device)
+            elif at != self.position:
+                self.rope.move(table, self.position, latents)
+        self._tables[latents] = (self.position, table)
+        return table
+
+    def commit(self) -> None:
+        """Keep the keys and values of the last forward and advance by its block.
+
+        Raises:
+            InputError: No forward since the last commit or reset.
+        """
+        if not self.open_latents:
+            do = "run the block first, with write=False if it is not final"
+            raise InputError("keeping a block in a cache", f"latent {self.position}", "no forward to keep", do)
+        self.position += self.open_latents
+        self.filled += self.open_latents
+        self.open_latents = 0
+
+    @abstractmethod
+    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Attend from the open block to itself and the visible past; see `attention.attend` for shapes."""
+
+
+class RollingCache(BlockCache):
+    """Hold at most ``window`` latents per layer in preallocated buffers.
+
+    Forwards through it run without gradients, since its buffers are overwritten in place.
+    """
+
+    def __init__(
+        self,
+        rope: Rope3D,
+        layers: int,
+        heads: int,
+        batch: int,
+        height: int,
+        width: int,
+        window: int,
+        sink: int,
+        device: torch.device,
+        dtype: torch.dtype,
+    ) -> None:
+        super().__init__(rope, batch, height, width, window, sink, device)
+        self.size = window
+        self.layout = (layers, heads, dtype)
+        shape = (layers, batch, window * self.tokens, heads, rope.head_width)
+        with torch.inference_mode(False):
+            self.keys = torch.zeros(shape, device=device, dtype=dtype)
+            self.values = torch.zeros(shape, device=device, dtype=dtype)
+            self._rows = torch.zeros(0, dtype=torch.long, device=device)  # buffer rows of the open block's tokens
+        self._source: Tensor | None = None  # the block's tokens in those rows; None for all
+        self._chosen = (0, 0)  # filled latents and block length that the rows belong to
+        self._fits = True
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the buffers."""
+        return 2 * self.keys.numel() * self.keys.element_size()
+
+    @property
+    def visible(self) -> tuple[int, int, bool]:
+        """Visible latents, visible sinks, and whether the block fits in the window; constant once the window is full."""
+        return min(self.size, self.filled + self.open_latents), min(self.sink, self.filled), self._fits
+
+    def begin(self, latents: int) -> RopeTable:
+        """Open the block and choose the slots of its latents.
+
+        Raises:
+            InputError: The block is reopened with fewer latents after its first forward overwrote the oldest latents.
+        """
+        overwritten = self.filled + self.open_latents > self.size
+        if 0 < latents < self.open_latents and overwritten:
+            found = f"{latents} latents after a forward with {self.open_latents} at latent {self.position}"
+            do = "repeat a block with its first length (its forwards share slots), or write it, or reset the cache"
+            raise InputError("opening a block of a rolling cache", f"window {self.window}, sink {self.sink}", found, do)
+        table = super().begin(latents)
+        if self._chosen == (self.filled, latents):  # reopened: no transfer to the device
+            return table
+        self._chosen = (self.filled, latents)
+        ring = self.size - self.sink
+        own = range(self.filled, self.filled + latents)
+        rolling = [i for i in own if i >= self.sink]
+        self._fits = len(rolling) <= ring
+        # A block longer than the ring attends to all of itself; only its newest latents are cached.
+        kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
+        slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
+        with torch.inference_mode(False):
+            self._rows = self._keep_in_place(self._rows, slots)
+            self._source = None if self._fits else self._keep_in_place(self._source, [i - self.filled for i in kept])
+        return table
+
+    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Write the block's keys and values into their slots and attend to the buffer."""
+        keys, values = self.keys[layer], self.values[layer]
+        own_k, own_v = (part.to(keys.dtype) for part in (k, v))
+        for buffer, own in ((keys, own_k), (values, own_v)):
+            buffer.index_copy_(1, self._rows, own if self._source is None else own[:, self._source])
+        if self._fits:
+            end = self.visible[0] * self.tokens
+            return attend(q, keys[:, :end], values[:, :end])
+        past = self.visible[1] * self.tokens
+        return attend(q, torch.cat([keys[:, :past], own_k], dim=1), torch.cat([values[:, :past], own_v], dim=1))
+
+    def _keep_in_place(self, old: Tensor | None, latents: list[int]) -> Tensor:
+        """Return the rows of these latents, in the old tensor's storage if the shape is equal."""
+        rows = self._token_rows(latents)
+        return rows.to(self.device) if old is None or old.shape != rows.shape else old.copy_(rows)
+
+    def _token_rows(self, latents: list[int]) -> Tensor:
+        first = torch.tensor(latents, dtype=torch.long, device="cpu")[:, None] * self.tokens
+        return (first + torch.arange(self.tokens, device="cpu")).flatten()
+
+
+class GraphCache(BlockCache):
+    """Keep every block's keys and values with their gradients; memory grows with the rollout."""
+
+    keeps_graph = True
+
+    def __init__(self, rope: Rope3D, batch: int, height: int, width: int, window: int | None, sink: int, device: torch.device) -> None:
+        super().__init__(rope, batch, height, width, window, sink, device)
+        self._kept: dict[int, list[tuple[Tensor, Tensor]]] = {}  # layer -> per latent k, v: (B, tokens, heads, head_width)
+        self._open: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def reset(self, position: int = 0) -> None:
+        """Clear the cache and start at an absolute latent index."""
+        super().reset(position)
+        self._kept, self._open = {}, {}
+
+    def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Attend to the concatenation of the visible past and the block."""
+        self._open[layer] = (k, v)
+        kept = self._kept.get(layer, [])
+        visible = [i for i in visible_latents(self.filled, self.filled + self.open_latents, self.window, self.sink) if i < self.filled]
+        return attend(q, torch.cat([*(kept[i][0] for i in visible), k], dim=1), torch.cat([*(kept[i][1] for i in visible), v], dim=1))
+
+    def commit(self) -> None:
+        """Keep the tensors of the last forward."""
+        for layer, (k, v) in self._open.items():
+            pairs = zip(torch.split(k, self.tokens, dim=1), torch.split(v, self.tokens, dim=1), strict=True)
+            self._kept.setdefault(layer, []).extend(pairs)
+        self._open = {}
+        super().commit()
+
+    def fork(self) -> GraphCache:
+        """Return an independent cache with the same, detached past.
+
+        Raises:
+            InputError: A block is open.
+        """
+        if self.open_latents:
+            do = "commit the block first, or reset the cache"
+            raise InputError("forking a cache", f"latent {self.position}", "an open block with forwards that were not committed", do)
+        copy = GraphCache(self.rope, self.batch, self.height, self.width, self.window, self.sink, self.device)
+        copy.position, copy.filled = self.position, self.filled
+        copy._kept = {layer: [(k.detach(), v.detach()) for k, v in kept] for layer, kept in self._kept.items()}
+        return copy

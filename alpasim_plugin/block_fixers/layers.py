@@ -1,0 +1,174 @@
+"""Small layers shared by the transformer's parts: float32 islands, RMS norm, patch order.
+
+Three places stay in float32 whatever the network's precision: the time embedding, the modulation made from it, and the rotary
+positions. `Float32Linear` keeps the first two there even under autocast or after ``net.to(torch.bfloat16)``.
+
+Embeddings of the transformer: patch tokens, semantic-map tokens and time.
+
+Source: OmniDreams single view (causal HD-map network). Channel order at the input is latent, condition mask, padding mask; the map has
+its own patch embedding and is added to the tokens. The time sinusoid is cosine first; its RMS norm feeds the modulation layers
+directly, while the two-layer map of the raw sinusoid is the additive term that all modulation layers share.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import nullcontext
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+NORM_EPS = 1e-6
+PATCH = 2  # latent pixels per token side; one latent frame per token in time
+TIME_SCALE = 0.001
+MAX_PERIOD = 10000.0
+
+
+class Float32Linear(nn.Linear):
+    """Apply a bias-free linear map in float32, whatever the dtype of its weights and input."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, bias=False)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(..., inputs)`` to ``(..., outputs)`` float32."""
+        kind = input.device.type
+        with torch.autocast(kind, enabled=False) if torch.amp.is_autocast_available(kind) else nullcontext():
+            return F.linear(input.float(), self.weight.float())
+
+
+class RMSNorm(nn.Module):
+    """Divide by the root mean square over the last axis and scale by a learned gain, in float32."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., width)`` to the same shape and dtype."""
+        return F.rms_norm(x.float(), (x.shape[-1],), self.weight.float(), NORM_EPS).to(x.dtype)
+
+
+def layer_norm(x: Tensor) -> Tensor:
+    """Normalise the last axis to zero mean and unit variance; the network's layer norms have no parameters."""
+    return F.layer_norm(x, (x.shape[-1],), eps=NORM_EPS)
+
+
+def patchify(video: Tensor) -> Tensor:
+    """Split into 2x2 patches, channel slowest: the order of the input embeddings.
+
+    Args:
+        video: ``(B, C, T, H, W)``, H and W even.
+
+    Returns:
+        ``(B, T, H/2 * W/2, C * 4)`` with the last axis ordered (channel, row, column).
+    """
+    b, c, t, h, w = video.shape
+    grid = video.reshape(b, c, t, h // PATCH, PATCH, w // PATCH, PATCH)
+    return grid.permute(0, 2, 3, 5, 1, 4, 6).reshape(b, t, (h // PATCH) * (w // PATCH), c * PATCH * PATCH)
+
+
+def unpatchify(tokens: Tensor, height: int, width: int) -> Tensor:
+    """Join 2x2 patches, channel fastest: the order of the output layer, which differs from the input's.
+
+    Args:
+        tokens: ``(B, T, H/2 * W/2, 4 * C)`` with the last axis ordered (row, column, channel).
+        height, width: Latent size.
+
+    Returns:
+        ``(B, C, T, H, W)``.
+    """
+    b, t, _, depth = tokens.shape
+    grid = tokens.reshape(b, t, height // PATCH, width // PATCH, PATCH, PATCH, depth // (PATCH * PATCH))
+    return grid.permute(0, 6, 1, 2, 4, 3, 5).reshape(b, -1, t, height, width)
+
+
+class PatchLinear(nn.Linear):
+    """Patch embedding that can skip input channels which are zero."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__(channels * PATCH * PATCH, width, bias=False)
+
+    def follow(self, weight: Tensor) -> None:
+        """Become the embedding followed by a linear with this weight ``(outputs, width)``, in place; product in float64."""
+        self.weight = nn.Parameter((weight.double() @ self.weight.double()).to(self.weight.dtype), requires_grad=False)
+        self.out_features = len(weight)
+
+    def embed(self, video: Tensor, first_channel: int = 0) -> Tensor:
+        """Embed ``video (B, C, T, H, W)`` as the channels from ``first_channel`` on; return ``(B, T, N, width)``."""
+        patches = patchify(video)
+        start = first_channel * PATCH * PATCH
+        return F.linear(patches, self.weight[:, start : start + patches.shape[-1]])
+
+
+def sinusoid(t: Tensor, width: int, rounding: torch.dtype = torch.float32) -> Tensor:
+    """Embed time steps as cosines then sines.
+
+    Args:
+        t: ``(...)`` time steps, 0 to 1000.
+        width: Channels, even.
+        rounding: Precision in which the original training code holds time: with ``torch.bfloat16``, the step, its scaled value and the
+            result are each rounded (937.5 becomes 936).
+
+    Returns:
+        ``(..., width)`` float32.
+    """
+    scaled = (t.to(rounding) * TIME_SCALE).float()
+    half = width // 2
+    frequency = torch.exp(-math.log(MAX_PERIOD) * torch.arange(half, device=t.device, dtype=torch.float32) / half)
+    angle = scaled[..., None] * frequency
+    return torch.cat([angle.cos(), angle.sin()], dim=-1).to(rounding).float()
+
+
+class TimeMap(nn.Module):
+    """Map the sinusoid to the modulation term shared by every block: ``Linear(SiLU(Linear(s)))``, no biases, float32."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.linear_1 = Float32Linear(width, width)
+        self.linear_2 = Float32Linear(width, 3 * width)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """Map ``(..., width)`` to ``(..., 3 * width)``."""
+        out: Tensor = self.linear_2(F.silu(self.linear_1(s)))
+        return out
+
+
+class PatchEmbed(nn.Module):
+    """Hold one patch embedding under the checkpoint's key ``proj.1.weight``."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.proj = nn.ModuleList([nn.Identity(), PatchLinear(channels, width)])
+
+    @property
+    def linear(self) -> PatchLinear:
+        """The embedding itself."""
+        layer = self.proj[1]
+        assert isinstance(layer, PatchLinear)
+        return layer
+
+
+def embed_latents(embed: PatchLinear, x: Tensor, condition_mask: Tensor | None, padding_mask: Tensor | None) -> Tensor:
+    """Embed latents together with their masks.
+
+    A mask that is None is zero, so its columns of the embedding are skipped.
+
+    Args:
+        embed: Embedding of C + 2 channels.
+        x: ``(B, C, T, H, W)``.
+        condition_mask: ``(B, 1, T, H, W)`` or anything that broadcasts to it, 1 where the latent is given.
+        padding_mask: ``(B, 1, h, w)`` at any resolution; resized to the latent's by nearest neighbour.
+
+    Returns:
+        ``(B, T, N, width)``.
+    """
+    b, c, t, h, w = x.shape
+    tokens = embed.embed(x)
+    if condition_mask is not None:
+        tokens = tokens + embed.embed(condition_mask.to(x.dtype).expand(b, 1, t, h, w), c)
+    if padding_mask is not None:
+        resized = F.interpolate(padding_mask.to(x.dtype), size=(h, w), mode="nearest")
+        tokens = tokens + embed.embed(resized[:, :, None].expand(b, 1, t, h, w), c + 1)
+    return tokens

@@ -1,0 +1,287 @@
+"""Streaming state of causal networks: explicit, immutable, passed in and returned.
+
+A causal layer sees one or two past frames; in a stream they come from the previous call. `StreamingState` serves the layers of one pass in
+their fixed order: each layer takes its cached frames and leaves those for the next pass. A `State` is a tuple of tensors that are never
+written to, so a copy is a reference: a stream can be forked, or rolled back to before a speculative block.
+
+Per-frame layers on videos ``(B, T, H, W, C)``, and the loop over a mix of per-frame and causal layers.
+
+Channels last: norms and 1x1 convolutions act on contiguous vectors, a frame is a contiguous slice, and a CPU's 2D convolutions are fast.
+
+Whole-clip and streaming interface of the video codecs, over their pure step functions `encode_next` and `decode_next`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, Protocol, Self, runtime_checkable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.core.errors import InputError
+
+State = tuple[Tensor, ...]
+Step = Callable[..., tuple[Tensor, State]]
+
+
+class StreamingState:
+    """Cached frames of every causal layer during one pass over a network.
+
+    Args:
+        state: State after the previous pass, or None before the first frame.
+        detach: Cut gradients at the pass boundary.
+    """
+
+    def __init__(self, state: State | None, detach: bool = False) -> None:
+        self._old = state
+        self._new: list[Tensor] = []
+        self._detach = detach
+
+    @property
+    def first(self) -> bool:
+        """Whether this pass starts with the first frame of the video."""
+        return self._old is None
+
+    @property
+    def state(self) -> State:
+        """Cached frames of the layers visited so far, for the next pass."""
+        return tuple(self._new)
+
+    def extend(self, x: Tensor, frames: int) -> Tensor:
+        """Prepend the cached frames to ``x`` and cache the last ``frames`` of the result.
+
+        Args:
+            x: ``(B, T, ...)``.
+            frames: Past frames that the layer sees.
+
+        Returns:
+            ``(B, k + T, ...)`` with ``0 <= k <= frames``; no padding is added at the start of a video.
+
+        Raises:
+            InputError: Batch or frame size changed in the middle of a stream.
+        """
+        past = x[:, :0] if self._old is None else self._old[len(self._new)].to(x.dtype)
+        if past.shape[0] != x.shape[0] or past.shape[2:] != x.shape[2:]:
+            raise InputError(
+                "continuing a video stream",
+                f"a block whose layers have shape {list(x.shape)}",
+                f"the stream so far had {list(past.shape)} (batch, frames, then sizes)",
+                "keep batch and frame size for the whole stream, or start a new stream",
+            )
+        joined = torch.cat([past, x], dim=1) if past.shape[1] else x
+        kept = joined[:, max(0, joined.shape[1] - frames) :]
+        self._new.append((kept.detach() if self._detach else kept).clone())  # a view would keep the memory of the whole pass
+        return joined
+
+    def shift(self, x: Tensor) -> Tensor:
+        """Return every frame's predecessor, same shape; a zero frame before the first one of the video."""
+        joined = self.extend(x, 1)
+        return joined[:, :-1] if joined.shape[1] > x.shape[1] else torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], dim=1)
+
+
+class Stream:
+    """Feed a pure step function block by block and hold its state.
+
+    Args:
+        step: ``step(x, state, ...) -> (y, state)``.
+        state: Where to start; None is before the first frame.
+    """
+
+    def __init__(self, step: Step, state: State | None = None) -> None:
+        self._step = step
+        self.state = state
+
+    def push(self, x: Tensor, *args: Any, **options: Any) -> Tensor:
+        """Take the next frames or latents and return the outputs that they complete."""
+        out, self.state = self._step(x, self.state, *args, **options)
+        return out
+
+    def fork(self) -> Stream:
+        """Return an independent stream at the same point."""
+        return Stream(self._step, self.state)
+
+
+def in_passes(step: Step, x: Tensor, state: State | None, ends: Sequence[int]) -> tuple[Tensor, State]:
+    """Apply a pure step to consecutive parts of ``x (B, C, T, H, W)`` along time and join the results.
+
+    One latent a pass bounds memory and makes the result bit-identical for any division of a video into calls: the order of
+    summation is the same.
+
+    Args:
+        step: ``step(part, state) -> (y, state)``.
+        x: Frames or latents, at least one.
+        state: Where the stream stands.
+        ends: Where each part ends, increasing, the last one at T.
+    """
+    parts = []
+    for start, end in zip((0, *ends[:-1]), ends, strict=True):
+        out, state = step(x[:, :, start:end], state)
+        parts.append(out)
+    assert state is not None, "no part at all"
+    return (torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]), state
+
+
+@runtime_checkable
+class Causal(Protocol):
+    """A layer that sees past frames."""
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map the next frames; past frames are read from ``streaming`` and updated there."""
+
+
+def run_layers(layers: Iterable[nn.Module], x: Tensor, streaming: StreamingState) -> Tensor:
+    """Apply layers in sequence; causal layers use the streaming state."""
+    for layer in layers:
+        x = layer.next(x, streaming) if isinstance(layer, Causal) else layer(x)
+    return x
+
+
+def channels_last(video: Tensor) -> Tensor:
+    """Map ``(B, C, T, H, W)`` to contiguous ``(B, T, H, W, C)``."""
+    return video.permute(0, 2, 3, 4, 1).contiguous()
+
+
+def channels_first(x: Tensor) -> Tensor:
+    """Undo `channels_last`."""
+    return x.permute(0, 4, 1, 2, 3).contiguous()
+
+
+def split_last(x: Tensor, parts: int) -> Tensor:
+    """Map ``(..., parts * C)`` to ``(..., parts, C)``."""
+    return x.view(*x.shape[:-1], parts, x.shape[-1] // parts)
+
+
+def channels_to_frames(x: Tensor, parts: int) -> Tensor:
+    """Rearrange ``parts`` groups of channels as consecutive frames: ``(B, T, H, W, parts * C)`` to ``(B, parts * T, H, W, C)``."""
+    return split_last(x, parts).movedim(-2, 2).flatten(1, 2)
+
+
+def conv_frames(x: Tensor, weight: Tensor, bias: Tensor | None, stride: int = 1, padding: int = 0) -> Tensor:
+    """Convolve every frame of ``(B, T, H, W, C)`` with a 2D kernel ``(O, C, kh, kw)``."""
+    b, t = x.shape[:2]
+    out = F.conv2d(x.flatten(0, 1).permute(0, 3, 1, 2), weight.contiguous(memory_format=torch.channels_last), bias, stride, padding)
+    out = out.permute(0, 2, 3, 1)
+    return out.reshape(b, t, *out.shape[1:])
+
+
+class Float32Buffers(nn.Module):
+    """A module whose buffers stay float32 when the network changes precision (``net.to(torch.bfloat16)``)."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        before = dict(self._buffers)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        for name, old in before.items():
+            new = self._buffers[name]
+            if old is not None and new is not None and new.dtype != old.dtype:
+                self._buffers[name] = old.to(new.device)
+        return self
+
+
+class FrameConv(nn.Conv2d):
+    """3x3 convolution of every frame, zero padding."""
+
+    def __init__(self, inputs: int, outputs: int, bias: bool = True) -> None:
+        super().__init__(inputs, outputs, 3, bias=bias)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
+        return conv_frames(input, self.weight, self.bias, padding=1)
+
+
+class DownsampleConv(nn.Conv2d):
+    """3x3 convolution with stride 2; zero padding at the bottom and right only."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, 3, stride=2)
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H/2, W/2, outputs)``."""
+        return conv_frames(F.pad(input, (0, 0, 0, 1, 0, 1)), self.weight, self.bias, stride=2)
+
+
+class UpsampleConv(FrameConv):
+    """Repeat every pixel 2x2, then a 3x3 convolution."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, 2H, 2W, outputs)``."""
+        return super().forward(input.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3))
+
+
+class PointwiseConv(nn.Module):
+    """1x1 convolution whose stored kernel has ``axes`` trailing axes of size 1."""
+
+    def __init__(self, inputs: int, outputs: int, axes: int, bias: bool = True) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(outputs, inputs, *(1,) * axes))
+        self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., inputs)`` to ``(..., outputs)``."""
+        return F.linear(x, self.weight.flatten(1), self.bias)
+
+
+class StreamingDecoder(nn.Module, ABC):
+    """Decode clips and streams of latents.
+
+    ``latents_per_pass`` (1; None for all) is the number of latents processed at once, which bounds memory; results differ by rounding only.
+    """
+
+    latents_per_pass: int | None = 1
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the learned weights, and of every result."""
+        return next(self.parameters()).dtype
+
+    @abstractmethod
+    def decode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
+        """Decode the next latents of a stream; a pure function ``(latents, state, **options) -> (frames, state)``."""
+
+    def decode(self, z: Tensor, **options: Any) -> Tensor:
+        """Decode a whole clip.
+
+        Args:
+            z: ``(B, 16, t, h, w)``, normalised.
+            options: Keyword arguments of `decode_next`, such as ``clamp``.
+
+        Returns:
+            ``(B, 3, 1 + 4 (t - 1), 8h, 8w)`` in [-1, 1].
+
+        Raises:
+            InputError: Another shape.
+        """
+        return self.decode_next(z, None, **options)[0]
+
+    def decoder_stream(self, *, detach: bool = True) -> Stream:
+        """Start a stream: ``push(latents, ...) -> frames`` as `decode_next`; its ``state`` is all it holds."""
+        return Stream(partial(self.decode_next, detach=detach))
+
+
+class StreamingCodec(StreamingDecoder):
+    """Encode and decode clips and streams."""
+
+    @abstractmethod
+    def encode_next(self, *args: Any, **options: Any) -> tuple[Tensor, State]:
+        """Encode the next frames of a stream; a pure function ``(frames, state, detach=False) -> (latents, state)``."""
+
+    def encode(self, video: Tensor) -> Tensor:
+        """Encode a whole clip.
+
+        Args:
+            video: ``(B, 3, 1 + 4k, H, W)`` in [-1, 1], H and W multiples of 8 (`clips.pad_clip` pads any clip).
+
+        Returns:
+            ``(B, 16, 1 + k, H/8, W/8)``, normalised means; nothing is sampled.
+
+        Raises:
+            InputError: Another shape.
+        """
+        return self.encode_next(video, None)[0]
+
+    def encoder_stream(self, *, detach: bool = True) -> Stream:
+        """Start a stream: ``push(frames) -> latents`` as `encode_next`; its ``state`` is all it holds."""
+        return Stream(partial(self.encode_next, detach=detach))

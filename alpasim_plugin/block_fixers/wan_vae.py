@@ -1,0 +1,205 @@
+"""The Wan 2.1 causal video autoencoder: 4x8x8 compression to 16 channels, whole clips or streams.
+
+Frame accounting: the first latent holds 1 frame and every later one 4: 1 + 4k frames and 1 + k latents belong together. An encoder stream
+takes the first frame, alone or with groups of 4 after it, and groups of 4 afterwards; a decoder stream takes any number of latents.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from alpasim_plugin.block_fixers.clips import check_frames, check_latents, group_ends, pass_ends
+from alpasim_plugin.block_fixers.codec_weights import WAN_MEAN, WAN_STD, LatentStats, fill_random, load_checked
+from alpasim_plugin.block_fixers.streaming import (
+    PointwiseConv,
+    State,
+    StreamingCodec,
+    StreamingState,
+    channels_first,
+    channels_last,
+    in_passes,
+    run_layers,
+)
+from alpasim_plugin.block_fixers.wan_vae_blocks import (
+    DECODER_TIME,
+    DO,
+    DOING,
+    ENCODER_TIME,
+    CausalConv,
+    ChannelNorm,
+    Downsample,
+    FrameAttention,
+    ResidualBlock,
+    Upsample,
+    WanLayout,
+    read_layout,
+)
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.nets.checkpoints import unwrap
+
+
+def residual_blocks(inputs: int, outputs: int, count: int) -> list[nn.Module]:
+    """Return the residual blocks of one stage; the first changes the width."""
+    return [ResidualBlock(inputs if i == 0 else outputs, outputs) for i in range(count)]
+
+
+class Coder(nn.Module):
+    """Common part of encoder and decoder: a middle (residual, attention, residual) and a head (norm, SiLU, convolution)."""
+
+    def __init__(self, stem: tuple[int, int], middle: int, head: tuple[int, int]) -> None:
+        super().__init__()
+        self.conv1 = CausalConv(*stem)
+        self.middle = nn.ModuleList([ResidualBlock(middle, middle), FrameAttention(middle), ResidualBlock(middle, middle)])
+        self.head = nn.ModuleList([ChannelNorm(head[0]), nn.SiLU(), CausalConv(*head)])
+
+
+class Encoder(Coder):
+    """Frames to means and log-variances of the latent."""
+
+    def __init__(self, layout: WanLayout) -> None:
+        last = layout.encoder[-1]
+        super().__init__((layout.colours, layout.stem), last, (last, 2 * layout.latent))
+        blocks: list[nn.Module] = []
+        for stage, (inputs, outputs) in enumerate(zip((layout.stem, *layout.encoder[:-1]), layout.encoder, strict=True)):
+            blocks += residual_blocks(inputs, outputs, layout.blocks)
+            if stage < len(ENCODER_TIME):
+                blocks.append(Downsample(outputs, ENCODER_TIME[stage]))
+        self.downsamples = nn.ModuleList(blocks)
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map frames ``(B, T, H, W, 3)`` to ``(B, t, H/8, W/8, 2 * latent)``."""
+        return run_layers((self.conv1, *self.downsamples, *self.middle, *self.head), x, streaming)
+
+
+class Decoder(Coder):
+    """Latents to frames."""
+
+    def __init__(self, layout: WanLayout) -> None:
+        first = layout.decoder_in[0]
+        super().__init__((layout.latent, first), first, (layout.decoder_out[-1], layout.colours))
+        blocks: list[nn.Module] = []
+        for stage, (inputs, outputs) in enumerate(zip(layout.decoder_in, layout.decoder_out, strict=True)):
+            blocks += residual_blocks(inputs, outputs, layout.blocks + 1)
+            if stage < len(DECODER_TIME):
+                blocks.append(Upsample(outputs, layout.decoder_in[stage + 1], DECODER_TIME[stage]))
+        self.upsamples = nn.ModuleList(blocks)
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map ``(B, t, h, w, latent)`` to frames ``(B, T, 8h, 8w, 3)``."""
+        return run_layers((self.conv1, *self.middle, *self.upsamples, *self.head), x, streaming)
+
+
+class WanVAE(StreamingCodec):
+    """Encode video to normalised latents and back.
+
+    Weights are frozen; gradients with respect to the input flow.
+
+    Example:
+        >>> vae = WanVAE.random(WanLayout.of_base(8))
+        >>> z = vae.encode(torch.zeros(1, 3, 5, 16, 24))
+        >>> tuple(z.shape), tuple(vae.decode(z).shape)
+        ((1, 16, 2, 2, 3), (1, 3, 5, 16, 24))
+    """
+
+    def __init__(self, layout: WanLayout, mean: Sequence[float] = WAN_MEAN, std: Sequence[float] = WAN_STD) -> None:
+        super().__init__()
+        self.layout = layout
+        self.encoder = Encoder(layout)
+        self.conv1 = PointwiseConv(2 * layout.latent, 2 * layout.latent, axes=3)
+        self.conv2 = PointwiseConv(layout.latent, layout.latent, axes=3)
+        self.decoder = Decoder(layout)
+        self.stats = LatentStats(mean, std)
+        self.eval().requires_grad_(False)
+
+    @classmethod
+    def from_state_dict(
+        cls,
+        sd: Mapping[str, Tensor],
+        *,
+        dtype: torch.dtype = torch.float32,
+        mean: Sequence[float] = WAN_MEAN,
+        std: Sequence[float] = WAN_STD,
+        source: str = "a state dict",
+    ) -> Self:
+        """Build the network that ``sd`` holds, at whatever width it has (96 as published, 24 for LightVAE).
+
+        Args:
+            sd: Original keys, alone or under ``model`` or ``state_dict``; any floating precision, also mixed.
+            dtype: Precision of the network.
+            mean, std: Latent statistics, one value a channel.
+            source: Where ``sd`` comes from, for messages.
+
+        Raises:
+            InputError: Missing, unexpected, mis-shaped or transposed keys, or statistics of another length than the latent.
+        """
+        tensors = unwrap(sd, source)
+        layout = read_layout(tensors, source)
+        if len(mean) != layout.latent:
+            found = f"{layout.latent} latent channels, {len(mean)} latent means"
+            raise InputError(DOING, source, found, "pass mean= and std=, one value a channel")
+        with torch.device("meta"):
+            vae = cls(layout)
+        load_checked(vae, tensors, dtype, DOING, source, DO)
+        vae.stats = LatentStats(mean, std)
+        return vae
+
+    @classmethod
+    def random(cls, layout: WanLayout, seed: int = 0) -> Self:
+        """Build an untrained network, for tests and timing."""
+        with torch.device("meta"):
+            vae = cls(layout)
+        fill_random(vae, seed, "wan_vae")
+        vae.stats = LatentStats(WAN_MEAN, WAN_STD)
+        return vae
+
+    def encode_next(self, frames: Tensor, state: State | None, *, detach: bool = False) -> tuple[Tensor, State]:
+        """Encode the next frames of a stream; a pure function.
+
+        Args:
+            frames: ``(B, 3, n, H, W)``: n = 1 + 4k if ``state`` is None (the video starts here), else 4k.
+            state: State after the previous call.
+            detach: Whether to cut gradients after every pass.
+
+        Returns:
+            Latents ``(B, 16, m, H/8, W/8)`` and the state for the next call.
+
+        Raises:
+            InputError: An invalid number of frames or size.
+        """
+        check_frames(frames, "encoding video frames", first=state is None, channels=self.layout.colours)
+        ends = group_ends(frames.shape[2], state is None, self.latents_per_pass)
+        return in_passes(partial(self._encode_pass, detach=detach), frames.to(self.dtype), state, ends)
+
+    def decode_next(self, z: Tensor, state: State | None, *, clamp: bool = True, detach: bool = False) -> tuple[Tensor, State]:
+        """Decode the next latents of a stream; a pure function.
+
+        Args:
+            z: ``(B, 16, m, h, w)``, any m.
+            state: State after the previous call, None at the start of the video.
+            clamp: Whether to cut the result to [-1, 1].
+            detach: Whether to cut gradients after every pass (one latent a pass is a truncation distance of 1).
+
+        Returns:
+            Frames ``(B, 3, n, 8h, 8w)``, n = 4m, or 1 + 4 (m - 1) at the start; and the state for the next call.
+
+        Raises:
+            InputError: Another shape.
+        """
+        check_latents(z, "decoding video latents", self.layout.latent)
+        ends = pass_ends(z.shape[2], self.latents_per_pass)
+        video, state = in_passes(partial(self._decode_pass, detach=detach), z.to(self.dtype), state, ends)
+        return video.clamp(-1, 1) if clamp else video, state
+
+    def _encode_pass(self, frames: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
+        streaming = StreamingState(state, detach)
+        moments = self.conv1(self.encoder.next(channels_last(frames), streaming))
+        return self.stats.normalise(channels_first(moments[..., : self.layout.latent])), streaming.state
+
+    def _decode_pass(self, z: Tensor, state: State | None, detach: bool) -> tuple[Tensor, State]:
+        streaming = StreamingState(state, detach)
+        return channels_first(self.decoder.next(self.conv2(channels_last(self.stats.denormalise(z))), streaming)), streaming.state

@@ -1,0 +1,275 @@
+"""Sizes of a Wan 2.1 autoencoder, read from its tensors.
+
+The graph is fixed: four stages, one residual block more per stage in the decoder than in the encoder, time halved after the second and
+third encoder stage. The widths of the stages vary (96, 192, 384, 384 in the published network, a quarter of that in LightVAE)
+and so may the number of blocks (2).
+
+Layers of the Wan 2.1 video autoencoder, with its parameter names and shapes.
+
+Inside, a video is ``(B, T, H, W, C)``. Every layer is causal in time. The first frame of a video is special in the two layers that change
+the frame rate: it passes unchanged, and later frames are processed in groups.
+
+Source: Wan 2.1 ``wan/modules/vae.py`` (graph, keys, cache rules).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from alpasim_plugin.block_fixers.streaming import (
+    DownsampleConv,
+    PointwiseConv,
+    StreamingState,
+    UpsampleConv,
+    channels_to_frames,
+    conv_frames,
+    run_layers,
+)
+from alpasim_plugin.core.errors import InputError
+
+STAGES = 4
+ENCODER_TIME = (False, True, True)  # which of the three halvings also halve the frame rate
+DECODER_TIME = (True, True, False)
+DOING = "loading Wan VAE weights"
+DO = "give the state dict of a Wan 2.1 VAE or LightVAE (keys encoder.*, decoder.*, conv1.*, conv2.*, no prefix; docs/lab/vae.md lists shapes)"
+SQUARE_FLOOR = 1e-24  # added to the mean square of a channel vector
+TAPS = 3  # of every temporal kernel: the frame and its two predecessors
+
+
+@dataclass(frozen=True)
+class WanLayout:
+    """Widths of one autoencoder.
+
+    Args:
+        colours: Channels of the video.
+        latent: Channels of the latent.
+        stem: Channels after the encoder's first convolution.
+        encoder: Channels of the four encoder stages.
+        decoder_in: Channels that enter each of the four decoder stages.
+        decoder_out: Channels that leave the residual blocks of each decoder stage.
+        blocks: Residual blocks of an encoder stage; a decoder stage has one more.
+    """
+
+    colours: int
+    latent: int
+    stem: int
+    encoder: tuple[int, ...]
+    decoder_in: tuple[int, ...]
+    decoder_out: tuple[int, ...]
+    blocks: int = 2
+
+    @classmethod
+    def of_base(cls, base: int, latent: int = 16) -> WanLayout:
+        """Return the published proportions: base 96 is the Wan 2.1 autoencoder, 24 is LightVAE.
+
+        Example:
+            >>> WanLayout.of_base(96).encoder
+            (96, 192, 384, 384)
+        """
+        one, two, four = base, 2 * base, 4 * base
+        return cls(3, latent, one, (one, two, four, four), (four, two, two, one), (four, four, two, one))
+
+
+def read_layout(sd: Mapping[str, Tensor], source: str = "a state dict") -> WanLayout:
+    """Read the widths from vectors (biases and norm gains), which cannot be transposed.
+
+    Raises:
+        InputError: A key that gives a width is missing.
+    """
+    halvings = [int(key.split(".")[2]) for key in sd if key.startswith("encoder.downsamples.") and ".resample." in key]
+    if not halvings:
+        raise InputError(DOING, f"{source} ({len(sd)} tensors)", "missing: encoder.downsamples.2.resample.1.weight", DO)
+    blocks = min(halvings)
+    encoder_starts = [stage * (blocks + 1) for stage in range(STAGES)]
+    decoder_starts = [stage * (blocks + 2) for stage in range(STAGES)]
+    return WanLayout(
+        colours=_length(sd, source, "decoder.head.2.bias"),
+        latent=_length(sd, source, "conv2.bias"),
+        stem=_length(sd, source, "encoder.conv1.bias"),
+        encoder=tuple(_length(sd, source, f"encoder.downsamples.{i}.residual.3.gamma") for i in encoder_starts),
+        decoder_in=tuple(_length(sd, source, f"decoder.upsamples.{i}.residual.0.gamma") for i in decoder_starts),
+        decoder_out=tuple(_length(sd, source, f"decoder.upsamples.{i + blocks}.residual.3.gamma") for i in decoder_starts),
+        blocks=blocks,
+    )
+
+
+def _length(sd: Mapping[str, Tensor], source: str, key: str) -> int:
+    if key not in sd:
+        raise InputError(DOING, f"{source} ({len(sd)} tensors)", f"missing: {key}", DO)
+    return sd[key].numel()
+
+
+def causal_conv(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:
+    """Convolve the last ``frames`` of ``joined`` in space and time.
+
+    On an accelerator one 3D convolution (`causal_conv3d`). On a CPU the three temporal taps are 2D convolutions that are summed: up to six
+    times faster on the small frames of the inner stages. Taps that would only see frames before the video are skipped.
+
+    Args:
+        joined: ``(B, k + frames, H, W, C)`` with k <= 2 past frames; missing ones are zero.
+        weight: ``(O, C, 3, kh, kw)``, odd kernel sides, zero padding in space.
+        bias: ``(O,)``.
+        frames: Frames of the result.
+
+    Returns:
+        ``(B, frames, H, W, O)``.
+    """
+    if joined.device.type != "cpu":
+        return causal_conv3d(joined, weight, bias, frames)
+    past = joined.shape[1] - frames
+    pad = weight.shape[-1] // 2
+    out = conv_frames(joined[:, past:], weight[:, :, -1], bias, padding=pad)
+    for back in range(1, TAPS):
+        start = max(0, back - past)  # first output frame that has a frame ``back`` steps before it
+        if start < frames:
+            inputs = joined[:, past + start - back : past + frames - back]
+            out[:, start:] += conv_frames(inputs, weight[:, :, -1 - back], None, padding=pad)
+    return out
+
+
+def causal_conv3d(joined: Tensor, weight: Tensor, bias: Tensor, frames: int) -> Tensor:
+    """Compute `causal_conv` as one 3D convolution: the path on an accelerator, and the reference of the CPU path."""
+    pad = weight.shape[-1] // 2
+    missing = frames + TAPS - 1 - joined.shape[1]
+    padded = F.pad(joined, (0, 0, 0, 0, 0, 0, missing, 0)) if missing else joined  # a pad of zero frames would still copy
+    return F.conv3d(padded.permute(0, 4, 1, 2, 3), weight, bias, padding=(0, pad, pad)).permute(0, 2, 3, 4, 1)
+
+
+class CausalConv(nn.Module):
+    """3x3x3 or 3x1x1 convolution over a frame and its two predecessors."""
+
+    def __init__(self, inputs: int, outputs: int, side: int = 3) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(outputs, inputs, TAPS, side, side))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
+        return causal_conv(streaming.extend(x, TAPS - 1), self.weight, self.bias, x.shape[1])
+
+
+class TemporalDownsampleConv(nn.Module):
+    """3x1x1 convolution with stride 2 in time: each output sees two frames and their predecessor."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(width, width, TAPS, 1, 1))
+        self.bias = nn.Parameter(torch.zeros(width))
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Halve the frames of ``(B, T, H, W, C)``; the first frame of a video passes unchanged and is the predecessor of the second."""
+        joined = streaming.extend(x, 1)
+        taps = self.weight.flatten(2).unbind(2)
+        inputs = [joined[:, back : joined.shape[1] - (TAPS - 1) + back : 2] for back in range(TAPS)]
+        out = F.linear(inputs[0], taps[0], self.bias) + F.linear(inputs[1], taps[1]) + F.linear(inputs[2], taps[2])
+        return torch.cat([x[:, :1], out], dim=1) if streaming.first else out
+
+
+class ChannelNorm(nn.Module):
+    """Scale every pixel's channel vector to length sqrt(C), then by a learned gain; in float32.
+
+    Args:
+        width: Channels C.
+        axes: Trailing axes of the stored gain: 3 in video layers, 2 in the attention layer.
+    """
+
+    def __init__(self, width: int, axes: int = 3) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(width, *(1,) * axes))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(..., C)`` to the same shape and dtype; a zero vector stays zero."""
+        return self.reference(x) if x.device.type == "cpu" else self.fused(x)
+
+    def fused(self, x: Tensor) -> Tensor:
+        """Normalise with torch's fused RMS norm: one pass over memory instead of six, the path on an accelerator."""
+        return F.rms_norm(x, (x.shape[-1],), self.gamma.flatten().to(x.dtype), SQUARE_FLOOR)
+
+    def reference(self, x: Tensor) -> Tensor:
+        """Normalise with elementary operations: the path on a CPU, where torch's version is not fused."""
+        wide = x.float()
+        length: Tensor = torch.linalg.vector_norm(wide, dim=-1, keepdim=True).clamp_min(1e-12)
+        gain = self.gamma.flatten().float() * math.sqrt(x.shape[-1])
+        return (wide / length * gain).to(x.dtype)
+
+
+class ResidualBlock(nn.Module):
+    """Norm, SiLU, convolution, twice, added to the input (through a 1x1x1 convolution if the width changes)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        # Position 5 is a dropout in the checkpoint's numbering.
+        self.residual = nn.ModuleList(
+            [
+                ChannelNorm(inputs), nn.SiLU(), CausalConv(inputs, outputs),
+                ChannelNorm(outputs), nn.SiLU(), nn.Identity(), CausalConv(outputs, outputs),
+            ]
+        )  # fmt: skip
+        self.shortcut = PointwiseConv(inputs, outputs, axes=3) if inputs != outputs else nn.Identity()
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T, H, W, outputs)``."""
+        skipped: Tensor = self.shortcut(x)
+        return run_layers(self.residual, x, streaming) + skipped
+
+
+class FrameAttention(nn.Module):
+    """Residual single-head self-attention among the pixels of each frame."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = ChannelNorm(width, axes=2)
+        self.to_qkv = PointwiseConv(width, 3 * width, axes=2)
+        self.proj = PointwiseConv(width, width, axes=2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(B, T, H, W, C)`` to the same shape."""
+        pixels = self.norm(x).flatten(0, 1).flatten(1, 2)[:, None]  # (B * T, one head, H * W, C)
+        q, k, v = self.to_qkv(pixels).chunk(3, dim=-1)
+        attended: Tensor = self.proj(F.scaled_dot_product_attention(q, k, v))
+        return x + attended.view(x.shape)
+
+
+class Downsample(nn.Module):
+    """Downsample by 2 in space and, with ``time``, in time."""
+
+    def __init__(self, width: int, time: bool) -> None:
+        super().__init__()
+        self.resample = nn.ModuleList([nn.Identity(), DownsampleConv(width, width)])  # position 0 is the padding
+        self.time_conv = TemporalDownsampleConv(width) if time else None
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map ``(B, T, H, W, C)`` to ``(B, T', H/2, W/2, C)``: T' = T, or T/2 not counting a first frame."""
+        x = run_layers(self.resample, x, streaming)
+        return x if self.time_conv is None else self.time_conv.next(x, streaming)
+
+
+class Upsample(nn.Module):
+    """Upsample by 2 in space, after upsampling by 2 in time with ``time``, and change the channels.
+
+    Temporal upsampling is a causal convolution to twice the channels, whose halves become consecutive frames. The first latent of a video
+    skips it; the padding of that convolution is zero and follows the first latent.
+    """
+
+    def __init__(self, inputs: int, outputs: int, time: bool) -> None:
+        super().__init__()
+        self.resample = nn.ModuleList([nn.Identity(), UpsampleConv(inputs, outputs)])  # position 0 is the repetition of pixels
+        self.time_conv = CausalConv(inputs, 2 * inputs, side=1) if time else None
+
+    def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
+        """Map ``(B, T, H, W, inputs)`` to ``(B, T', 2H, 2W, outputs)``: T' = T, or 2T not counting a first latent."""
+        if self.time_conv is not None:
+            first = 1 if streaming.first else 0
+            alone, rest = x[:, :first], x[:, first:]
+            if rest.shape[1]:
+                rest = channels_to_frames(self.time_conv.next(rest, streaming), 2)
+            else:
+                streaming.extend(rest, TAPS - 1)  # only the first latent: cache an empty history, so that the slot exists
+            x = torch.cat([alone, rest], dim=1)
+        return run_layers(self.resample, x, streaming)

@@ -1,0 +1,198 @@
+"""Compose a renderer and a fixer into a renderer: render frames with their semantic maps and run the fixer over them, checked and timed.
+
+A fixer of single frames fixes each frame as it is rendered. How the loop calls a fixer of blocks is a mode, which the package that holds it
+registers in the entry-point group ``simrun.fixer_modes``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
+from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.types import U8, Actor, BlockRule, Fixer, Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.plugins.parts import complete
+from alpasim_plugin.plugins.parts.spec import MODES
+from alpasim_plugin.semantic_map.draw import draw_map
+from alpasim_plugin.semantic_map.prepare import PreparedMap, actor_boxes, prepare_map
+
+Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
+DOING = "fixing a block of frames"
+ONE_BY_ONE = BlockRule(1, 1)
+
+
+@dataclass(frozen=True)
+class ConditionedFrame:
+    """One rendered frame with the semantic map of the same view."""
+
+    request: RenderRequest
+    frame: Frame
+    map: U8 | None  # (H, W, 3); None where the fixer uses none
+
+
+@dataclass
+class BlockRunner:
+    """Render and fix the blocks of one rollout.
+
+    Attributes:
+        render_base: The base renderer; its frames are checked.
+        scene_map: The scene's map, or None where the fixer uses none.
+        actors: The scenario's, for the sizes of their boxes.
+        threads: Threads of the map rasteriser.
+        stage_ms: Time since `reset_times` by stage, without the base renderer's.
+    """
+
+    render_base: Callable[[RenderRequest], Frame]
+    scene_map: PreparedMap | None
+    actors: Sequence[Actor]
+    threads: int | None = None
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+    def reset_times(self) -> None:
+        """Set the time of every stage seen so far to zero."""
+        self.stage_ms = dict.fromkeys(self.stage_ms, 0.0)
+
+    def render(self, request: RenderRequest) -> ConditionedFrame:
+        """Render one frame and draw its map."""
+        frame = self.render_base(request)
+        if self.scene_map is None:
+            return ConditionedFrame(request, frame, None)
+        with self._timed("map"):
+            boxes = actor_boxes(request.actors, self.actors)
+            image = draw_map(self.scene_map, request.camera, request.T_world_camera[-1], boxes, threads=self.threads)
+        return ConditionedFrame(request, frame, image)
+
+    def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:
+        """Fix a block and check the result.
+
+        Args:
+            fixer: Gives its name for messages, and the stages it timed itself (``stage_ms``).
+            call: Its ``preview`` or ``step``.
+            block: Frames with their maps.
+
+        Raises:
+            FixerError: The fixer raised, or its frames have another number, time, camera, size or type.
+        """
+        frames, maps = [item.frame for item in block], [item.map for item in block if item.map is not None]
+        name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
+        before = dict(fixer.stage_ms)
+        with self._timed("fix"):
+            try:
+                fixed = list(call(frames, maps))
+            except SimrunError:
+                raise
+            except Exception as error:
+                raise FixerError(DOING, name, f"{type(error).__name__}: {error}", "see the traceback in the rollout's manifest") from error
+        self._add_fixer_stages(before, fixer.stage_ms)
+        problem = _problem(frames, fixed)
+        if problem:
+            raise FixerError(DOING, name, problem, "fix the fixer: as many frames out as in, with the same times, cameras and sizes")
+        return fixed
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
+
+    def _add_fixer_stages(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+        """Add what a fixer timed itself (running sums) as ``fix: STAGE``, and the rest of its call as ``fix``."""
+        for stage, total_ms in after.items():
+            part_ms = total_ms - before.get(stage, 0.0)
+            name = f"fix: {stage}"
+            self.stage_ms[name] = self.stage_ms.get(name, 0.0) + part_ms
+            self.stage_ms["fix"] -= part_ms
+
+
+def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:
+    if len(fixed) != len(given):
+        return f"{len(fixed)} frames came back"
+    for before, after in zip(given, fixed, strict=True):
+        if (before.t_us, before.camera) != (after.t_us, after.camera):
+            return f"camera {before.camera!r} at {before.t_us} us came back as {after.camera!r} at {after.t_us} us"
+        if before.rgb.shape != after.rgb.shape or before.rgb.dtype != after.rgb.dtype:
+            return f"rgb came back as {after.rgb.dtype} {after.rgb.shape}, not {before.rgb.dtype} {before.rgb.shape}"
+    return ""
+
+
+class PerFrameRenderer(Renderer):
+    """A renderer session whose frames are fixed at once, at every camera's own rate; the cameras of an instant are one batch.
+
+    Args:
+        runner: Renders and calls the fixer.
+        fixer: At the start of its history; its blocks are single frames.
+    """
+
+    def __init__(self, runner: BlockRunner, fixer: Fixer) -> None:
+        self.runner, self.fixer = runner, fixer
+        self.frames = 0
+
+    @property
+    def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # computed when it is read
+        """Times of the last call by stage, without the base renderer's."""
+        return self.runner.stage_ms
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fixer's label and the number of frames so far."""
+        fixer = self.fixer
+        return {"label": fixer.label, "trained": fixer.trained, "mode": "frame", "frames": self.frames, "chosen": dict(fixer.chosen)}
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Render one frame; see `render_batch`."""
+        return self.render_batch([request])[0]
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
+        """Return the frames of one instant, in the order of the requests.
+
+        Raises:
+            FixerError: The fixer broke its contract.
+        """
+        self.runner.reset_times()
+        fixed = self.runner.fix(self.fixer, self.fixer.step, [self.runner.render(request) for request in requests])
+        self.frames += len(fixed)
+        return fixed
+
+
+def fixed_renderer(
+    render: Callable[[RenderRequest], Frame],
+    make_fixer: Callable[[], Fixer],
+    settings: FixerSettings,
+    scenario: Scenario,
+    threads: int | None = None,
+) -> Renderer:
+    """Return one rollout's renderer whose frames are fixed.
+
+    A fixer of single frames fixes each as it is rendered. Others work in blocks (5 frames first, then 8), but the poses of a block's later
+    frames are not known when its first frame falls due: ``settings.mode`` names what is done about it.
+
+    Args:
+        render: The base renderer of the same rollout; its frames are checked.
+        make_fixer: Makes a fixer without history; called once, and again for every further group of cameras with other frame times.
+        settings: Mode, tolerances, and whether the fixer wants semantic maps.
+        scenario: Its map and its actors' boxes are what the semantic map shows.
+        threads: Threads of the map rasteriser; None leaves numba's number.
+
+    Raises:
+        InputError: No installed package has the mode.
+    """
+    scene_map = prepare_map(scenario.lane_map) if settings.uses_map else None
+    runner = BlockRunner(render, scene_map, scenario.actors, threads)
+
+    def make() -> Fixer:
+        return complete(make_fixer(), Fixer)
+
+    first = make()
+    if first.blocks == ONE_BY_ONE:
+        return PerFrameRenderer(runner, first)
+    modes = installed(MODES)
+    if settings.mode not in modes:
+        found = f"no installed package has this mode (entry points {MODES}); known: {', '.join(modes) or 'none'}"
+        do = "install simrun with its block fixers, or take a fixer of single frames, such as onefixer"
+        raise InputError("running a fixer of blocks", f"{settings.name}, fixer.mode={settings.mode}", found, do)
+    renderer: Renderer = modes[settings.mode].load()(runner, make, settings, first)
+    return renderer
