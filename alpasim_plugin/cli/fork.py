@@ -15,9 +15,8 @@ from alpasim_plugin.plugins.parts import resolve, resolve_renderer
 from alpasim_plugin.runtime.fork import Change, fork_rollout
 from alpasim_plugin.runtime.logged_rollout import find_rollout
 from alpasim_plugin.runtime.plan import slug
-from alpasim_plugin.runtime.probe import probe_rollout
+from alpasim_plugin.runtime.probe import probe_rollout, write_probe
 from alpasim_plugin.runtime.probe_files import PROBE_JSON
-from alpasim_plugin.runtime.probe_write import write_probe
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.store import read_json
 

@@ -99,15 +99,7 @@ def run_cell(
     folder = root / cell.folder
     began = time.perf_counter()
     cv2.setNumThreads(1)  # OpenCV's pool is outside the thread budget, and frames are too small to gain from it
-    manifest: dict[str, Any] = {
-        **cell.names,
-        "path": cell.folder.as_posix(),
-        "rollout_key": cell.rollout_key,
-        "score_key": cell.score_key,
-        "preset": options.preset,
-        "stops_at_path_end": cell.stops_at_path_end,
-        "video": options.video,
-    }
+    manifest = _begun(cell) | {"preset": options.preset, "stops_at_path_end": cell.stops_at_path_end, "video": options.video}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MANIFEST, *DRIVEN, *DERIVED):  # the manifest first: without it nothing is trusted
@@ -115,48 +107,69 @@ def run_cell(
         scenario = replace((load or _scenario)(cell.ref), stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME):
             parts = builder(cell, options, scenario, threads)
-            recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
-            held: list[Policy | Controller | RemoteActors] = [
-                complete(parts.policy, Policy),
-                complete(parts.controller, Controller),
-                *([parts.actors] if parts.actors else []),
-            ]
-            with recorder, ExitStack() as stack:
-                for part in held:
-                    stack.enter_context(_closing(part))
-                run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller, parts.actors)
-        rendered = dict(complete(parts.renderer, Renderer).facts())
-        manifest |= recorder.facts() | {"fixer": rendered if cell.renderer.fixer is not None else {}}
-        manifest |= {"renderer_facts": rendered} if rendered and cell.renderer.fixer is None else {}
-        own = dict(complete(parts.policy, Policy).facts())
-        manifest |= {"policy_facts": own} if own else {}
+            recorder = _drive(parts, cell, options, scenario, folder)
+        manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         manifest |= _score(folder, cell, options, scenario)
         recorder.save_pictures(video=options.video == "all" or (options.video == "failures" and bool(manifest["events"])))
         manifest["status"] = "ok"
-    except SimrunError as error:
-        final = isinstance(error, PolicyError) and error.is_final
-        manifest |= {"status": "failed", "error": error.as_dict(), "final": final, "traceback": traceback.format_exc()}
-    except OSError as error:
-        failure = disk_error(folder, error)
-        manifest |= {"status": "failed", "error": failure.as_dict(), "traceback": traceback.format_exc()}
     except Exception as error:
-        manifest |= {"status": "failed", "error": _unexpected(error), "traceback": traceback.format_exc()}
+        manifest |= _failure(error, folder)
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_manifest(folder, manifest)
     return manifest
 
 
+def _begun(cell: Cell) -> dict[str, Any]:
+    """Return what the manifest of a rollout begins with."""
+    return {**cell.names, "path": cell.folder.as_posix(), "rollout_key": cell.rollout_key, "score_key": cell.score_key}
+
+
+def _drive(parts: RolloutParts, cell: Cell, options: RunOptions, scenario: Scenario, folder: Path) -> Recorder:
+    """Drive a rollout and close its parts, however it ends."""
+    recorder = Recorder(scenario, cell.seed, folder, parts.session, options.images, options.video != "none", parts.names)
+    held: list[Policy | Controller | RemoteActors] = [complete(parts.policy, Policy), complete(parts.controller, Controller)]
+    if parts.actors is not None:
+        held.append(parts.actors)
+    with recorder, ExitStack() as stack:
+        for part in held:
+            stack.enter_context(_closing(part))
+        run_rollout(scenario, parts.renderer, parts.policy, cell.seed, recorder, parts.controller, parts.actors)
+    return recorder
+
+
+def _facts_of(parts: RolloutParts, has_fixer: bool) -> dict[str, Any]:
+    """Return what renderer and policy say of the rollout; a renderer with a fixer speaks for the fixer."""
+    rendered = dict(complete(parts.renderer, Renderer).facts())
+    driven = dict(complete(parts.policy, Policy).facts())
+    facts: dict[str, Any] = {"fixer": rendered if has_fixer else {}}
+    if rendered and not has_fixer:
+        facts["renderer_facts"] = rendered
+    if driven:
+        facts["policy_facts"] = driven
+    return facts
+
+
+def _failure(error: Exception, folder: Path) -> dict[str, Any]:
+    """Return what the manifest says of a rollout that failed; called where the error is handled."""
+    trace = {"traceback": traceback.format_exc()}
+    if isinstance(error, SimrunError):
+        final = isinstance(error, PolicyError) and error.is_final
+        return {"status": "failed", "error": error.as_dict(), "final": final} | trace
+    if isinstance(error, OSError):
+        return {"status": "failed", "error": disk_error(folder, error).as_dict()} | trace
+    found = {
+        "doing": "running a rollout",
+        "with": "a part that raised something other than a SimrunError",
+        "found": f"{type(error).__name__}: {error}",
+        "do": "read the traceback in the manifest and report it",
+        "failure_class": "infrastructure",
+    }
+    return {"status": "failed", "error": found} | trace
+
+
 def failed_manifest(cell: Cell, error: SimrunError) -> dict[str, Any]:
     """Return the manifest of a rollout that was never driven to its end."""
-    return {
-        **cell.names,
-        "path": cell.folder.as_posix(),
-        "rollout_key": cell.rollout_key,
-        "score_key": cell.score_key,
-        "status": "failed",
-        "error": error.as_dict(),
-        "wall_s": None,
-    }
+    return _begun(cell) | {"status": "failed", "error": error.as_dict(), "wall_s": None}
 
 
 def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -196,17 +209,12 @@ def find_rollout_state(
         return "none", state
     if manifest.get("passed_path_end") and manifest.get("stops_at_path_end") != cell.stops_at_path_end:
         return "drive", state  # the only rollouts that differ between presets that stop there and those that drive on
-    if _lacks_video(manifest, video):
+    wants_video = video == "all" or (video == "failures" and bool(manifest.get("events")))
+    if wants_video and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video:
         return "drive", state
     if state.remedy == "none" and manifest.get("score_key") != cell.score_key:
         return "score", state
     return state.remedy, state
-
-
-def _lacks_video(manifest: Mapping[str, Any], video: str) -> bool:
-    """Tell whether a finished rollout was driven without the video that is asked for now."""
-    is_asked = video == "all" or (video == "failures" and bool(manifest.get("events")))
-    return is_asked and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
@@ -230,13 +238,3 @@ def _closing(part: Policy | Controller | RemoteActors) -> Iterator[None]:
 @lru_cache(maxsize=4)
 def _scenario(ref: ScenarioRef) -> Scenario:
     return load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
-
-
-def _unexpected(error: Exception) -> dict[str, str]:
-    return {
-        "doing": "running a rollout",
-        "with": "a part that raised something other than a SimrunError",
-        "found": f"{type(error).__name__}: {error}",
-        "do": "read the traceback in the manifest and report it",
-        "failure_class": "infrastructure",
-    }

@@ -20,10 +20,10 @@ from alpasim_plugin.plugins.parts import digest
 from alpasim_plugin.process.subprocesses import end_children
 from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.contents import find_contents, read_run_json, write_run_json
-from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
+from alpasim_plugin.runtime.execute import HowToRun, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, kept_open
 from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
-from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, publish, write_run_info
+from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, on_done, publish, write_run_info
 from alpasim_plugin.runtime.tables import pool_of, rollout_rows
 from alpasim_plugin.runtime.writing import writing
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
@@ -168,15 +168,10 @@ def execute_decision(
         write_run_json(root, read_run_json(root) | {"kind": KIND})  # so that nothing takes all scenes of the plan for wanted
         progress.started(plan, root, threads)
         began = time.perf_counter()
-
-        def on_done(manifest: dict[str, Any], reused: bool) -> None:
-            manifest["reused"] = reused
-            progress.rollout_done(manifest, reused)
-
         known = contents.rollouts if contents else ()
         try:
             while cells := drawing.next_cells():
-                drawing.add(cells, execute(part_of(plan, cells), root, how, on_done, progress.noticed, known))
+                drawing.add(cells, execute(part_of(plan, cells), root, how, on_done(progress), progress.noticed, known))
                 progress.looked(drawing.state, drawing.rollouts, drawing.ceiling)
                 write_decision(root, drawing.record())
             driven = part_of(plan, drawing.cells)
@@ -185,18 +180,13 @@ def execute_decision(
             repeat = certify(driven, root, manifests, how.cores_here, certificate, held.get("determinism"))
         finally:
             end_children()
-        _describe(root, driven, command, threads, held)
+        write_run_info(root, driven, command, threads)  # again, with the scenes that were driven
+        kept = {"started_at": held["started_at"]} if "started_at" in held else {}
+        write_run_json(root, read_run_json(root) | kept | {"kind": KIND})
         summary = finish_run(root, manifests, {"pool": pool, "determinism": repeat}, report)
         publish(root, store)
     result = RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
     return Decided(result, drawing.record(), drawing.state, drawing.outcome)
-
-
-def _describe(root: Path, driven: RunPlan, command: Sequence[str], threads: Threads, held: Mapping[str, Any]) -> None:
-    """Write run.json again with the scenes that were driven."""
-    write_run_info(root, driven, command, threads)
-    kept = {"started_at": held["started_at"]} if "started_at" in held else {}
-    write_run_json(root, read_run_json(root) | kept | {"kind": KIND})
 
 
 class _Drawing:
@@ -268,7 +258,8 @@ class _Drawing:
         rows = rollout_rows(list(self.manifests.values()))
         sides = by_renderer(rows)
         self.failed = outcome_of_failures(failures_of(rows), self.design.max_failed)
-        base = sides[self.baseline] if self.stored is None else RendererRows.of(self.stored.of_cells(self._driven))
+        driven = {(cell.scene, cell.seed) for cell in self.cells}
+        base = sides[self.baseline] if self.stored is None else RendererRows.of(self.stored.of_cells(driven))
         values, adjusted = {}, {}
         for one in self.question.metrics:
             found = scene_differences(sides[self.candidate], base, one.metric, self.scenes)
@@ -279,10 +270,6 @@ class _Drawing:
         self.state = state_after(self.question, values, self.horizon, adjusted, len(self.order))
         self.looks.append(look_as_dict(self.state, self.rollouts, self._chosen[self.scenes[-1]]))
         self.stopped = self._reason_to_stop()
-
-    @property
-    def _driven(self) -> set[tuple[str, int]]:
-        return {(cell.scene, cell.seed) for cell in self.cells}
 
     @property
     def lacking(self) -> list[str]:
@@ -306,6 +293,7 @@ class _Drawing:
         """Return ``decision.json``."""
         outcome, asked = self.outcome, self.question.metrics[0].asked
         words = {"pass": asked, "regression": OPPOSITE[asked]}
+        chosen_by = "cost against variance of earlier scenes" if self.design.auto_seeds else "all that were asked for"
         return {
             "schema_version": SCHEMA_VERSION,
             "question": question_as_dict(self.question),
@@ -315,7 +303,7 @@ class _Drawing:
             "order_seed": self.design.order_seed,
             "look_every": self.design.look_every,
             "ceiling": {"scenes": len(self.order), "rollouts": self.ceiling},
-            "seeds": {"most": len(self.plan.seeds), "chosen_by": self._seeds_by(), "scene_cost": self.design.scene_cost},
+            "seeds": {"most": len(self.plan.seeds), "chosen_by": chosen_by, "scene_cost": self.design.scene_cost},
             "controls": {name: one.facts for name, one in self.controls.items()},
             "drawn": {"order": self.design.order}
             | ({} if self.strata is None else {"families": dict(Counter(self.strata.family_of.values()))}),
@@ -336,9 +324,6 @@ class _Drawing:
             lost = ", ".join(f"{self.differences[name].missing} of {name}" for name in self.lacking)
             return f"pairs lack a value: {lost}; more than the share of {self.design.max_missing:g} that is allowed"
         return ""
-
-    def _seeds_by(self) -> str:
-        return "cost against variance of earlier scenes" if self.design.auto_seeds else "all that were asked for"
 
     def _next_seeds(self) -> int:
         most = len(self.plan.seeds)

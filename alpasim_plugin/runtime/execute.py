@@ -6,29 +6,95 @@ rasteriser is bit-equal for any number of threads. Workers may therefore run cel
 
 from __future__ import annotations
 
+import hashlib
+import importlib
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import alpasim_plugin
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.measured import share_measurements
+from alpasim_plugin.renderers.cache import cache_root, cached
+from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
-from alpasim_plugin.runtime.executors.assignment import assignment_as_here
-from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_pool
-from alpasim_plugin.runtime.executors.dispatch import dispatch
-from alpasim_plugin.runtime.executors.identity import targets_of
-from alpasim_plugin.runtime.executors.local import run_local
-from alpasim_plugin.runtime.executors.parcel import Parcel, unpack
-from alpasim_plugin.runtime.executors.scratch import measured_folder
-from alpasim_plugin.runtime.kernels import compile_for
+from alpasim_plugin.runtime.executors.assignment import assignment_as_here, targets_of
+from alpasim_plugin.runtime.executors.base import Lost
+from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, opened_backend
+from alpasim_plugin.runtime.executors.local import run_in_processes, run_or_retry
+from alpasim_plugin.runtime.executors.node_files import measured_folder
+from alpasim_plugin.runtime.executors.pool import run_jobs
+from alpasim_plugin.runtime.executors.result import unpack
 from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runtime.stores.commits import Commits
-from alpasim_plugin.runtime.stores.stored import commit_key, opened, run_stored_cell
-from alpasim_plugin.runtime.workers import Lost
+from alpasim_plugin.runtime.provenance import hardware
+from alpasim_plugin.runtime.stores.commits import KnownCommits, opened, run_stored_cell
+
+KERNELS = "kernels"
+SUBJECTS = {  # subject -> tiny case, imported in the process that compiles
+    "rasteriser": "alpasim_plugin.renderers.kernels:rasterise",
+    "gradient": "alpasim_plugin.renderers.kernels:fit",
+    "map": "alpasim_plugin.fixers.gather:draw_and_gather",
+}
+SOURCES = ("gaussians", "semantic_map", "fixers")  # where kernels are
+GAUSSIANS = ("clean", "3dgs")  # base renderers that draw Gaussians themselves
+
+
+def compile_for(todo: Sequence[Cell], scenarios: Mapping[str, Scenario], workers: int) -> None:
+    """Compile what rollouts need that several workers are about to drive; nothing where that was done before.
+
+    Args:
+        todo: The rollouts.
+        scenarios: Their scenarios by scene.
+        workers: Processes. One compiles nothing here: it compiles while it drives.
+    """
+    cold = [subject for subject in needed(todo, scenarios) if not (cache_root() / KERNELS / _key(subject)).exists()]
+    if workers < 2 or not cold:
+        return
+    for subject, got in run_in_processes(compile_kernels, cold, min(workers, len(cold)), 1):
+        if isinstance(got, Lost):
+            print(f"warning: compiling {subject} kernels: {got.found}; the rollouts compile them", file=sys.stderr, flush=True)
+
+
+def needed(todo: Iterable[Cell], scenarios: Mapping[str, Scenario]) -> list[str]:
+    """Return the subjects of `SUBJECTS` whose kernels some rollouts call."""
+    found = set()
+    for cell in todo:
+        if cell.renderer.base.name in GAUSSIANS:
+            found.add("rasteriser")
+        if cell.renderer.base.name == "3dgs" and is_reconstructed(scenarios[cell.scene]):
+            found.add("gradient")
+        if cell.renderer.fixer is not None:
+            found.add("map")
+    return [subject for subject in SUBJECTS if subject in found]
+
+
+def compile_kernels(subject: str) -> None:
+    """Compile the kernels of a subject on a tiny case, unless that was done; wait where another process is about to."""
+
+    module, _, case = SUBJECTS[subject].partition(":")
+
+    def make(folder: Path) -> None:
+        getattr(importlib.import_module(module), case)()
+
+    cached(KERNELS, _key(subject), make, lambda folder: folder, f"compiling {subject} kernels, once on this machine")
+
+
+@cache
+def _key(subject: str) -> str:
+    """Name what is compiled as numba does: by the sources' times and sizes, its version, its folder, the processor."""
+    package = Path(alpasim_plugin.__file__).parent
+    sources = sorted(path for folder in SOURCES for path in (package / folder).rglob("*.py"))
+    stamps = [(str(path), (stat := path.stat()).st_mtime_ns, stat.st_size) for path in sources]
+    facts = repr((stamps, version("numba"), os.environ.get("NUMBA_CACHE_DIR"), hardware()["cpu"]))
+    return f"{subject}-{hashlib.blake2b(facts.encode(), digest_size=8).hexdigest()}"
+
 
 OnDone = Callable[[dict[str, Any], bool], None]  # (manifest, reused)
 
@@ -93,7 +159,7 @@ class HowToRun:
 
 
 def execute(
-    plan: RunPlan, root: Path, how: HowToRun, on_done: OnDone, noticed: Callable[[str], None], known: Collection[str] = ()
+    plan: RunPlan, root: Path, how: HowToRun, on_done: OnDone, notify: Callable[[str], None], known: Collection[str] = ()
 ) -> list[dict[str, Any]]:
     """Run every unfinished cell and return all manifests in the plan's order.
 
@@ -105,64 +171,39 @@ def execute(
         root: Its folder.
         how: Workers, checks, limits.
         on_done: Called with each manifest.
-        noticed: Called with one line for each damaged rollout.
+        notify: Called with one line for each damaged rollout.
         known: Folders of rollouts that were finished once.
     """
     share_measurements(measured_folder(how.run))
     manifests: dict[Path, dict[str, Any]] = {}
     todo: list[Cell] = []
-    shelf = None if how.store is None else Shelf(opened(how.store), plan.options, how.reuse_undigested)
+    store = None if how.store is None else KnownCommits(opened(how.store), plan.options, how.reuse_undigested)
     for cell in plan.cells:
         folder = cell.folder.as_posix()
-        remedy, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
+        action, state = find_rollout_state(cell, root, how.reuse_undigested, how.full, folder in known, how.retry, plan.options.video)
         if state.damage:
-            doing = "driving again" if remedy == "drive" else "scoring again"
-            noticed(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
-        if remedy == "drive" or state.manifest is None:
-            stored = shelf and shelf.find(cell)
+            doing = "driving again" if action == "drive" else "scoring again"
+            notify(f"damaged: {'; '.join(map(str, state.damage))}; {doing}")
+        if action == "drive" or state.manifest is None:
+            stored = store and store.find(cell)
             if not stored:
                 todo.append(cell)
                 continue
             manifest = _scored(cell, plan.options, root, unpack(stored, root))
         else:
-            manifest = state.manifest if remedy == "none" else rescore_cell(cell, plan.options, root, state.manifest)
+            manifest = state.manifest if action == "none" else rescore_cell(cell, plan.options, root, state.manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
     runner = _run_local if how.executor.is_local else _run_elsewhere
-    for cell, manifest in runner(todo, plan, root, how, shelf, noticed):
+    for cell, manifest in runner(todo, plan, root, how, store, notify):
         manifest = _scored(cell, plan.options, root, manifest)
         manifests[cell.folder] = manifest
         on_done(manifest, False)
-        if shelf is not None:
-            shelf.add(cell, manifest)
-    if shelf is not None:
-        shelf.commits.index.flush()
+        if store is not None:
+            store.add(cell, manifest)
+    if store is not None:
+        store.commits.index.flush()
     return [manifests[cell.folder] for cell in plan.cells]
-
-
-class Shelf:
-    """The driver's view of a store: what it knows to be committed.
-
-    Args:
-        commits: The store.
-        options: Of the run.
-        reuse_undigested: Also reuse rollouts with parts that have no digest.
-    """
-
-    def __init__(self, commits: Commits, options: RunOptions, reuse_undigested: bool) -> None:
-        self.commits, self._options = commits, options
-        self.fresh = "" if reuse_undigested else os.urandom(8).hex()
-        commits.index.load()
-
-    def find(self, cell: Cell) -> Parcel | None:
-        """Return a rollout that the index names."""
-        key = commit_key(cell, self._options, self.fresh)
-        return self.commits.find(key) if key in self.commits.index.keys else None
-
-    def add(self, cell: Cell, manifest: Mapping[str, Any]) -> None:
-        """Take in a rollout that a worker has committed."""
-        if manifest["status"] == "ok":
-            self.commits.index.add([commit_key(cell, self._options, self.fresh)])
 
 
 def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -173,23 +214,24 @@ def _scored(cell: Cell, options: RunOptions, root: Path, manifest: dict[str, Any
 
 
 Done = Iterator[tuple[Cell, dict[str, Any]]]
-Noticed = Callable[[str], None]
 
 
-def _run_local(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, shelf: Shelf | None, noticed: Noticed) -> Done:
+def _run_local(
+    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, notify: Callable[[str], None]
+) -> Done:
     """Run cells in this process, or in workers that write the run folder themselves."""
     if how.threads.workers > 1 or how.limit_s is not None:
         compile_for(todo, plan.scenarios, how.threads.workers)
     threads = how.threads.per_worker
     work: Callable[[Cell], dict[str, Any]] = partial(run_cell, options=plan.options, root=root, threads=threads)
-    if how.store is not None and shelf is not None:
-        work = partial(run_stored_cell, options=plan.options, root=root, threads=threads, store=how.store, fresh=shelf.fresh)
+    if how.store is not None and store is not None:
+        work = partial(run_stored_cell, options=plan.options, root=root, threads=threads, store=how.store, fresh=store.fresh)
 
-    def recall(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
-        remedy, state = find_rollout_state(cell, root, reuse_undigested=True)
-        return state.manifest if remedy == "none" else None
+    def known(cell: Cell) -> dict[str, Any] | None:  # a worker may have died after writing its rollout
+        action, state = find_rollout_state(cell, root, reuse_undigested=True)
+        return state.manifest if action == "none" else None
 
-    for cell, got in run_local(partial(_of_run, how.run, work), todo, how.threads.workers, how.threads.per_worker, how.limit_s, recall):
+    for cell, got in run_or_retry(partial(_of_run, how.run, work), todo, how.threads.workers, threads, how.limit_s, known):
         yield cell, _lost(cell, root, got) if isinstance(got, Lost) else got
 
 
@@ -200,18 +242,18 @@ def _of_run(run: str, work: Callable[[Cell], dict[str, Any]], cell: Cell) -> dic
 
 
 def _run_elsewhere(
-    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, shelf: Shelf | None, noticed: Callable[[str], None]
+    todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun, store: KnownCommits | None, notify: Callable[[str], None]
 ) -> Done:
     """Run cells on other nodes; only this process writes the run folder."""
     if not todo:
         return
-    from alpasim_plugin.runtime.executors.mission import mission_of  # a run on this machine needs none of it
+    from alpasim_plugin.runtime.executors.job import rollout_work  # a run on this machine needs none of it
 
-    mission, contents = mission_of(plan, how.run, todo, how.threads.per_worker, how.store, shelf.fresh if shelf else "")
-    most = min(how.threads.workers, len(todo))
-    given = assignment_as_here(mission, contents, targets_of(plan.parts), how.executor.resources, most, noticed)
-    with opened_pool(how.executor, given, root) as pool:
-        for cell, got in dispatch(pool, todo, noticed, how.limit_s):
+    work, contents = rollout_work(plan, how.run, todo, how.threads.per_worker, how.store, store.fresh if store else "")
+    workers = min(how.threads.workers, len(todo))
+    assignment = assignment_as_here(work, contents, targets_of(plan.parts), how.executor.resources, workers, notify)
+    with opened_backend(how.executor, assignment, root) as backend:
+        for cell, got in run_jobs(backend, todo, notify, how.limit_s):
             yield cell, _lost(cell, root, got) if isinstance(got, Lost) else unpack(got, root)
 
 

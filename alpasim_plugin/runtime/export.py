@@ -10,15 +10,21 @@ older versions are replaced by ones that sort as their seeds, and a rollout of a
 
 from __future__ import annotations
 
+import json
 import os
+import uuid
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import RolloutLog, Scenario
-from alpasim_plugin.io.atomic import atomic_folder, write_json
+from alpasim_plugin.io.atomic import atomic_file, atomic_folder, write_json, write_text
+from alpasim_plugin.io.config import load_yaml
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.rename import Renaming, Stage, copy_log
 from alpasim_plugin.log.session import session_uuid
@@ -26,20 +32,135 @@ from alpasim_plugin.plugins.parts import resolve_renderer
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.contents import read_contents
 from alpasim_plugin.runtime.execute import thread_budget
-from alpasim_plugin.runtime.export_configs import SCENES, write_configs
 from alpasim_plugin.runtime.export_frames import AddedFrames
-from alpasim_plugin.runtime.export_scenes import scenes_of, write_scene
 from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import RunOptions, slug
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.score_logs import check_vouched
-from scenarios.load import load_scenario
+from evaluators.alpasim import EvalSettings
+from scenarios.cosmos_camera import FRONT_WIDE
+from scenarios.load import find, load_scenario
 from scenarios.suite import ScenarioRef, expand
-from scenarios.usdz_write import alpasim_cameras
+from scenarios.usdz_write import alpasim_cameras, rig_box, write_usdz
 
+RUN_METADATA, EVAL_CONFIG, WIZARD_CONFIG = "run_metadata.yaml", "eval-config.yaml", "wizard-config.yaml"
+SCENES = "scenes"
+OF_SCENES = "exporting scenes"
 DOING = "exporting to AlpaSim"
 COMPLETE, FAILED = "_complete", "failed_rollouts.json"
 PLAN_US = 5_000_000  # AlpaSim's longest minADE horizon; one shorter sample loses all four metrics of its rollout
+
+
+def write_configs(folder: Path, final: Path, name: str, identity: str) -> None:
+    """Write the three files of one run folder.
+
+    Args:
+        folder: Where to write now.
+        final: The export's own folder when it is done; ``alpasim-reeval`` looks for the scenes below it, by its absolute path.
+        name: The run's name in AlpaSim's tables.
+        identity: What determines the run; equal runs have equal ids.
+    """
+    metadata = {"run_uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, identity)), "run_name": name}
+    wizard = {
+        "services": {"runtime": {"image": "none"}},  # alpasim-reeval needs the key; only its Slurm mode uses the image
+        "scenes": {"scene_cache": str(final.absolute()), "sceneset_path": SCENES},
+        "wizard": {"sqshcaches": []},
+    }
+    for file, content in ((RUN_METADATA, metadata), (EVAL_CONFIG, eval_config()), (WIZARD_CONFIG, wizard)):
+        write_text(folder / file, yaml.safe_dump(content, sort_keys=False))
+
+
+def eval_config() -> dict[str, Any]:
+    """Return AlpaSim's evaluation settings: its defaults, no video, and no unpickling of what a driver sent."""
+    own = EvalSettings().model_dump(mode="json", exclude={"run_in_runtime", "vec_map", "video"})
+    return own | {
+        "vec_map": {
+            "incl_road_edges": True,
+            "incl_traffic_signs": True,
+            "incl_wait_lines": True,
+            "max_num_lanes": 20,
+            "num_pts_per_lane": 20,
+        },
+        "video": {
+            "render_video": False,
+            "video_layouts": ["DEFAULT"],
+            "camera_id_to_render": FRONT_WIDE,
+            "render_every_nth_frame": 1,
+            "generate_combined_video": False,
+            "combined_video_speed_factor": 0.33,
+            "map_video": {"map_radius_m": 20, "ego_loc": "BOTTOM_CENTER", "rotate_map_to_ego": True},
+        },
+    }
+
+
+def scenes_of(info: Mapping[str, Any]) -> dict[str, tuple[ScenarioRef, Scenario]]:
+    """Load the scenarios of a run by scene id.
+
+    Args:
+        info: Its ``run.json``.
+
+    Raises:
+        InputError: A scenario is gone, or is no longer the one that was driven.
+    """
+    out = {}
+    for scene_id, stated in info["scenes"].items():
+        given = stated.get("ref") or {}
+        if "path" not in given:
+            raise InputError(
+                OF_SCENES, f"scene {scene_id!r}", "run.json has no path of its scenario", "export a folder that simrun run wrote"
+            )
+        ref = ScenarioRef(given["path"], given.get("seed"), tuple(given.get("overrides", ())), given.get("source"))
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+        if scenario.content_hash != stated["content_hash"]:
+            found = f"{ref.path} is not what was driven: its content has changed"
+            raise InputError(OF_SCENES, f"scene {scene_id!r}", found, "run again, or restore the scenario")
+        out[scene_id] = (ref, scenario)
+    return out
+
+
+def write_scene(path: Path, ref: ScenarioRef, scenario: Scenario) -> None:
+    """Write a scenario as an AlpaSim scene; one that was read from an AlpaSim scene is a copy of it, with its own id and vehicle."""
+    if scenario.source == "usdz":
+        _copy(path, _archive_of(ref), scenario)
+    else:
+        write_usdz(path, scenario)
+
+
+def _archive_of(ref: ScenarioRef) -> Path:
+    path = find(ref.path)
+    if path.suffix not in (".yaml", ".yml"):
+        return path
+    document = load_yaml(path, OF_SCENES)
+    key = next(key for key in ("usdz", "path") if key in document.data["log"])
+    return Path(document.folder_of(("log", key)) / document.data["log"][key])
+
+
+def _copy(path: Path, source: Path, scenario: Scenario) -> None:
+    with (
+        atomic_file(path, OF_SCENES) as partial,
+        zipfile.ZipFile(source) as old,
+        zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for info in old.infolist():
+            data = old.read(info)
+            if info.filename == "metadata.yaml":
+                metadata = yaml.safe_load(data)
+                if metadata["scene_id"] != scenario.scene_id:
+                    data = yaml.safe_dump(metadata | {"scene_id": scenario.scene_id}, sort_keys=False).encode()
+            elif info.filename == "rig_trajectories.json":
+                data = _with_vehicle(data, scenario)
+            new.writestr(info, data)
+
+
+def _with_vehicle(data: bytes, scenario: Scenario) -> bytes:
+    rigs = json.loads(data)
+    wanted, (rig,) = rig_box(scenario.vehicle), rigs["rig_trajectories"]
+    held = rig.get("rig_bbox") or {}
+    same = all(abs(a - b) < 1e-6 for key in ("dim",) for a, b in zip(held.get(key, [0.0] * 3), wanted[key], strict=True))
+    if held and same and abs(held["centroid"][0] - wanted["centroid"][0]) < 1e-6:
+        return data
+    rig["rig_bbox"] = wanted
+    return json.dumps(rigs).encode()
 
 
 @dataclass

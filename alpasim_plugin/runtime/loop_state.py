@@ -1,18 +1,107 @@
-"""The state of one rollout between ticks."""
+"""The state of one rollout between ticks: the ego and its history, the active plan, the end of the path, and a forecast from it.
+
+Predicted poses of cameras and road users are for `RenderRequest.ahead`. The controller moves the predicted ego along the active plan and
+along plans that become active after their latency. During the warm-up the prediction is the log itself. A forecast queries no policy and
+leaves the state of the loop unchanged.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import overload
 
 import numpy as np
 
 from alpasim_plugin.control import Controller
-from alpasim_plugin.core.geometry import quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
-from alpasim_plugin.core.types import F64, I64, CameraSpec, EgoState, Frame, Observation, Plan, Scenario, Trajectory
+from alpasim_plugin.core.geometry import arc_lengths, interpolate, project, quat_from_matrix, quat_from_yaw, wrap_angle, yaw_of
+from alpasim_plugin.core.types import F64, I64, CameraSpec, EgoState, Frame, Latency, Observation, Plan, RenderRequest, Scenario, Trajectory
+from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ego import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig
+
+DIRECTION_M = 1.0
+STANDS_MPS = 1.0
+SPEED_SPAN_US = 500_000
+
+
+@dataclass
+class PlanQueue:
+    """Plans in order of the time they become effective.
+
+    ``none`` applies a plan at its query, ``fixed`` after a constant delay, ``measured`` after the wall time of the query. With
+    ``measured`` a run depends on the machine and is not repeatable; run.json records this.
+
+    With ``latency.fixer`` the fixer is a queue of its own: the frames of an instant are done after those before them, so a fixer slower
+    than the camera falls behind, and a query waits until its frames are done.
+    """
+
+    latency: Latency
+    _pending: list[tuple[int, Trajectory]] = field(default_factory=list)
+    _active: Trajectory | None = None
+    _fixed_us: int = 0  # when the fixer is done with all frames so far
+
+    def frames(self, t_us: int, stage_ms: Mapping[str, float]) -> None:
+        """Take the wall time, by stage, that the fixer needed for the frames of ``t_us``."""
+        if self.latency.fixer:
+            self._fixed_us = max(self._fixed_us, t_us) + int(1e3 * sum(stage_ms.values()))
+
+    def submit(self, plan_world: Trajectory, query_us: int, wall_us: int) -> None:
+        """Add the plan of the query at ``query_us``, which took ``wall_us`` of wall time."""
+        measured_us = max(self._fixed_us - query_us, 0) + wall_us
+        delay = {"none": 0, "fixed": self.latency.fixed_us, "measured": measured_us}[self.latency.kind]
+        self._pending.append((query_us + delay, plan_world))
+
+    def copy(self) -> PlanQueue:
+        """Return an independent copy."""
+        return replace(self, _pending=list(self._pending))
+
+    def active(self, t_us: int) -> Trajectory | None:
+        """Return the active plan at ``t_us``: among those due, that of the newest query. None before the first."""
+        while self._pending and self._pending[0][0] <= t_us:
+            self._active = self._pending.pop(0)[1]
+        # A later, faster query overtakes an earlier, slower one.
+        overtaking = [i for i, (due, _) in enumerate(self._pending) if due <= t_us]
+        if overtaking:
+            self._active = self._pending[overtaking[-1]][1]
+            del self._pending[: overtaking[-1] + 1]
+        return self._active
+
+
+class PathEnd:
+    """Tells when the ego has passed the end of the recorded path.
+
+    Beyond that end nothing is known: no recorded drive to compare with, often no map. If the recorded car stands there, what lies beyond
+    is why it stopped (a queue, a red light), and running into it must be seen: such a path has no end here.
+
+    Args:
+        log: The recorded rig poses.
+        stops: Whether a rollout ends there.
+
+    Attributes:
+        passed: Whether the ego has passed the end in this rollout.
+    """
+
+    def __init__(self, log: Trajectory, stops: bool = True) -> None:
+        self._path = log.xyz[:, :2]
+        self._length_m = float(arc_lengths(self._path)[-1])
+        before_us = max(int(log.t_us[-1]) - SPEED_SPAN_US, int(log.t_us[0]))
+        seconds = (int(log.t_us[-1]) - before_us) * 1e-6
+        there = interpolate(log, np.array([before_us]))[0, :2, 3]
+        goes = seconds > 0 and float(np.hypot(*(self._path[-1] - there))) / seconds > STANDS_MPS
+        self._has_end = goes and self._length_m > DIRECTION_M
+        s = arc_lengths(self._path)
+        inside = [float(np.interp(self._length_m - DIRECTION_M, s, self._path[:, axis])) for axis in (0, 1)]
+        self._ahead = self._path[-1] - np.array(inside)
+        self._stops = stops
+        self.passed = False
+
+    def ends_rollout(self, at: F64) -> bool:
+        """Note where the ego's rear axle is, ``(2,)``, metres, world; return whether the rollout ends here."""
+        if self._has_end and not self.passed and (at - self._path[-1]) @ self._ahead > 0.0:
+            self.passed = project(self._path, at)[0] >= self._length_m * (1 - 1e-12)
+        return self.passed and self._stops
 
 
 @dataclass
@@ -100,3 +189,79 @@ def advance_ego(scenario: Scenario, controller: Controller, ego: EgoState, plan:
         return moved, False
     x, y = float(moved.T_world_rig[0, 3]), float(moved.T_world_rig[1, 3])
     return replace(moved, T_world_rig=ground_pose(scenario.ground, x, y, yaw_of(moved.T_world_rig))), False
+
+
+def shutter_poses(history: Trajectory, camera: CameraSpec, t_us: int) -> F64:
+    """Return ``T_world_camera`` ``(2, 4, 4)`` at shutter start and end, from rig poses of which the last is at ``t_us``."""
+    start_us = max(t_us - camera.shutter_us, int(history.t_us[0]))
+    return np.asarray(interpolate(history, np.array([start_us, t_us])) @ camera.T_rig_camera)
+
+
+class Forecaster:
+    """Makes forecasts of a running loop."""
+
+    def __init__(self, scenario: Scenario, controller: Controller, plans: PlanQueue, actors: Actors, state: LoopState) -> None:
+        self._parts = scenario, controller, plans, actors, state
+
+    def now(self) -> Forecast:
+        """Return the forecast from the present instant. It is computed when read."""
+        scenario, controller, plans, actors, state = self._parts
+        return Forecast(scenario, controller, plans.copy(), actors.forecast(), state.history, state.ego)
+
+
+@dataclass
+class Forecast:
+    """A forecast from one instant, computed as far as it is read."""
+
+    scenario: Scenario
+    controller: Controller
+    plans: PlanQueue
+    actors: ActorForecast
+    history: Trajectory  # rig poses up to the instant, then predicted ones
+    ego: EgoState  # at the end of the history
+
+    def request(self, camera: CameraSpec, t_us: int) -> RenderRequest:
+        """Return the predicted render request at a future control instant."""
+        self._extend(t_us)
+        upto = int(np.searchsorted(self.history.t_us, t_us, side="right"))
+        past = Trajectory(self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto])
+        return RenderRequest(t_us, camera, shutter_poses(past, camera, t_us), self.actors.at(t_us))
+
+    def _extend(self, to_us: int) -> None:
+        states = []
+        while self.ego.t_us < to_us:
+            next_us = self.ego.t_us + self.scenario.rates.control_us
+            self.ego, _ = advance_ego(self.scenario, self.controller, self.ego, self.plans.active(self.ego.t_us), next_us)
+            states.append(self.ego)
+        if states:
+            past, poses = self.history, np.stack([state.T_world_rig for state in states])
+            self.history = Trajectory(
+                np.concatenate([past.t_us, np.array([state.t_us for state in states], dtype=np.int64)]),
+                np.concatenate([past.xyz, poses[:, :3, 3]]),
+                np.concatenate([past.quat, quat_from_matrix(poses[:, :3, :3])]),
+            )
+
+
+@dataclass
+class PredictedRequests(Sequence[RenderRequest]):
+    """The predicted next requests of one camera, computed when read."""
+
+    forecast: Forecast
+    camera: CameraSpec
+    times_us: tuple[int, ...]
+    _made: dict[int, RenderRequest] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.times_us)
+
+    @overload
+    def __getitem__(self, index: int) -> RenderRequest: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[RenderRequest]: ...
+    def __getitem__(self, index: int | slice) -> RenderRequest | Sequence[RenderRequest]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        t_us = self.times_us[index]
+        if t_us not in self._made:
+            self._made[t_us] = self.forecast.request(self.camera, t_us)
+        return self._made[t_us]

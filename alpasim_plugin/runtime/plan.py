@@ -19,6 +19,7 @@ from evaluators.presets import preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
+DOING = "planning a run"
 SLUG_LENGTH = 80
 LOOP, SCORING = "alpasim_plugin.runtime.rollout", "alpasim_plugin.runtime.scoring"  # modules whose code, with its imports, decides
 
@@ -126,48 +127,59 @@ def make_plan(
         InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given twice.
     """
     for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
-        twice = sorted({str(value) for value in values if list(values).count(value) > 1})
-        if not values or twice:
-            found = f"{', '.join(twice)} twice" if twice else "none"
-            raise InputError("planning a run", f"{what}s {', '.join(map(str, values)) or '(none)'}", found, f"name every {what} once")
+        _check_named_once(what, values)
     rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
     same = [str(spec) for spec in rendering]
     if len(set(same)) != len(same):
-        raise InputError("planning a run", f"renderers {list(renderers)}", f"they resolve to {same}", "name every renderer once")
-    labels = {label for text in options.fixer if (label := text.partition("=")[0].rpartition(":")[0])}
-    if unknown := sorted(labels - {spec.name for spec in rendering if spec.fixer is not None}):
-        found = f"no fixer of that name among the renderers {list(renderers)}"
-        raise InputError("planning a run", f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it")
-    if options.fixer and all(spec.fixer is None for spec in rendering):
-        found = f"no fixer among the renderers {list(renderers)}"
-        raise InputError("planning a run", f"--set fixer.{options.fixer[0]}", found, "leave it out, or name a fixer")
+        raise InputError(DOING, f"renderers {list(renderers)}", f"they resolve to {same}", "name every renderer once")
+    _check_fixer_settings(options.fixer, renderers, rendering)
     driving = tuple(resolve("policy", name) for name in policies)
     moving = {spec.name: resolve("controller", options.controller or spec.controller) for spec in driving}
     scoring = resolve_evaluators(options.evaluators)
-    scenarios: dict[str, Scenario] = {}
-    origin: dict[str, ScenarioRef] = {}
-    for ref in refs:
-        scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
-        other = origin.get(scenario.scene_id)
-        if other is not None:
-            raise InputError(
-                "planning a run",
-                f"{ref.path} and {other.path}",
-                f"both have the scene id {scenario.scene_id!r}",
-                "give one of them another id, or name it once",
-            )
-        note = background_note(scenario)
-        scenario = replace(scenario, notes=(*scenario.notes, note)) if note else scenario
-        scenarios[scenario.scene_id], origin[scenario.scene_id] = scenario, ref
+    loaded = _load(refs)
+    scenarios = {scenario.scene_id: scenario for _, scenario in loaded}
     code = _Code.of(scenarios.values(), options.preset, scoring)
     cells = [
-        _cell(scenario, origin[scene_id], renderer, policy, moving[policy.name], seed, scoring, options, code)
-        for scene_id, scenario in scenarios.items()
+        _cell(scenario, ref, renderer, policy, moving[policy.name], seed, scoring, options, code)
+        for ref, scenario in loaded
         for renderer in rendering
         for policy in driving
         for seed in seeds
     ]
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def _check_named_once(what: str, values: Sequence[object]) -> None:
+    twice = sorted({str(value) for value in values if list(values).count(value) > 1})
+    if not values or twice:
+        found = f"{', '.join(twice)} twice" if twice else "none"
+        raise InputError(DOING, f"{what}s {', '.join(map(str, values)) or '(none)'}", found, f"name every {what} once")
+
+
+def _check_fixer_settings(settings: Sequence[str], names: Sequence[str], renderers: Sequence[RendererSpec]) -> None:
+    """Refuse settings of fixers that no renderer has."""
+    fixed = {spec.name for spec in renderers if spec.fixer is not None}
+    labels = {label for text in settings if (label := text.partition("=")[0].rpartition(":")[0])}
+    if unknown := sorted(labels - fixed):
+        found = f"no fixer of that name among the renderers {list(names)}"
+        raise InputError(DOING, f"--set {unknown[0]}:fixer...", found, "write the name as --renderer has it")
+    if settings and not fixed:
+        found = f"no fixer among the renderers {list(names)}"
+        raise InputError(DOING, f"--set fixer.{settings[0]}", found, "leave it out, or name a fixer")
+
+
+def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
+    """Load scenarios, with a note where the background is not as stated."""
+    loaded: dict[str, tuple[ScenarioRef, Scenario]] = {}
+    for ref in refs:
+        scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
+        if scenario.scene_id in loaded:
+            both = f"{ref.path} and {loaded[scenario.scene_id][0].path}"
+            found = f"both have the scene id {scenario.scene_id!r}"
+            raise InputError(DOING, both, found, "give one of them another id, or name it once")
+        note = background_note(scenario)
+        loaded[scenario.scene_id] = ref, replace(scenario, notes=(*scenario.notes, note)) if note else scenario
+    return list(loaded.values())
 
 
 def part_of(plan: RunPlan, cells: Sequence[Cell]) -> RunPlan:

@@ -1,17 +1,25 @@
-"""Provenance of a run: software versions and hardware."""
+"""What a run folder says of its making: versions, machine and source, and what was chosen by measuring it."""
 
 from __future__ import annotations
 
 import os
 import platform
+import re
+import subprocess
 import sys
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from alpasim_plugin import __version__
 
 PACKAGES = ("numpy", "scipy", "numba", "torch", "shapely", "opencv-contrib-python-headless", "pyarrow", "av")
+VARIABLE = "SIMRUN_COMMIT"
+PATIENCE_S = 5.0
+GIT = ("git", "--no-optional-locks", "-c", "core.fsmonitor=false")
+_COMMIT = re.compile(r"[0-9a-f]{7,64}")
+COUNTS = ("predicted", "hits", "exact", "drafts", "redrafts")
 
 
 def versions() -> dict[str, str]:
@@ -45,3 +53,123 @@ def _cpu_name() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or "unknown"
+
+
+class Project(TypedDict):
+    """What ``run.json`` says of the project.
+
+    Attributes:
+        commit: Full hash of the commit; None where there is none.
+        committed_at: When it was made, ISO 8601.
+        branch: None where no branch is checked out.
+        dirty: Whether a file that git follows differs from the commit; files that it does not follow do not count.
+        reason: Why there is no commit, else empty.
+    """
+
+    commit: str | None
+    committed_at: str | None
+    branch: str | None
+    dirty: bool | None
+    reason: str
+
+
+def project(folder: Path | None = None) -> Project:
+    """Return the commit of the repository that holds a folder, or what ``SIMRUN_COMMIT`` says where the repository is elsewhere.
+
+    Args:
+        folder: The working directory by default.
+
+    Returns:
+        Without a repository, or without git, ``commit`` is None and ``reason`` says why: a run needs neither.
+    """
+    stated = os.environ.get(VARIABLE, "").strip().lower()
+    if stated:
+        return _stated(stated) if _COMMIT.fullmatch(stated) else _without(f"{VARIABLE} is no commit: {stated[:40]!r}")
+    try:
+        last = _git(folder, "log", "-1", "--format=%H %cI")
+        state = _git(folder, "status", "--porcelain=v2", "--branch", "--untracked-files=no")
+    except FileNotFoundError:
+        return _without("git is not installed")
+    except subprocess.TimeoutExpired:
+        return _without(f"git did not answer in {PATIENCE_S:g} s")
+    except subprocess.CalledProcessError as error:
+        said = str(error.stderr or "").strip().splitlines()
+        return _without(said[0] if said else f"git ended with {error.returncode}")
+    commit, _, committed_at = last.strip().partition(" ")
+    lines = state.splitlines()
+    branch = next((line.removeprefix("# branch.head ") for line in lines if line.startswith("# branch.head ")), "(detached)")
+    dirty = any(not line.startswith("#") for line in lines)
+    return {
+        "commit": commit, "committed_at": committed_at, "branch": None if branch == "(detached)" else branch, "dirty": dirty, "reason": "",
+    }  # fmt: skip
+
+
+def _stated(commit: str) -> Project:
+    return {"commit": commit, "committed_at": None, "branch": None, "dirty": None, "reason": ""}
+
+
+def _without(reason: str) -> Project:
+    return {"commit": None, "committed_at": None, "branch": None, "dirty": None, "reason": reason}
+
+
+def _git(folder: Path | None, *words: str) -> str:
+    """Return what git prints; its errors are raised."""
+    return subprocess.run([*GIT, *words], cwd=folder, capture_output=True, text=True, check=True, timeout=PATIENCE_S).stdout
+
+
+def fixers(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and ``frames``; ``blocks`` unless the
+    mode is ``frame``.
+
+    In speculative mode also the counts of `block_fixers.speculation.SpeculationStats` over rollouts, ``hit_rate`` (the share of
+    predicted frames within tolerance), and the largest ``forecast_error`` and ``shown_error``.
+
+    Args:
+        manifests: Of finished rollouts of one policy.
+    """
+    out: dict[str, Any] = {}
+    for name in dict.fromkeys(m["renderer"] for m in manifests):
+        facts = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
+        if not facts:
+            continue
+        entry = {key: facts[0][key] for key in ("label", "trained", "mode")} | {"rollouts": len(facts)}
+        entry |= {key: sum(one[key] for one in facts) for key in ("frames", "blocks") if key in facts[0]}
+        if entry["mode"] == "speculative":
+            entry |= {key: sum(one[key] for one in facts) for key in COUNTS}
+            entry["hit_rate"] = round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None
+            entry |= {key: _largest(one[key] for one in facts) for key in ("forecast_error", "shown_error")}
+        out[name] = entry
+    return out
+
+
+def chosen(manifests: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return for each renderer with a fixer what was chosen by measuring the machines, for ``run.json``.
+
+    One entry for each node (``node``; null: the machine that the command ran on) and choice, with what was measured and the number of
+    rollouts. A node has several entries only where the run was continued, or its processes share no temporary folder.
+    """
+    out: dict[str, list[dict[str, Any]]] = {}
+    for manifest in manifests:
+        facts = (manifest.get("fixer") or {}).get("chosen")
+        if not facts:
+            continue
+        node, entries = manifest.get("node"), out.setdefault(manifest["renderer"], [])
+        same = [entry for entry in entries if (entry["node"], _picked(entry)) == (node, _picked(facts))]
+        if same:
+            same[0]["rollouts"] += 1
+        else:
+            entries.append({"node": node, **facts, "rollouts": 1})
+    return out
+
+
+def _picked(facts: Mapping[str, Any]) -> tuple[Any, Any]:
+    return facts["precision"]["name"] if "precision" in facts else None, facts["threads"]["number"] if "threads" in facts else None
+
+
+def _largest(spreads: Iterable[dict[str, dict[str, float] | None]]) -> dict[str, float | None]:
+    """Return the largest value of each kind of error over rollouts; None where there is no finite one."""
+    found: dict[str, list[float]] = {}
+    for spread in spreads:
+        for name, values in spread.items():
+            found.setdefault(name, []).extend([] if values is None else [values["max"]])
+    return {name: max(values, default=None) for name, values in found.items()}

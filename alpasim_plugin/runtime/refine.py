@@ -6,7 +6,7 @@ Only the current block is held in memory. The result is renamed to its final nam
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -17,9 +17,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, U8, Fixer, Frame
-from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
+from alpasim_plugin.fixers.refine import ChangeLimit, FixedBlock, StreamStats, refine_frames
 from alpasim_plugin.log.picture_folder import PictureFolderReader, PictureFolderWriter
-from alpasim_plugin.log.video_reader import TimedFrame, VideoReader
+from alpasim_plugin.log.video_reader import TimedFrame, VideoFormat, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
 
 Reader = VideoReader | PictureFolderReader
@@ -125,7 +125,7 @@ def refine_video(
     with ExitStack() as stack:
         readers: dict[str, Reader] = {}
         for role, path in files.inputs.items():
-            readers[role] = _reader(path)
+            readers[role] = PictureFolderReader(path, DOING) if path.is_dir() else VideoReader(path, DOING)
             stack.enter_context(readers[role])
         check_formats(readers)
         source = readers["input"].format
@@ -136,14 +136,22 @@ def refine_video(
             stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer, limit):
-            for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
-                writers["output"].write(fixed.rgb, timed.time, timed.duration)
-                if "compare" in writers:
-                    writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
+            _write_block(writers, timing, block)
             timing.clear()
             stats.add(block)
             if on_frames is not None:
                 on_frames(stats.frames, source.frames)
+    return _summary(fixer, source, stats, time.perf_counter() - begin)
+
+
+def _write_block(writers: Mapping[str, Writer], timing: Sequence[TimedFrame], block: FixedBlock) -> None:
+    for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
+        writers["output"].write(fixed.rgb, timed.time, timed.duration)
+        if "compare" in writers:
+            writers["compare"].write(np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration)
+
+
+def _summary(fixer: Fixer, source: VideoFormat, stats: StreamStats, wall_s: float) -> RefineSummary:
     later = stats.ms_per_frame[1:] or stats.ms_per_frame
     difference = stats.difference
     return RefineSummary(
@@ -156,7 +164,7 @@ def refine_video(
         ms_per_frame_p50=float(np.median(later)),
         ms_per_frame_p95=float(np.percentile(later, 95)),
         ms_per_frame_first=stats.ms_per_frame[0],
-        wall_s=time.perf_counter() - begin,
+        wall_s=wall_s,
         psnr_db=difference.psnr_db if difference.squared else None,
         mean_levels=difference.mean_levels,
         max_levels=difference.max_levels,
@@ -187,10 +195,6 @@ def check_names(files: RefineFiles) -> None:
             raise InputError(DOING, str(path), f"the {role} is a folder with other things than pictures", "name a new folder or file")
         if path.exists() and not files.overwrite:
             raise InputError(DOING, str(path), f"the {role} exists already", "choose another name, or pass --overwrite")
-
-
-def _reader(path: Path) -> Reader:
-    return PictureFolderReader(path, DOING) if path.is_dir() else VideoReader(path, DOING)
 
 
 def _writer(path: Path, source: Reader) -> Writer:

@@ -9,13 +9,9 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.types import F64, Controller, Observation, Plan, Policy, Renderer, Scenario, SensorSpec
 from alpasim_plugin.plugins.parts import complete
-from alpasim_plugin.runtime.cadence import make_cadence
-from alpasim_plugin.runtime.cameras import CameraRig
-from alpasim_plugin.runtime.forecast import Forecaster
+from alpasim_plugin.runtime.cameras import CameraRig, make_cadence
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan, checked_sensors, reset_policy
-from alpasim_plugin.runtime.latency import PlanQueue
-from alpasim_plugin.runtime.loop_state import LoopState
-from alpasim_plugin.runtime.path_end import PathEnd
+from alpasim_plugin.runtime.loop_state import Forecaster, LoopState, PathEnd, PlanQueue
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.world.actors import Actors, make_actors
 
@@ -32,7 +28,7 @@ def run_rollout(
     """Drive one scenario once and return its recorder.
 
     Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then the loop is closed. It ends at
-    ``end_us``, or, if the scenario says so, where the ego passes the end of the recorded path (`alpasim_plugin.runtime.path_end`).
+    ``end_us``, or, if the scenario says so, where the ego passes the end of the recorded path (`alpasim_plugin.runtime.loop_state`).
 
     Args:
         scenario: The scenario.

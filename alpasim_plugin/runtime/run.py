@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.process.subprocesses import end_children
@@ -34,19 +35,18 @@ from alpasim_plugin.runtime.contents import (
 )
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
-from alpasim_plugin.runtime.fixer_table import chosen
 from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan, slug
-from alpasim_plugin.runtime.project import project
-from alpasim_plugin.runtime.provenance import hardware, versions
+from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
 from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.store import read_json
-from alpasim_plugin.runtime.stores.stored import opened
+from alpasim_plugin.runtime.stores.commits import opened
 from alpasim_plugin.runtime.tables import pool_of, write_tables
 from alpasim_plugin.runtime.writing import writing
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import declared
+from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
 
@@ -85,6 +85,16 @@ class RunResult:
     def exit_code(self) -> int:
         """Give the process exit code that docs/cli.md lists."""
         return self.outcome.exit_code
+
+
+def on_done(progress: Progress) -> Callable[[dict[str, Any], bool], None]:
+    """Return what notes in a manifest whether its rollout was reused, and then announces it."""
+
+    def done(manifest: dict[str, Any], reused: bool) -> None:
+        manifest["reused"] = reused
+        progress.rollout_done(manifest, reused)
+
+    return done
 
 
 def default_folder(plan: RunPlan) -> Path:
@@ -141,14 +151,9 @@ def execute_run(
         held = claim(root, plan, command, threads, resume, contents, progress.noticed)
         progress.started(plan, root, threads)
         began = time.perf_counter()
-
-        def on_done(manifest: dict[str, Any], reused: bool) -> None:
-            manifest["reused"] = reused
-            progress.rollout_done(manifest, reused)
-
         how = HowToRun(threads, resume, full, limit_s, retry, executor, store)
         try:
-            manifests = execute(plan, root, how, on_done, progress.noticed, contents.rollouts if contents else ())
+            manifests = execute(plan, root, how, on_done(progress), progress.noticed, contents.rollouts if contents else ())
             pool = {**how.stated, **pool_of(manifests, threads, time.perf_counter() - began, held.get("pool"))}
             determinism = certify(plan, root, manifests, how.cores_here, certificate, held.get("determinism"))
         finally:
@@ -217,21 +222,14 @@ def claim(
     Returns:
         What ``run.json`` said before; empty for a new folder.
     """
-    held: dict[str, Any] = {}
-    lost = False
-    if (root / RUN_INFO).exists() or contents is not None:
-        try:
-            held = read_run_json(root)
-        except InputError as error:
-            lost, held = True, {} if contents is None else dict(contents.run)
-            noticed(f"damaged: {RUN_INFO}: {error.found}; writing it again")
-        if held and held.get("key") != plan.command_key and not resume:
-            raise InputError(
-                "starting a run",
-                f"folder {root}",
-                f"it holds another run (key {held.get('key')}; this command has {plan.command_key})",
-                "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
-            )
+    held, lost = _held(root, contents, noticed)
+    if held and held.get("key") != plan.command_key and not resume:
+        raise InputError(
+            "starting a run",
+            f"folder {root}",
+            f"it holds another run (key {held.get('key')}; this command has {plan.command_key})",
+            "choose another --out, or pass --resume to reuse its matching rollouts and replace its tables",
+        )
     damage = [] if contents is None else damaged_files(root, contents)
     for one in damage:
         noticed(f"damaged: {one}; writing it again")
@@ -246,6 +244,17 @@ def claim(
     return held
 
 
+def _held(root: Path, contents: Contents | None, noticed: Callable[[str], None]) -> tuple[dict[str, Any], bool]:
+    """Return what ``run.json`` says, empty for a new folder, and whether it is lost and its copy in the contents stands for it."""
+    if contents is None and not (root / RUN_INFO).exists():
+        return {}, False
+    try:
+        return read_run_json(root), False
+    except InputError as error:
+        noticed(f"damaged: {RUN_INFO}: {error.found}; writing it again")
+        return {} if contents is None else dict(contents.run), True
+
+
 def _write_scenes(root: Path, plan: RunPlan) -> None:
     for scene_id, scenario in plan.scenarios.items():
         write_json(root / SCENES / f"{slug(scene_id)}.json", scene_as_json(scenario))
@@ -255,52 +264,55 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
     """Write ``run.json`` and the scene files of the report."""
     _write_scenes(root, plan)
     refs = {cell.scene: cell.ref for cell in plan.cells}
+    fixed = [spec for spec in plan.renderers if spec.fixer is not None]
     parts = plan.parts
     write_run_json(
         root,
-        {
-            "schema_version": SCHEMA_VERSION,
-            "key": plan.command_key,
-            "content": plan.content,
-            "command": list(command),
-            "version": versions()["alpasim-onefixer"],
-            "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
-            "project": project(),
+        {"schema_version": SCHEMA_VERSION, "key": plan.command_key, "content": plan.content}
+        | origin_of(command)
+        | {
             "asked": list(plan.asked),
             "config": asdict(plan.options) | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
             "preset": plan.options.preset,
             "renderers": [spec.name for spec in plan.renderers],
             "policies": [spec.name for spec in plan.policies],
             "seeds": list(plan.seeds),
-            "scenes": {
-                name: {
-                    "source": s.source,
-                    "ref": {
-                        "path": str(Path(refs[name].path).absolute()),
-                        "seed": refs[name].seed,
-                        "overrides": refs[name].overrides,
-                        "source": refs[name].source,
-                    },
-                    "content_hash": s.content_hash,
-                    "seed": s.seed,
-                    "varied": {key: list(values) for key, values in s.varied.items()},
-                    "duration_s": (s.end_us - s.start_us) * 1e-6,
-                    "rates": asdict(s.rates),
-                    "latency": asdict(s.latency),
-                    "degradation": asdict(s.degradation),
-                    "reconstruction": model_key(s),
-                    "notes": list(s.notes),
-                }
-                for name, s in plan.scenarios.items()
-            },
-            "bases": {spec.name: spec.base.name for spec in plan.renderers if spec.fixer is not None},
-            "fixers": {spec.name: spec.fixer.as_dict() for spec in plan.renderers if spec.fixer is not None},
+            "scenes": {name: _scene_facts(scenario, refs[name]) for name, scenario in plan.scenarios.items()},
+            "bases": {spec.name: spec.base.name for spec in fixed},
+            "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
             "code": {"loop": own_code_digest(LOOP)[:12], "scoring": own_code_digest(SCORING)[:12]},
             "metrics": declared(),
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),
             "versions": versions(),
-            "left_out": sorted({note for s in plan.scenarios.values() for note in s.notes}),
+            "left_out": sorted({note for scenario in plan.scenarios.values() for note in scenario.notes}),
         },
     )
+
+
+def origin_of(command: Sequence[str]) -> dict[str, Any]:
+    """Return what ``run.json`` says of how a run folder came about: command, version, time, the user's project."""
+    return {
+        "command": list(command),
+        "version": versions()["alpasim-onefixer"],
+        "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "project": project(),
+    }
+
+
+def _scene_facts(scenario: Scenario, ref: ScenarioRef) -> dict[str, Any]:
+    where = {"path": str(Path(ref.path).absolute()), "seed": ref.seed, "overrides": ref.overrides, "source": ref.source}
+    return {
+        "source": scenario.source,
+        "ref": where,
+        "content_hash": scenario.content_hash,
+        "seed": scenario.seed,
+        "varied": {key: list(values) for key, values in scenario.varied.items()},
+        "duration_s": (scenario.end_us - scenario.start_us) * 1e-6,
+        "rates": asdict(scenario.rates),
+        "latency": asdict(scenario.latency),
+        "degradation": asdict(scenario.degradation),
+        "reconstruction": model_key(scenario),
+        "notes": list(scenario.notes),
+    }

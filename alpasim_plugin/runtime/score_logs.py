@@ -18,8 +18,8 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.plugins.parts import PartSpec
 from alpasim_plugin.runtime.contents import RUN_INFO
 from alpasim_plugin.runtime.known_scenes import KnownScenes
+from alpasim_plugin.runtime.loop_state import PathEnd
 from alpasim_plugin.runtime.manifests import MANIFEST, STEPS_NAME, read_manifest
-from alpasim_plugin.runtime.path_end import PathEnd
 from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.scoring import contacts_of, tabulate

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,8 @@ from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import SCORING, slug
-from alpasim_plugin.runtime.project import project
 from alpasim_plugin.runtime.provenance import hardware, versions
-from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run
+from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run, origin_of
 from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
 from alpasim_plugin.runtime.store import write_parquet
@@ -32,6 +30,7 @@ from evaluators.aggregate.reduce import RolloutValue
 from evaluators.alpasim import (
     EvalSettings,
     SceneScore,
+    ScoredRollout,
     metrics_results_table,
     metrics_unprocessed_table,
     over_sweeps,
@@ -120,45 +119,55 @@ def _aggregate(
     """Aggregate as AlpaSim does, put its rollout values into the manifests, and write its files."""
     good = [one for one in scores if one.scored is not None]
     failed = [one.manifest for one in scores if one.scored is None]
-    written: list[str] = []
-    error: EvaluatorError | None = None
     skipped = ""
     if failed and not settings.allow_aggregation_with_failed_rollouts:
         skipped = f"{len(failed)} of {len(scores)} rollouts failed, and allow_aggregation_with_failed_rollouts is false"
-    if good:
-        try:
-            reduced = reduce_run([one.scored for one in good if one.scored is not None], preset)
-            marks = _scores(reduced, settings) if settings.scene_score.enabled else {}
-        except EvaluatorError as failure:
-            error, marks = failure, {}
-            reduced = reduce_run([one.scored for one in good if one.scored is not None], preset) if "scene score" in failure.doing else []
-        for i, one in enumerate(reduced):
-            values = dict(one.reduction.values)
-            if i in marks:
-                facts = info("scene_score")
-                values["scene_score"] = RolloutValue(marks[i].score, True, "", facts.unit, facts.direction)
-            good[i].manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
-            good[i].manifest["scene_score"] = None if i not in marks else {"failure_reason": marks[i].failure_reason}
-        if reduced and not skipped:
-            own = [one.of for one in reduced]
-            sweeps = over_sweeps(reduced)
-            write_parquet(root / AGGREGATE / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
-            write_parquet(root / AGGREGATE / "metrics_results.parquet", metrics_results_table(sweeps, own))
-            written += ["metrics_unprocessed.parquet", "metrics_results.parquet"]
-            if error is None:
-                rows = [_failure(m, own[0].run_name) for m in failed]
-                write_json(root / AGGREGATE / "results-summary.json", results_summary(reduced, marks, rows, sweeps, settings.scene_score))
-                written.append("results-summary.json")
+    reduced, marks, error = _reduce([one.scored for one in good if one.scored is not None], preset, settings)
+    for i, one in enumerate(reduced):
+        values = dict(one.reduction.values)
+        if i in marks:
+            facts = info("scene_score")
+            values["scene_score"] = RolloutValue(marks[i].score, True, "", facts.unit, facts.direction)
+        good[i].manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
+        good[i].manifest["scene_score"] = None if i not in marks else {"failure_reason": marks[i].failure_reason}
+    written: list[str] = []
+    if reduced and not skipped:
+        written = _write_aggregate(root / AGGREGATE, reduced, None if error else marks, failed, settings)
     return {"folder": AGGREGATE, "files": written, "skipped": skipped, "error": error.as_dict() if error else None}, error
 
 
-def _scores(reduced: Sequence[Any], settings: EvalSettings) -> dict[int, SceneScore]:
-    return {i: scene_score(one.values, settings.scene_score) for i, one in enumerate(reduced) if not one.dropped}
+def _reduce(
+    scored: Sequence[ScoredRollout], preset: Preset, settings: EvalSettings
+) -> tuple[Sequence[Any], dict[int, SceneScore], EvaluatorError | None]:
+    """Reduce rollouts to values, and score their scenes; an error of the scene score leaves the values."""
+    if not scored:
+        return [], {}, None
+    try:
+        reduced = reduce_run(scored, preset)
+    except EvaluatorError as error:
+        return [], {}, error
+    try:
+        kept = [(i, one) for i, one in enumerate(reduced) if settings.scene_score.enabled and not one.dropped]
+        return reduced, {i: scene_score(one.values, settings.scene_score) for i, one in kept}, None
+    except EvaluatorError as error:
+        return reduced if "scene score" in error.doing else [], {}, error
 
 
-def _failure(manifest: dict[str, Any], run_name: str | None) -> dict[str, Any]:
-    ids = {"clipgt_id": manifest["scene"], "rollout_id": manifest["rollout"], "run_uuid": None, "run_name": run_name}
-    return ids | {"error": manifest["error"]["found"]}
+def _write_aggregate(
+    folder: Path, reduced: Sequence[Any], marks: dict[int, SceneScore] | None, failed: Sequence[dict[str, Any]], settings: EvalSettings
+) -> list[str]:
+    """Write AlpaSim's files and return their names; without ``marks`` no summary."""
+    own, sweeps = [one.of for one in reduced], over_sweeps(reduced)
+    write_parquet(folder / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
+    write_parquet(folder / "metrics_results.parquet", metrics_results_table(sweeps, own))
+    if marks is None:
+        return ["metrics_unprocessed.parquet", "metrics_results.parquet"]
+    rows = []
+    for one in failed:
+        ids = {"clipgt_id": one["scene"], "rollout_id": one["rollout"], "run_uuid": None, "run_name": own[0].run_name}
+        rows.append(ids | {"error": one["error"]["found"]})
+    write_json(folder / "results-summary.json", results_summary(reduced, marks, rows, sweeps, settings.scene_score))
+    return ["metrics_unprocessed.parquet", "metrics_results.parquet", "results-summary.json"]
 
 
 def _write_info(
@@ -180,13 +189,8 @@ def _write_info(
     write_run_json(
         root,
         {
-            "schema_version": SCHEMA_VERSION,
-            "kind": "score",
-            "key": key,
-            "command": list(command),
-            "version": versions()["alpasim-onefixer"],
-            "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
-            "project": project(),
+            **{"schema_version": SCHEMA_VERSION, "kind": "score", "key": key},
+            **origin_of(command),
             "config": {"preset": preset.as_dict(), "settings": None if settings is None else settings.model_dump(mode="json")},
             "preset": preset.name,
             "renderers": names("renderer"),

@@ -13,9 +13,9 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY
 from alpasim_plugin.runtime.execute import Threads
-from alpasim_plugin.runtime.fixer_table import fixers
 from alpasim_plugin.runtime.manifests import STEPS_NAME
-from alpasim_plugin.runtime.plan_motion import plan_table
+from alpasim_plugin.runtime.provenance import fixers
+from alpasim_plugin.runtime.recorder import plan_table
 from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_parquet_parts
 from evaluators import censoring
 from evaluators.aggregate.columns import RolloutTable

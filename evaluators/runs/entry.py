@@ -54,7 +54,7 @@ class RunEntry:
 
     @property
     def project(self) -> Mapping[str, Any]:
-        """Give what `alpasim_plugin.runtime.project.Project` names; empty for a run of an earlier version."""
+        """Give what `alpasim_plugin.runtime.provenance.Project` names; empty for a run of an earlier version."""
         return self.info.get("project") or {}
 
     @property

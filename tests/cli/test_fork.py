@@ -12,14 +12,14 @@ from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import execute_run
 from scenarios.suite import expand
 from tests.runtime.test_fork import CELL, SHORT
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 
 @pytest.mark.slow
 def test_the_verbs_report_what_they_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "run"
     plan = make_plan(expand("smoke/lead_car", SHORT), ("clean",), ("lane-camera",), (0,), RunOptions())
-    execute_run(plan, root, 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(plan, root, 1, ["simrun"], Announced(), certificate="none", report=False)
     assert run_command(["fork", str(root), "--cell", CELL, "--at", "0.6", "--out", str(tmp_path / "fork")]) == 0
     assert "continuation      equal to the log, bit for bit" in capsys.readouterr().out
     asked = ["--renderers", "clean,broken-frozen", "--out", str(tmp_path / "p"), "--json"]

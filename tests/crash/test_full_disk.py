@@ -40,17 +40,17 @@ def test_a_run_with_a_refused_write_says_so_and_the_same_command_finishes_it(
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", disk.fsync)
         try:
-            heard = run(tmp_path / "full", plan)
+            announced = run(tmp_path / "full", plan)
         except InfrastructureError as error:  # a write of the run itself
             advice = error.do_this
         else:  # a write of a rollout, which is a failed one then
-            assert [status for status, _ in heard.fates].count("failed") == 1
+            assert [status for status, _ in announced.results].count("failed") == 1
             advice = "free disk space"
     assert "free disk space" in advice
     assert disk.left <= 0
     finished = sum(path.stat().st_size > 0 for path in (tmp_path / "full").rglob("manifest.json"))
     again = run(tmp_path / "full", plan)
-    assert len(again.fates) == 2
+    assert len(again.results) == 2
     assert finished <= 2
     assert inspect_run(tmp_path / "full", full=True).whole
     assert comparable(tmp_path / "full") == comparable(tmp_path / "whole")

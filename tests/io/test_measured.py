@@ -13,7 +13,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io import measured as module
 from alpasim_plugin.io.measured import measured, share_measurements
-from alpasim_plugin.runtime.workers import in_workers
+from alpasim_plugin.runtime.executors.local import run_in_processes
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def work(folder: Path, log: Path, item: int) -> tuple[int, int]:
 
 def test_of_two_processes_at_once_one_measures_and_both_have_its_values(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    answers = [got for _, got in in_workers(partial(work, tmp_path / "measured" / "run", log), [0, 1, 2, 3], 2, 1)]
+    answers = [got for _, got in run_in_processes(partial(work, tmp_path / "measured" / "run", log), [0, 1, 2, 3], 2, 1)]
     assert len({pid for pid, _ in answers}) == 2
     (measurer,) = log.read_text().split()
     assert {measurer} == {str(taken) for _, taken in answers}

@@ -11,30 +11,30 @@ from typing import Any
 from alpasim_plugin.runtime.executors.assignment import Assignment, assignment_as_here
 from alpasim_plugin.runtime.executors.base import Resources
 from alpasim_plugin.runtime.executors.choice import Executor
-from alpasim_plugin.runtime.executors.dispatch import dispatch
-from alpasim_plugin.runtime.executors.placing import Contents
+from alpasim_plugin.runtime.executors.node_files import Contents
+from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.plan import RunPlan
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from tests.runtime.cluster_nodes import Nodes
 from tests.runtime.remote_work import Scripted
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 
-def run(plan: RunPlan, root: Path, executor: Executor, **more: Any) -> tuple[RunResult, Heard]:
-    heard = Heard()
-    result = execute_run(plan, root, None, ["simrun"], heard, certificate="none", report=False, executor=executor, **more)
-    return result, heard
+def run(plan: RunPlan, root: Path, executor: Executor, **more: Any) -> tuple[RunResult, Announced]:
+    announced = Announced()
+    result = execute_run(plan, root, None, ["simrun"], announced, certificate="none", report=False, executor=executor, **more)
+    return result, announced
 
 
 @contextmanager
 def pool_on(nodes: Nodes | None, work: Scripted, contents: Contents | None = None, **more: Any) -> Iterator[Any]:
     """Give a pool of at most eight workers; ``more`` for `Assignment`, or ``start_s`` for the pool."""
-    from alpasim_plugin.runtime.executors.ray_pool import START_S, RayPool, connected
+    from alpasim_plugin.runtime.executors.ray_backend import START_S, RayBackend, connected
 
     start_s = more.pop("start_s", START_S)
     given: Assignment[str] = replace(assignment_as_here(work, contents or Contents(), (), Resources(), 8, print), **more)
     with connected(nodes and nodes.address):
-        pool = RayPool(given, start_s)
+        pool = RayBackend(given, start_s)
         try:
             yield pool
         finally:
@@ -43,4 +43,4 @@ def pool_on(nodes: Nodes | None, work: Scripted, contents: Contents | None = Non
 
 def scripted(nodes: Nodes, work: Scripted, items: list[str], contents: Contents | None = None, limit_s: float | None = None) -> dict:
     with pool_on(nodes, work, contents) as pool:
-        return dict(dispatch(pool, items, print, limit_s))
+        return dict(run_jobs(pool, items, print, limit_s))

@@ -25,11 +25,11 @@ class Scripted:
     notes: Path
     bad_node: str = ""  # results of this node are faulty
 
-    def __call__(self, item: str, node: Node) -> Any:
-        name = item.replace(" ", "-")[:60]
+    def __call__(self, job: str, node: Node) -> Any:
+        name = job.replace(" ", "-")[:60]
         seen = len(list(self.notes.glob(f"{name}.*")))
         (self.notes / f"{name}.{os.getpid()}.{time.monotonic_ns()}").write_text(f"{node.name} {int(time.time() // DAY_S)}")
-        words = item.split("#")[0].split()
+        words = job.split("#")[0].split()
         if words[0] == "sleep" or (words[0] == "late" and seen == 0):
             time.sleep(float(words[1]))
         while words[0] == "hold" and not (self.notes / "go").exists():
@@ -41,8 +41,8 @@ class Scripted:
         if words[0] == "fetch":
             return len(node.fetch(words[1]))
         if self.bad_node and node.name == self.bad_node:
-            return Faulty(f"{item} failed", "disk full")
-        return item.upper()
+            return Faulty(f"{job} failed", "disk full")
+        return job.upper()
 
     def key(self, item: str) -> str:
         """Return the item."""

@@ -18,7 +18,7 @@ from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
 from policies import ConstantVelocity
 from scenarios.suite import expand
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
 SHORT, LONGER = "timing.duration_us=800000", "timing.duration_us=1200000"
@@ -37,7 +37,7 @@ def certificate(plan: RunPlan, root: Path, before: dict | None = None, wanted: C
 
 
 def test_the_shortest_rollout_is_repeated_and_stands_in_both_files(tmp_path: Path) -> None:
-    found = execute_run(plan_of(), tmp_path, 1, ["simrun"], Heard(), report=False).summary["determinism"]
+    found = execute_run(plan_of(), tmp_path, 1, ["simrun"], Announced(), report=False).summary["determinism"]
     assert found["status"] == "equal"
     assert found["cell"]["scene"] == "smoke-straight"
     assert found["steps"] == 8

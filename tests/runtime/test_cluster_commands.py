@@ -119,11 +119,14 @@ def at_work(mark: bytes) -> list[int]:
 
 
 @both
-def test_ctrl_c_leaves_no_worker_and_the_same_command_goes_on(tmp_path: Path, where: str, repo: Path) -> None:
+def test_ctrl_c_leaves_no_worker_and_the_same_command_goes_on(
+    tmp_path: Path, where: str, repo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = [*RUN, "--seeds", "4", "--executor", where, "--workers", "2", "--certify", "none", "--out", str(tmp_path / "run")]
+    monkeypatch.setenv("SIMRUN_SLURM", str(private := tmp_path / "private"))
     environment = {**os.environ, "PYTHONPATH": str(repo)}
     command = [sys.executable, "-m", "alpasim_plugin.cli.main", *words]
-    mark = b"ray::Serving" if where.startswith("ray") else f"{tmp_path}/run/.slurm".encode()
+    mark = b"ray::Serving" if where.startswith("ray") else str(private).encode()
     driver = subprocess.Popen(command, cwd=repo, env=environment, stderr=subprocess.PIPE, text=True)
     until_s = time.monotonic() + 200
     while not list((tmp_path / "run").rglob("manifest.json")):
@@ -139,7 +142,7 @@ def test_ctrl_c_leaves_no_worker_and_the_same_command_goes_on(tmp_path: Path, wh
     while at_work(mark):
         assert time.monotonic() < until_s, "a worker outlives the run"
         time.sleep(0.1)
-    assert not (tmp_path / "run" / ".slurm").exists()
+    assert not private.exists() or list(private.iterdir()) == []
     done = len(list((tmp_path / "run").rglob("manifest.json")))
     assert 1 <= done < 16
     assert run_command(words) == 0

@@ -22,7 +22,7 @@ from evaluators.sequential.record import DECISION, read_decision
 from scenarios.suite import ScenarioRef, expand
 from tests.runtime.grey_policy import BY_GREY
 from tests.runtime.grey_renderer import GREY
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 DARKER = GREY.replace("Grey", "Darker")
 SHORT = ("timing.duration_us=700000", "timing.warmup_us=100000")
@@ -32,7 +32,7 @@ WORSE = Question(
 )
 
 
-class Looks(Heard):
+class Looks(Announced):
     """Remembers looks, too."""
 
     def __init__(self) -> None:
@@ -50,9 +50,9 @@ def plan_of(scenes: int = 8, renderers: tuple[str, str] = (GREY, DARKER), policy
 
 
 def decide(root: Path, question: Question, plan: RunPlan, design: Design, workers: int = 1, report: bool = False) -> tuple[Decided, Looks]:
-    heard = Looks()
+    announced = Looks()
     asked = replace(plan, question=key_of(question, design, {}))
-    return execute_decision(asked, question, design, root, workers, ["simrun"], heard, {}, certificate="none", report=report), heard
+    return execute_decision(asked, question, design, root, workers, ["simrun"], announced, {}, certificate="none", report=report), announced
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +67,10 @@ def told(root: Path) -> dict:
 
 
 def test_a_renderer_that_is_worse_is_found_before_all_scenes_are_driven(worse) -> None:
-    root, decided, heard = worse
+    root, decided, announced = worse
     assert (decided.outcome.exit_code, decided.record["verdict"], decided.record["stopped"]) == (1, "worse", "decided")
     assert decided.outcome.reasons == ("lateral_distance_m is worse",)
-    assert heard.looks == [(2, "open"), (4, "bad")]
+    assert announced.looks == [(2, "open"), (4, "bad")]
     assert decided.record["order"] == drawing_order(list(plan_of().scenarios), 0)[:4]
     assert (decided.record["rollouts"], decided.record["ceiling"]) == (8, {"scenes": 8, "rollouts": 16})
     assert len(read_run(root).rollouts) == 8
@@ -88,11 +88,11 @@ def test_in_stratified_order_every_batch_has_both_families_and_the_record_names_
     refs = [ScenarioRef(ref.path, seed, ref.overrides) for ref in listed for seed in (1, 2)]
     plan = make_plan(refs, (GREY, DARKER), (BY_GREY,), (0,), RunOptions(images="none", baseline=GREY))
     suite = replace(SAME, population="suite", alpha=0.02)
-    decided, heard = decide(tmp_path / "run", suite, plan, Design("stratified", look_every=2))
+    decided, announced = decide(tmp_path / "run", suite, plan, Design("stratified", look_every=2))
     file_of = {cell.scene: cell.ref.path for cell in plan.cells}
     order = decided.record["order"]
     assert [len({file_of[scene] for scene in order[at : at + 2]}) for at in (0, 2)] == [2, 2]
-    assert (heard.looks[-1], decided.record["stopped"]) == ((4, "good"), "decided")  # of all scenes the answer is exact
+    assert (announced.looks[-1], decided.record["stopped"]) == ((4, "good"), "decided")  # of all scenes the answer is exact
     assert list(decided.record["drawn"]["families"].values()) == [2, 2]
     assert "in stratified order of 2 families" in render_report(read_run(tmp_path / "run"))
     with pytest.raises(InputError, match="shares of families in a population"):
@@ -111,8 +111,8 @@ def test_an_interrupted_decision_continues_and_decides_the_same(worse, tmp_path:
         for manifest in root.glob(f"rollouts/*/*/{scene}/0/{MANIFEST}"):
             manifest.unlink()
             break
-    decided, heard = decide(root, WORSE, plan_of(), Design(look_every=2))
-    assert sorted(heard.fates) == [("ok", False)] * 2 + [("ok", True)] * 6
+    decided, announced = decide(root, WORSE, plan_of(), Design(look_every=2))
+    assert sorted(announced.results) == [("ok", False)] * 2 + [("ok", True)] * 6
     assert told(root) == before
     assert decided.record == before
 
@@ -151,17 +151,17 @@ def test_a_damaged_record_is_named(worse, tmp_path: Path) -> None:
 
 
 def test_at_the_ceiling_the_decision_is_undecided(tmp_path: Path) -> None:
-    decided, heard = decide(tmp_path, SAME, plan_of(renderers=(GREY, DARKER)), Design(look_every=3, budget=5))
+    decided, announced = decide(tmp_path, SAME, plan_of(renderers=(GREY, DARKER)), Design(look_every=3, budget=5))
     assert (decided.outcome.exit_code, decided.record["rollouts"]) == (3, 4)
     assert decided.outcome.reasons == ("offroad undecided: the budget of 5 rollouts is spent",)
-    assert heard.looks == [(2, "open")]
+    assert announced.looks == [(2, "open")]
 
 
 def test_a_failed_rollout_ends_the_decision(tmp_path: Path) -> None:
     broken = "tests.runtime.broken_policies:Raises"
-    decided, heard = decide(tmp_path, SAME, plan_of(policy=broken), Design(look_every=1))
+    decided, announced = decide(tmp_path, SAME, plan_of(policy=broken), Design(look_every=1))
     assert decided.outcome.exit_code == 2  # the policy's own fault
-    assert heard.looks == [(1, "open")]
+    assert announced.looks == [(1, "open")]
     assert "rollouts failed" in decided.record["stopped"]
 
 

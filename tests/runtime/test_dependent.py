@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.dependent import Say, run_dependent
+from alpasim_plugin.runtime.executors.local import Send, run_dependent
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Step:
     what: str = ""
 
 
-def work(step: Step, say: Say) -> None:
+def work(step: Step, send: Send) -> None:
     missing = [name for name in step.after if not (step.folder / name).exists()]
-    say(f"missing {missing}" if missing else "ready")
+    send(f"missing {missing}" if missing else "ready")
     if step.what == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
     if step.what == "raises":
@@ -39,18 +39,16 @@ def work(step: Step, say: Say) -> None:
 @pytest.mark.parametrize("jobs", [1, 3])
 def test_every_task_finds_what_it_depends_on(tmp_path: Path, jobs: int) -> None:
     steps = [Step("a", tmp_path), Step("b", tmp_path), Step("c", tmp_path, ("a",)), Step("d", tmp_path, ("b", "c"))]
-    heard: dict[str, str] = {}
-    run_dependent(work, steps, jobs, heard.__setitem__)
-    assert heard == dict.fromkeys("abcd", "ready")
+    messages: dict[str, str] = {}
+    run_dependent(work, steps, jobs, messages.__setitem__)
+    assert messages == dict.fromkeys("abcd", "ready")
 
 
-@pytest.mark.parametrize(("what", "error", "found"), [("raises", ValueError, "no"), ("dies", InfrastructureError, "exit code -9")])
+@pytest.mark.parametrize(("what", "error", "found"), [("raises", ValueError, "no"), ("dies", InfrastructureError, "killed by SIGKILL")])
 def test_a_task_that_fails_ends_the_others(tmp_path: Path, what: str, error: type[Exception], found: str) -> None:
     steps = [Step("a", tmp_path, what="waits"), Step("b", tmp_path, what=what), Step("c", tmp_path, ("b",))]
-    began = time.monotonic()
     with pytest.raises(error, match=found):
         run_dependent(work, steps, 2, lambda name, said: None)
-    assert time.monotonic() - began < 55
     assert not any((tmp_path / name).exists() for name in "abc")
 
 

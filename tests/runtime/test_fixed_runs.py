@@ -18,7 +18,7 @@ from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.tables import speed
 from scenarios.suite import expand
-from tests.runtime.test_runs import Heard, comparable
+from tests.runtime.test_runs import Announced, comparable
 
 SMALL_NET = ("weights.bundle=null", "dit.width=32", "dit.blocks=1", "dit.head_width=16", "dit.mlp_width=32", "untrained=random")
 SCENE = ("timing.duration_us=1500000", "cameras=[{name: front, width: 96, height: 64}]")
@@ -30,9 +30,9 @@ def plan_of(fixer: tuple[str, ...] = SMALL_NET) -> RunPlan:
 
 
 def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False, report: bool = False) -> list[tuple[str, bool]]:
-    heard = Heard()
-    execute_run(plan, root, workers, ["simrun"], heard, resume, "none", report)
-    return heard.fates
+    announced = Announced()
+    execute_run(plan, root, workers, ["simrun"], announced, resume, "none", report)
+    return announced.results
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -18,18 +18,16 @@ from alpasim_plugin.plugins.parts import resolve
 from alpasim_plugin.runtime.certificate import rollout_trace
 from alpasim_plugin.runtime.contents import write_run_json
 from alpasim_plugin.runtime.flips import write_flips
-from alpasim_plugin.runtime.fork import Change, fork_rollout
+from alpasim_plugin.runtime.fork import Change, fork_rollout, merge_sensors
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout, find_rollout
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from alpasim_plugin.runtime.probe import probe_rollout
-from alpasim_plugin.runtime.probe_write import write_probe
+from alpasim_plugin.runtime.probe import probe_rollout, write_probe
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from alpasim_plugin.runtime.store import read_json
-from alpasim_plugin.runtime.switch import merge_sensors
 from scenarios.suite import expand
 from tests.examples import first_of
 from tests.runtime.test_certificate import BARE
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 SHORT = ("timing.duration_us=1200000", "timing.warmup_us=200000", "degradation.kind=surrogate", *BARE)
 CELL = "clean/lane-camera/smoke-lead_car/0"
@@ -41,7 +39,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a run of a scene with a reactive car ahead behind two renderers, one of which makes the policy lose its lane."""
     folder = tmp_path_factory.mktemp("run")
     plan = make_plan(expand("smoke/lead_car", SHORT), ("clean", "broken-frozen"), ("lane-camera",), (0,), RunOptions())
-    execute_run(plan, folder, 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(plan, folder, 1, ["simrun"], Announced(), certificate="none", report=False)
     return folder
 
 

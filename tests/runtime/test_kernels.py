@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.renderers.cache import cache_root
-from alpasim_plugin.runtime.kernels import KIND, SUBJECTS, compile_for, compile_kernels, needed
+from alpasim_plugin.runtime.execute import KERNELS, SUBJECTS, compile_for, compile_kernels, needed
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from scenarios.suite import ScenarioRef
 
@@ -38,9 +38,9 @@ def test_one_worker_compiles_while_it_drives_and_two_beforehand(tmp_path: Path, 
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
     plan = plan_of("clean")
     compile_for(plan.cells, plan.scenarios, 1)
-    assert not (cache_root() / KIND).exists()
+    assert not (cache_root() / KERNELS).exists()
     compile_kernels("rasteriser")
-    assert [path.name.split("-")[0] for path in (cache_root() / KIND).iterdir() if path.is_dir()] == ["rasteriser"]
+    assert [path.name.split("-")[0] for path in (cache_root() / KERNELS).iterdir() if path.is_dir()] == ["rasteriser"]
     before = sys.modules.copy()
     compile_for(plan.cells, plan.scenarios, 2)  # nothing is left to do: no process is started
     assert sys.modules.keys() == before.keys()
@@ -50,7 +50,7 @@ def test_one_worker_compiles_while_it_drives_and_two_beforehand(tmp_path: Path, 
 COMPILED_LATER = """
 import sys
 from numba.core import event
-from alpasim_plugin.runtime.kernels import SUBJECTS, compile_kernels
+from alpasim_plugin.runtime.execute import SUBJECTS, compile_kernels
 
 class Compiled(event.Listener):
     names = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.types import Latency, Trajectory
-from alpasim_plugin.runtime.latency import PlanQueue
+from alpasim_plugin.runtime.loop_state import PlanQueue
 
 
 def plan(t_us: int) -> Trajectory:

@@ -12,7 +12,7 @@ from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec, Trajectory
 from alpasim_plugin.runtime.cell import find_rollout_state
-from alpasim_plugin.runtime.path_end import PathEnd
+from alpasim_plugin.runtime.loop_state import PathEnd
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.run import execute_run
@@ -20,7 +20,7 @@ from alpasim_plugin.runtime.score_logs import check_complete
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 from tests.runtime.grey_renderer import GREY, Grey
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 FAST = f"{__name__}:Fast"
 
@@ -96,7 +96,7 @@ def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(
 
     scene = load_scenario("smoke/straight", overrides=("timing.duration_us=2000000",))
     assert scene.stop_at_path_end
-    execute_run(plan("paper"), tmp_path, 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(plan("paper"), tmp_path, 1, ["simrun"], Announced(), certificate="none", report=False)
     remedies = {cell.policy.name: find_rollout_state(cell, tmp_path)[0] for cell in plan("alpasim").cells}
     assert remedies == {"constant-velocity": "score", FAST: "drive"}
     assert {find_rollout_state(cell, tmp_path)[0] for cell in plan("strict").cells} == {"score"}

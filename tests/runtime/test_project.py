@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.runtime.project import project
+from alpasim_plugin.runtime.provenance import project
 
 WHO = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
 

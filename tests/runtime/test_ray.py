@@ -16,20 +16,19 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.executors.base import Resources
+from alpasim_plugin.runtime.executors.assignment import identity_of
+from alpasim_plugin.runtime.executors.base import Lost, Resources
 from alpasim_plugin.runtime.executors.choice import Executor
-from alpasim_plugin.runtime.executors.dispatch import dispatch
-from alpasim_plugin.runtime.executors.identity import identity_of
-from alpasim_plugin.runtime.executors.placing import Contents
+from alpasim_plugin.runtime.executors.node_files import Contents
+from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.runtime.workers import Lost
 from scenarios.suite import expand
 from tests.runtime.cluster_nodes import Nodes, on
 from tests.runtime.grey_renderer import GREY
 from tests.runtime.on_ray import pool_on, run, scripted
 from tests.runtime.remote_work import Scripted
-from tests.runtime.test_runs import SHORT, Heard, cheap_plan, comparable, plan_of
+from tests.runtime.test_runs import SHORT, Announced, cheap_plan, comparable, plan_of
 
 pytest.importorskip("ray", reason="the extra [ray] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
@@ -67,7 +66,7 @@ def three() -> Iterator[Nodes]:
 @pytest.fixture(scope="module")
 def by_local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("local")
-    execute_run(plan_of(scenes=("smoke/straight", "smoke/lead_car")), root, 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(plan_of(scenes=("smoke/straight", "smoke/lead_car")), root, 1, ["simrun"], Announced(), certificate="none", report=False)
     return root
 
 
@@ -78,16 +77,16 @@ def test_one_and_three_nodes_give_the_run_of_one_process(tmp_path: Path, three: 
         run(plan, tmp_path / "one", on(one))
     finally:
         one.close()
-    result, heard = run(plan, tmp_path / "three", on(three))
-    assert heard.fates == [("ok", False)] * 4
+    result, announced = run(plan, tmp_path / "three", on(three))
+    assert announced.results == [("ok", False)] * 4
     assert result.exit_code == 0
     assert comparable(tmp_path / "one") == comparable(tmp_path / "three") == comparable(by_local)
 
 
 def test_a_second_run_reuses_what_nodes_have_driven_without_them(tmp_path: Path, three: Nodes) -> None:
     run(cheap_plan(), tmp_path, on(three))
-    _, heard = run(cheap_plan(), tmp_path, Executor())
-    assert heard.fates == [("ok", True)] * 4
+    _, announced = run(cheap_plan(), tmp_path, Executor())
+    assert announced.results == [("ok", True)] * 4
 
 
 def test_every_item_has_a_result_though_workers_die(tmp_path: Path, three: Nodes) -> None:
@@ -118,7 +117,7 @@ def test_a_raylet_that_is_killed_loses_nothing(tmp_path: Path, three: Nodes) -> 
     items = [f"sleep 0.5 #{i}" for i in range(24)]
     found = {}
     with pool_on(three, Scripted(tmp_path)) as pool:
-        for item, got in dispatch(pool, items, print):
+        for item, got in run_jobs(pool, items, print):
             found[item] = got
             if len(found) >= 4 and raylet and any(doomed.node_id[:8] in name for name in pool.nodes()):
                 os.kill(raylet, signal.SIGKILL)
@@ -149,7 +148,7 @@ def test_no_node_of_the_right_version_is_an_error_that_names_it(tmp_path: Path) 
         pool_on(None, Scripted(tmp_path), expected={**identity_of(()), "scipy": "0.0.1"}) as pool,
         pytest.raises(InfrastructureError, match=r"no node takes the work: .*scipy is .*, the driver has 0\.0\.1"),
     ):
-        dict(dispatch(pool, ["a"], print))
+        dict(run_jobs(pool, ["a"], print))
 
 
 def test_a_straggler_is_done_again_on_another_node(tmp_path: Path, three: Nodes) -> None:
@@ -165,12 +164,12 @@ def test_workers_go_where_what_they_declare_is(tmp_path: Path, three: Nodes) -> 
     for resources, workers in ((Resources(1, gpus=0.5), 2), (Resources(1, memory_gib=1.0, gpus=0.1), 3), (Resources(2), 2)):
         with pool_on(three, Scripted(tmp_path), resources=resources) as pool:
             until = time.monotonic() + 120
-            while len(pool.free()) < workers:
+            while len(pool.free(workers)) < workers:
                 assert time.monotonic() < until, resources
                 pool.wait(0.2)
             seen_until = time.monotonic() + 5
             while time.monotonic() < seen_until:
-                assert len(places := pool.free()) == workers, resources
+                assert len(places := pool.free(workers)) == workers, resources
                 pool.wait(0.5)
             assert all(large.node_id[:8] in place.node for place in places), resources
             assert len(pool.nodes()) == 1
@@ -179,7 +178,7 @@ def test_workers_go_where_what_they_declare_is(tmp_path: Path, three: Nodes) -> 
 
 def test_more_than_any_node_has_is_an_error_that_says_so(tmp_path: Path, three: Nodes) -> None:
     with pool_on(three, Scripted(tmp_path), resources=Resources(64)) as pool, pytest.raises(InfrastructureError) as caught:
-        dict(dispatch(pool, ["a"], print))
+        dict(run_jobs(pool, ["a"], print))
     assert "cores=64" in caught.value.with_what
     assert "no node has that much" in caught.value.found
 
@@ -200,11 +199,11 @@ def test_a_node_that_starts_no_process_is_set_aside_and_others_do_its_work(
     (tmp_path / "notes").mkdir()
     items = [f"sleep 0.5 #{i}" for i in range(12)]
     with pool_on(three, Scripted(tmp_path / "notes"), start_s=PATIENCE_S) as pool:
-        assert dict(dispatch(pool, items, print)) == {item: item.upper() for item in items}
+        assert dict(run_jobs(pool, items, print)) == {item: item.upper() for item in items}
         said, until = "", time.monotonic() + 10 * PATIENCE_S
         while " is set aside: " not in said:
             assert time.monotonic() < until, said
-            pool.free()
+            pool.free(8)
             pool.wait(0.5)
             said += capsys.readouterr().out
         assert len(pool.nodes()) == 3
@@ -222,7 +221,7 @@ def test_an_only_node_whose_worker_is_never_ready_is_an_error_that_names_it(tmp_
     head = str(one.cluster.head_node.node_id)
     try:
         with pool_on(one, Scripted(tmp_path), start_s=PATIENCE_S) as pool, pytest.raises(InfrastructureError) as caught:
-            dict(dispatch(pool, ["a"], print))
+            dict(run_jobs(pool, ["a"], print))
     finally:
         one.close()
     assert caught.value.doing == "working on a Ray cluster"
@@ -240,13 +239,13 @@ def test_a_node_whose_core_another_driver_holds_is_waited_for(tmp_path: Path, ca
             ray.get(holder.held.remote())
             began, said = time.monotonic(), ""
             while time.monotonic() < began + 2.5 * PATIENCE_S:
-                assert not pool.free()
+                assert not pool.free(8)
                 pool.wait(0.5)
                 said += capsys.readouterr().out
             assert "others may hold its cores" in said
             assert " is set aside" not in said
             ray.kill(holder)
-            assert dict(dispatch(pool, ["a"], print)) == {"a": "A"}
+            assert dict(run_jobs(pool, ["a"], print)) == {"a": "A"}
     finally:
         one.close()
 
@@ -260,12 +259,12 @@ class Holder:
 
 def test_stopping_ends_the_workers_and_removes_what_they_left(tmp_path: Path, three: Nodes) -> None:
     with pool_on(three, Scripted(tmp_path)) as pool:
-        outcomes = dispatch(pool, ["a", "sleep 100 #1", "sleep 100 #2"], print)
+        outcomes = run_jobs(pool, ["a", "sleep 100 #1", "sleep 100 #2"], print)
         assert next(outcomes)[0] == "a"
         until = time.monotonic() + 30
         while len(list(tmp_path.iterdir())) < 3 and time.monotonic() < until:
             list(pool.wait(0.1))
-            for place in pool.free():
+            for place in pool.free(8):
                 pool.start(place.worker, ["sleep 100 #2"])
         pool.close()
         pids = [int(note.name.split(".")[-2]) for note in tmp_path.iterdir()]
@@ -280,8 +279,8 @@ import sys
 from pathlib import Path
 from alpasim_plugin.runtime.executors.choice import Executor
 from alpasim_plugin.runtime.run import execute_run
-from tests.runtime.test_runs import Heard, cheap_plan
-execute_run(cheap_plan((0, 1, 2)), Path(sys.argv[1]), None, ["simrun"], Heard(), certificate="none", report=False,
+from tests.runtime.test_runs import Announced, cheap_plan
+execute_run(cheap_plan((0, 1, 2)), Path(sys.argv[1]), None, ["simrun"], Announced(), certificate="none", report=False,
             executor=Executor("ray", sys.argv[2]))
 """
 
@@ -299,9 +298,9 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(tmp_path:
     wait_until(lambda: not serving(), "a worker outlives its driver")
     done = len(list((tmp_path / "run").rglob("manifest.json")))
     assert done < 12
-    _, heard = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
-    assert heard.fates.count(("ok", True)) == done
-    assert len(heard.fates) == 12
+    _, announced = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
+    assert announced.results.count(("ok", True)) == done
+    assert len(announced.results) == 12
     run(cheap_plan((0, 1, 2)), tmp_path / "here", Executor())
     assert comparable(tmp_path / "run") == comparable(tmp_path / "here")
 
@@ -312,8 +311,8 @@ KILLER = "tests.runtime.broken_policies:KillsItsProcess"
 def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path: Path, three: Nodes) -> None:
     refs = [ref for name in ("smoke/straight", "smoke/lead_car") for ref in expand(name, SHORT)]
     plan = make_plan(refs, (GREY,), ("constant-velocity", KILLER), (0,), RunOptions())
-    result, heard = run(plan, tmp_path / "run", on(three))
-    assert sorted(heard.fates) == [("failed", False)] * 2 + [("ok", False)] * 2
+    result, announced = run(plan, tmp_path / "run", on(three))
+    assert sorted(announced.results) == [("failed", False)] * 2 + [("ok", False)] * 2
     assert result.exit_code == 4
     for cell in result.summary["failures"]["cells"]:
         assert cell["policy"] == KILLER
@@ -334,11 +333,11 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_node_whose_disk_is_full_is_set_aside(tmp_path: Path, three: Nodes, tiny_disk: Path) -> None:
     full = three.add(env_vars={"SIMRUN_SCRATCH": str(tiny_disk)})
-    result, heard = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
+    result, announced = run(cheap_plan((0, 1, 2)), tmp_path / "run", on(three))
     three.cluster.remove_node(full)
-    assert heard.fates == [("ok", False)] * 12
+    assert announced.results == [("ok", False)] * 12
     assert result.exit_code == 0
-    aside = [text for text in heard.notices if "set aside" in text]
+    aside = [text for text in announced.notices if "set aside" in text]
     assert len(aside) == 1
     assert full.node_id[:8] in aside[0]
     assert "No space left on device" in aside[0]

@@ -62,12 +62,12 @@ def test_a_node_whose_clock_is_a_day_ahead_gives_the_same_run(tmp_path: Path, th
     ahead = three.add(env_vars={"PYTHONPATH": f"{tmp_path / 'site'}:{os.environ.get('PYTHONPATH', '')}"})
     (tmp_path / "notes").mkdir()
     scripted(three, Scripted(tmp_path / "notes"), [f"sleep 0.5 #{i}" for i in range(24)])
-    _, heard = run(cheap_plan((0, 1)), tmp_path / "run", on(three))
+    _, announced = run(cheap_plan((0, 1)), tmp_path / "run", on(three))
     three.cluster.remove_node(ahead)
     days = dict(note.read_text().split() for note in (tmp_path / "notes").iterdir())
     assert int(days.pop(next(name for name in days if ahead.node_id[:8] in name))) > max(map(int, days.values()))
-    assert heard.fates == [("ok", False)] * 8
+    assert announced.results == [("ok", False)] * 8
     run(cheap_plan((0, 1)), tmp_path / "here", Executor())
     assert comparable(tmp_path / "run") == comparable(tmp_path / "here")
     _, again = run(cheap_plan((0, 1)), tmp_path / "run", Executor())
-    assert again.fates == [("ok", True)] * 8
+    assert again.results == [("ok", True)] * 8

@@ -20,7 +20,7 @@ from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.score_logs import check_vouched
 from alpasim_plugin.runtime.writing import remove_left_overs
 from scenarios.suite import expand
-from tests.runtime.test_runs import Heard, comparable
+from tests.runtime.test_runs import Announced, comparable
 
 CELL = "rollouts/clean/constant-velocity/smoke-straight/0"
 
@@ -30,10 +30,10 @@ def plan_of(seeds: tuple[int, ...] = (0, 1)) -> RunPlan:
     return make_plan(refs, ("clean", "broken-black"), ("constant-velocity",), seeds, RunOptions(images="none"))
 
 
-def run(root: Path, plan: RunPlan | None = None) -> Heard:
-    heard = Heard()
-    execute_run(plan or plan_of(), root, 1, ["simrun", "--seeds", "2"], heard, certificate="none", report=False)
-    return heard
+def run(root: Path, plan: RunPlan | None = None) -> Announced:
+    announced = Announced()
+    execute_run(plan or plan_of(), root, 1, ["simrun", "--seeds", "2"], announced, certificate="none", report=False)
+    return announced
 
 
 @pytest.fixture(scope="module")
@@ -98,11 +98,11 @@ def test_the_next_run_tells_what_is_damaged_and_makes_only_that_again(
     made: Path, root: Path, file: str, damage: Callable[[Path], None], remedy: str
 ) -> None:
     damage(root / file)
-    heard = run(root)
-    assert len(heard.notices) == 1
-    assert heard.notices[0].startswith(f"damaged: {file}: ")
-    assert heard.notices[0].endswith(remedy)
-    assert heard.fates.count(("ok", False)) == (remedy == DRIVE)
+    announced = run(root)
+    assert len(announced.notices) == 1
+    assert announced.notices[0].startswith(f"damaged: {file}: ")
+    assert announced.notices[0].endswith(remedy)
+    assert announced.results.count(("ok", False)) == (remedy == DRIVE)
     assert comparable(root) == comparable(made)
     assert inspect_run(root, full=True).whole
     assert run(root).notices == []
@@ -164,7 +164,7 @@ def test_a_run_that_was_stopped_is_not_read_until_it_is_finished(root: Path, cap
     told = capsys.readouterr().err
     assert "the run is not finished: 3 of 4 rollouts are finished" in told
     assert "do: give its command again: simrun --seeds 2" in told
-    assert run(root).fates.count(("ok", False)) == 1
+    assert run(root).results.count(("ok", False)) == 1
     assert inspect_run(root).whole
 
 
@@ -173,7 +173,7 @@ def test_what_has_neither_run_nor_contents_can_only_be_run_again(root: Path, cap
     becomes("[1]")(root / "contents.json")
     assert run_command(["check", str(root), "--repair"]) == 2
     assert f"give the command of the run again: finished rollouts are kept (with --out {root})" in capsys.readouterr().err
-    assert run(root).fates == [("ok", True)] * 4
+    assert run(root).results == [("ok", True)] * 4
     assert inspect_run(root).whole
 
 
@@ -187,7 +187,7 @@ def test_a_read_only_folder_is_read_and_a_finished_run_in_it_is_its_own_result(r
     inspect_run(root)  # sets the copy's times
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
     monkeypatch.setattr("alpasim_plugin.runtime.run.os.access", lambda path, mode: False)
-    assert run(root).fates == []
+    assert run(root).results == []
     assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
     with pytest.raises(InfrastructureError, match="read-only, and 2 of 6 rollouts are missing"):
         run(root, plan_of((0, 1, 2)))

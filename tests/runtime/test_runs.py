@@ -24,18 +24,18 @@ from tests.runtime.grey_renderer import GREY
 SHORT = ("timing.duration_us=1200000", "degradation.kind=surrogate")
 
 
-class Heard:
+class Announced:
     """Remembers what a run announced."""
 
     def __init__(self) -> None:
-        self.fates: list[tuple[str, bool]] = []
+        self.results: list[tuple[str, bool]] = []
         self.notices: list[str] = []
 
     def started(self, plan: RunPlan, root: Path, threads: Threads) -> None:
         self.threads = threads
 
     def rollout_done(self, manifest: dict, reused: bool) -> None:
-        self.fates.append((manifest["status"], reused))
+        self.results.append((manifest["status"], reused))
 
     def noticed(self, text: str) -> None:
         self.notices.append(text)
@@ -52,9 +52,9 @@ def cheap_plan(seeds: tuple[int, ...] = (0,)) -> RunPlan:
     return make_plan(refs, (GREY,), ("constant-velocity", "pure-pursuit"), seeds, RunOptions())
 
 
-def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Heard]:
-    heard = Heard()
-    return execute_run(plan, root, workers, ["simrun"], heard, resume, certificate="none", report=False), heard
+def run(plan: RunPlan, root: Path, workers: int = 1, resume: bool = False) -> tuple[RunResult, Announced]:
+    announced = Announced()
+    return execute_run(plan, root, workers, ["simrun"], announced, resume, certificate="none", report=False), announced
 
 
 def comparable(root: Path) -> dict[str, object]:
@@ -71,7 +71,7 @@ def comparable(root: Path) -> dict[str, object]:
 def test_one_and_two_workers_give_the_same_run(tmp_path: Path, scenes: tuple[str, ...]) -> None:
     _, one = run(plan_of(scenes=scenes), tmp_path / "one", workers=1)
     _, two = run(plan_of(scenes=scenes), tmp_path / "two", workers=2)
-    assert one.fates.count(("ok", False)) == two.fates.count(("ok", False)) == 2 * len(scenes)
+    assert one.results.count(("ok", False)) == two.results.count(("ok", False)) == 2 * len(scenes)
     assert comparable(tmp_path / "one") == comparable(tmp_path / "two")
 
 
@@ -81,8 +81,8 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
     before = comparable(tmp_path)
     lost = tmp_path / plan.cells[1].folder / MANIFEST
     lost.unlink()  # as after a kill: the log is there, the completion marker is not
-    _, heard = run(plan, tmp_path)
-    assert sorted(heard.fates) == [("ok", False), ("ok", True), ("ok", True), ("ok", True)]
+    _, announced = run(plan, tmp_path)
+    assert sorted(announced.results) == [("ok", False), ("ok", True), ("ok", True), ("ok", True)]
     assert comparable(tmp_path) == before
 
 
@@ -92,10 +92,10 @@ def test_rollouts_driven_without_the_video_that_is_asked_for_are_driven_again(tm
         return make_plan(refs, (GREY,), ("log-replay",), (0,), RunOptions(video=video))  # type: ignore[arg-type]
 
     run(plan("none"), tmp_path)
-    assert run(plan("all"), tmp_path, resume=True)[1].fates == [("ok", False)]
+    assert run(plan("all"), tmp_path, resume=True)[1].results == [("ok", False)]
     assert len(list(tmp_path.rglob("front.mp4"))) == 1
-    assert run(plan("all"), tmp_path)[1].fates == [("ok", True)]
-    assert run(plan("failures"), tmp_path, resume=True)[1].fates == [("ok", True)]  # no event: nothing is asked for
+    assert run(plan("all"), tmp_path)[1].results == [("ok", True)]
+    assert run(plan("failures"), tmp_path, resume=True)[1].results == [("ok", True)]  # no event: nothing is asked for
 
 
 def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> None:
@@ -103,8 +103,8 @@ def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path: Path) -> 
     with pytest.raises(InputError, match="it holds another run") as caught:
         run(cheap_plan((0, 1)), tmp_path)
     assert "--resume" in caught.value.do_this
-    result, heard = run(cheap_plan((0, 1)), tmp_path, resume=True)
-    assert heard.fates.count(("ok", True)) == 4
+    result, announced = run(cheap_plan((0, 1)), tmp_path, resume=True)
+    assert announced.results.count(("ok", True)) == 4
     assert result.n_rollouts == 8
 
 
@@ -117,18 +117,18 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
     rows = pq.read_table(tmp_path / "rollouts.parquet").to_pylist()
     assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
     assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)
-    _, heard = run(plan, tmp_path)
-    assert sorted(heard.fates) == [("failed", True), ("failed", True), ("ok", True), ("ok", True)]
-    heard = Heard()
-    execute_run(plan, tmp_path, 1, ["simrun"], heard, certificate="none", report=False, retry=True)
-    assert sorted(heard.fates) == [("failed", False), ("failed", False), ("ok", True), ("ok", True)]
+    _, announced = run(plan, tmp_path)
+    assert sorted(announced.results) == [("failed", True), ("failed", True), ("ok", True), ("ok", True)]
+    announced = Announced()
+    execute_run(plan, tmp_path, 1, ["simrun"], announced, certificate="none", report=False, retry=True)
+    assert sorted(announced.results) == [("failed", False), ("failed", False), ("ok", True), ("ok", True)]
 
 
 def test_a_policy_without_its_file_is_tried_again(tmp_path: Path) -> None:
     plan = make_plan(expand("smoke/straight", SHORT), (GREY,), ("tests.runtime.broken_policies:MissesItsWeights",), (0,), RunOptions())
     result, _ = run(plan, tmp_path)
     assert result.summary["failures"]["cells"][0]["error"]["failure_class"] == "policy"
-    assert run(plan, tmp_path)[1].fates == [("failed", False)]  # the file may be there now
+    assert run(plan, tmp_path)[1].results == [("failed", False)]  # the file may be there now
 
 
 @pytest.mark.slow

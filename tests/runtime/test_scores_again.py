@@ -14,7 +14,7 @@ from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.store import read_json
 from scenarios.suite import expand
-from tests.runtime.test_runs import Heard
+from tests.runtime.test_runs import Announced
 
 
 def one_rollout() -> RunPlan:
@@ -23,9 +23,9 @@ def one_rollout() -> RunPlan:
 
 
 def run(of: RunPlan, root: Path) -> list[tuple[str, bool]]:
-    heard = Heard()
-    execute_run(of, root, 1, ["simrun"], heard, certificate="none", report=False)
-    return heard.fates
+    announced = Announced()
+    execute_run(of, root, 1, ["simrun"], announced, certificate="none", report=False)
+    return announced.results
 
 
 def test_rollouts_are_scored_again_when_the_evaluators_changed_and_only_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,43 +16,50 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.executors.assignment import assignment_as_here
-from alpasim_plugin.runtime.executors.base import Resources
+from alpasim_plugin.runtime.executors.assignment import assignment_as_here, identity_of
+from alpasim_plugin.runtime.executors.base import Lost, Resources
 from alpasim_plugin.runtime.executors.choice import Executor
-from alpasim_plugin.runtime.executors.dispatch import dispatch
-from alpasim_plugin.runtime.executors.identity import identity_of
-from alpasim_plugin.runtime.executors.placing import Contents
+from alpasim_plugin.runtime.executors.node_files import Contents
+from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.runtime.workers import Lost
 from tests.runtime.remote_work import Scripted
-from tests.runtime.test_runs import Heard, cheap_plan, comparable
+from tests.runtime.test_runs import Announced, cheap_plan, comparable
 
 pytest.importorskip("submitit", reason="the extra [slurm] is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]  # most of the time goes by while processes start
 
 
+@pytest.fixture(autouse=True)
+def private(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give the folder that sessions lie in."""
+    folder = tmp_path_factory.mktemp("private")
+    folder.chmod(0o700)
+    monkeypatch.setenv("SIMRUN_SLURM", str(folder))
+    return folder
+
+
 def scripted(
     work: Scripted, items: list[str], folder: Path, expected: dict[str, str] | None = None, contents: Contents | None = None
 ) -> dict:
-    from alpasim_plugin.runtime.executors.slurm_pool import SlurmPool
+    from alpasim_plugin.runtime.executors.slurm_backend import SlurmBackend
 
     given = assignment_as_here(work, contents or Contents(), (), Resources(), 2, print)
-    pool: SlurmPool[str] = SlurmPool(given if expected is None else replace(given, expected=expected), "@local", folder)
+    pool: SlurmBackend[str] = SlurmBackend(given if expected is None else replace(given, expected=expected), "@local", folder)
     try:
-        return dict(dispatch(pool, items, print))
+        return dict(run_jobs(pool, items, print))
     finally:
         pool.close()
 
 
-def test_jobs_give_the_run_of_one_process(tmp_path: Path) -> None:
-    heard = Heard()
+def test_jobs_give_the_run_of_one_process(tmp_path: Path, private: Path) -> None:
+    announced = Announced()
     plan = cheap_plan()
-    execute_run(plan, tmp_path / "here", 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(plan, tmp_path / "here", 1, ["simrun"], Announced(), certificate="none", report=False)
     executor = Executor("slurm", "@local")
-    execute_run(plan, tmp_path / "jobs", 2, ["simrun"], heard, certificate="none", report=False, executor=executor)
-    assert heard.fates == [("ok", False)] * 4
+    execute_run(plan, tmp_path / "jobs", 2, ["simrun"], announced, certificate="none", report=False, executor=executor)
+    assert announced.results == [("ok", False)] * 4
     assert comparable(tmp_path / "jobs") == comparable(tmp_path / "here")
-    assert not (tmp_path / "jobs" / ".slurm").exists()
+    assert list(private.iterdir()) == []
 
 
 def test_every_item_has_a_result_though_jobs_die(tmp_path: Path) -> None:
@@ -82,7 +89,7 @@ scripted(Scripted(Path(sys.argv[1])), ["hold", "sleep 300"], Path(sys.argv[2]))
 
 
 def test_a_killed_driver_leaves_results_that_the_next_one_takes_over(
-    tmp_path: Path, repo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, private: Path, repo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (notes := tmp_path / "notes").mkdir()
     driver = subprocess.Popen(
@@ -101,7 +108,7 @@ def test_a_killed_driver_leaves_results_that_the_next_one_takes_over(
     driver.wait()
     assert Path("/proc", str(job)).exists(), "a job of Slurm outlives its driver"
     (notes / "go").touch()
-    until(lambda: list(tmp_path.glob(".slurm/*/*_result.pkl")), "the job that was let go leaves its result")
+    until(lambda: list(private.glob("*/*/*_result.pkl")), "the job that was let go leaves its result")
     found = scripted(Scripted(notes), ["hold", "c"], tmp_path)
     assert found == {"hold": "HOLD", "c": "C"}
     assert len(list(notes.glob("hold.*"))) == 1, "it was done once, by the job of the killed driver"

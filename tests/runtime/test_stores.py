@@ -19,18 +19,18 @@ import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.runtime.executors.parcel import Parcel
+from alpasim_plugin.runtime.executors.result import RolloutResult
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.stores.commits import Commits, Index
 from alpasim_plugin.runtime.stores.objects import FolderObjects, Objects, RemoteObjects, open_objects
 from tests.runtime.s3_server import Line, s3_line
-from tests.runtime.test_runs import Heard, cheap_plan, comparable
+from tests.runtime.test_runs import Announced, cheap_plan, comparable
 
 
-def parcel(text: str) -> Parcel:
+def result(text: str) -> RolloutResult:
     data = text.encode()
     facts = {"bytes": len(data), "mtime_ns": 0, "sha256": hashlib.sha256(data).hexdigest()}
-    return Parcel({"path": "rollouts/a/b/c/0", "status": "ok", "files": {"rollout.asl": facts}}, {"rollout.asl": data})
+    return RolloutResult({"path": "rollouts/a/b/c/0", "status": "ok", "files": {"rollout.asl": facts}}, {"rollout.asl": data})
 
 
 def check_objects(objects: Objects) -> None:
@@ -48,9 +48,9 @@ def check_objects(objects: Objects) -> None:
 def check_commits(objects: Objects) -> None:
     one, other = Commits("one", objects), Commits("other", objects)
     assert one.find("k1") is None
-    assert one.commit("k1", parcel("first")) == parcel("first")
-    assert other.commit("k1", parcel("second")) == parcel("first")
-    assert other.find("k1") == parcel("first")
+    assert one.commit("k1", result("first")) == result("first")
+    assert other.commit("k1", result("second")) == result("first")
+    assert other.find("k1") == result("first")
 
 
 def test_a_key_of_a_folder_is_made_once(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_the_first_commit_stands(tmp_path: Path) -> None:
 
 def test_a_commit_whose_files_are_cut_is_named(tmp_path: Path) -> None:
     commits = Commits("here", FolderObjects(tmp_path))
-    commits.commit("k1", parcel("first"))
+    commits.commit("k1", result("first"))
     next(tmp_path.rglob("rollout.asl")).write_text("fir")
     with pytest.raises(InfrastructureError, match="is not what was committed"):
         commits.find("k1")
@@ -76,7 +76,7 @@ def test_files_of_an_attempt_that_was_cut_off_are_no_rollout(tmp_path: Path) -> 
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Commits("here", Killed(tmp_path)).commit("k1", parcel("first"))
+        Commits("here", Killed(tmp_path)).commit("k1", result("first"))
     assert list(tmp_path.rglob("rollout.asl"))
     assert Commits("here", FolderObjects(tmp_path)).find("k1") is None
 
@@ -115,19 +115,19 @@ def test_the_answer_to_a_commit_that_was_lost_is_no_second_rollout(tmp_path: Pat
             super().create(key, data)
             return False
 
-    own = parcel("first")
+    own = result("first")
     assert Commits("here", Deaf(tmp_path)).commit("k1", own) is own
 
 
 @pytest.mark.slow
 def test_a_run_with_a_store_is_taken_from_it_into_an_empty_folder(tmp_path: Path) -> None:
     plan, store = cheap_plan(), str(tmp_path / "store")
-    first, again = Heard(), Heard()
-    execute_run(plan, tmp_path / "plain", 1, ["simrun"], Heard(), certificate="none", report=False)
+    first, again = Announced(), Announced()
+    execute_run(plan, tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False)
     execute_run(plan, tmp_path / "one", 1, ["simrun"], first, certificate="none", report=False, store=store)
     execute_run(plan, tmp_path / "two", 1, ["simrun"], again, certificate="none", report=False, store=store)
-    assert first.fates == [("ok", False)] * 4
-    assert again.fates == [("ok", True)] * 4
+    assert first.results == [("ok", False)] * 4
+    assert again.results == [("ok", True)] * 4
     assert comparable(tmp_path / "one") == comparable(tmp_path / "two") == comparable(tmp_path / "plain")
     one, two = (pq.read_table(tmp_path / name / "rollouts.parquet") for name in ("one", "two"))
     assert one == two, "wall_s too: it is the same drive"
@@ -140,8 +140,8 @@ import sys
 from pathlib import Path
 from alpasim_plugin.runtime.run import execute_run
 from tests.runtime.s3_server import Line, s3_line
-from tests.runtime.test_runs import Heard, cheap_plan
-execute_run(cheap_plan((0, 1)), Path(sys.argv[1]), 1, ["simrun"], Heard(), certificate="none", report=False, store=sys.argv[2])
+from tests.runtime.test_runs import Announced, cheap_plan
+execute_run(cheap_plan((0, 1)), Path(sys.argv[1]), 1, ["simrun"], Announced(), certificate="none", report=False, store=sys.argv[2])
 """
 
 
@@ -171,10 +171,10 @@ def test_a_killed_driver_goes_on_from_another_folder(tmp_path: Path, repo: Path)
     first.kill()
     first.wait()
     kept = {path.name: path.read_bytes() for path in store.glob("commits/*/*.json")}
-    heard = Heard()
-    execute_run(cheap_plan((0, 1)), tmp_path / "two", 1, ["simrun"], heard, certificate="none", report=False, store=str(store))
+    announced = Announced()
+    execute_run(cheap_plan((0, 1)), tmp_path / "two", 1, ["simrun"], announced, certificate="none", report=False, store=str(store))
     assert all((store / "commits" / name[:2] / name).read_bytes() == data for name, data in kept.items())
-    execute_run(cheap_plan((0, 1)), tmp_path / "plain", 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(cheap_plan((0, 1)), tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False)
     assert comparable(tmp_path / "two") == comparable(tmp_path / "plain")
 
 
@@ -214,7 +214,7 @@ def test_a_store_that_is_away_for_30_s_costs_time_and_nothing_else(tmp_path: Pat
     index = Index(objects)
     index.load()
     assert len(index.keys) == 8
-    execute_run(cheap_plan((0, 1)), tmp_path / "plain", 1, ["simrun"], Heard(), certificate="none", report=False)
+    execute_run(cheap_plan((0, 1)), tmp_path / "plain", 1, ["simrun"], Announced(), certificate="none", report=False)
     assert comparable(tmp_path / "one") == comparable(tmp_path / "plain")
 
 
@@ -229,7 +229,7 @@ def test_a_store_that_stays_away_is_an_error_that_names_it(s3: Line) -> None:
 
 
 def test_a_node_fetches_a_content_once_and_refuses_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from alpasim_plugin.runtime.executors.placing import place
+    from alpasim_plugin.runtime.executors.node_files import place
 
     monkeypatch.setenv("SIMRUN_CACHE", str(tmp_path))
     fetched = []

@@ -42,7 +42,7 @@ from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.plugins.parts import build, resolve
-from alpasim_plugin.runtime.parallel import parallel_map
+from alpasim_plugin.runtime.executors.local import map_jobs
 from alpasim_plugin.runtime.store import read_json
 
 FRAMES = 198  # of a clip at most, as in the paper
@@ -128,7 +128,7 @@ def measure_appearance(run: AppearanceRun, told: Told) -> dict[str, Measured]:
     judges_of(run.judging)
     works = [_Work(run, sequence.folder) for sequence in run.sequences]
     rows: dict[str, Row] = {}
-    for i, (work, row) in enumerate(parallel_map(_finish, works, run.jobs), start=1):
+    for i, (work, row) in enumerate(map_jobs(_finish, works, run.jobs), start=1):
         rows[work.sequence.name] = row
         told(i, len(works), work.sequence.name)
     styles = STYLES[1:]

@@ -19,12 +19,11 @@ from typing import Any
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.runtime.executors.assignment import assignment_as_here
-from alpasim_plugin.runtime.executors.base import Node, Resources
-from alpasim_plugin.runtime.executors.choice import Executor, kept_open, opened_pool
-from alpasim_plugin.runtime.executors.dispatch import Pool, dispatch
-from alpasim_plugin.runtime.executors.parcel import Parcel, unpack
-from alpasim_plugin.runtime.executors.placing import Contents
-from alpasim_plugin.runtime.workers import Lost
+from alpasim_plugin.runtime.executors.base import Backend, Lost, Node, Resources
+from alpasim_plugin.runtime.executors.choice import Executor, kept_open, opened_backend
+from alpasim_plugin.runtime.executors.node_files import Contents
+from alpasim_plugin.runtime.executors.pool import run_jobs
+from alpasim_plugin.runtime.executors.result import RolloutResult, unpack
 
 DOING = "measuring an executor"
 LOG = "rollout.asl"
@@ -65,18 +64,18 @@ class Sleeping:
     seconds: float
     result_bytes: int
 
-    def __call__(self, item: int, node: Node) -> Parcel:
+    def __call__(self, job: int, node: Node) -> RolloutResult:
         """Sleep."""
         time.sleep(self.seconds)
         data = os.urandom(self.result_bytes)
         facts = {"bytes": len(data), "mtime_ns": 0, "sha256": hashlib.sha256(data).hexdigest()}
-        return Parcel({"path": f"rollouts/{item}", "status": "ok", "node": node.name, "files": {LOG: facts}}, {LOG: data})
+        return RolloutResult({"path": f"rollouts/{job}", "status": "ok", "node": node.name, "files": {LOG: facts}}, {LOG: data})
 
-    def key(self, item: int) -> str:
-        """Return the item's number."""
-        return str(item)
+    def key(self, job: int) -> str:
+        """Return the rollout's number."""
+        return str(job)
 
-    def needs(self, item: int) -> list[str]:
+    def needs(self, job: int) -> list[str]:
         """Return nothing: a sleeping rollout has no scene."""
         return []
 
@@ -139,10 +138,10 @@ def _row(executor: Executor, count: int, items: Sequence[int], work: Sleeping, r
     noticed: list[str] = []
     given = assignment_as_here(work, Contents(), (), Resources(), count, noticed.append)
     asked_s = time.perf_counter()
-    with opened_pool(executor, given, root) as pool:
-        _all_ready(pool, count, noticed)
+    with opened_backend(executor, given, root) as backend:
+        _all_ready(backend, count, noticed)
         began_s, began_cpu_s = time.perf_counter(), time.process_time()
-        for item, got in dispatch(pool, items, noticed.append):
+        for item, got in run_jobs(backend, items, noticed.append):
             if isinstance(got, Lost):
                 raise InfrastructureError(DOING, f"rollout {item}", got.found, "look at the nodes, then measure again")
             unpack(got, root)
@@ -151,10 +150,10 @@ def _row(executor: Executor, count: int, items: Sequence[int], work: Sleeping, r
     return ExecutorRow(count, len(items), began_s - asked_s, wall_s, efficiency, cpu_s, 1e3 * cpu_s / len(items))
 
 
-def _all_ready(pool: Pool[Any], count: int, noticed: Sequence[str]) -> None:
+def _all_ready(backend: Backend[Any], count: int, noticed: Sequence[str]) -> None:
     until_s = time.perf_counter() + READY_S
-    while (ready := len(pool.free())) < count:
+    while (ready := len(backend.free(count))) < count:
         if time.perf_counter() > until_s:
             found = "; ".join([f"{ready} were ready after {READY_S:g} s", *noticed])
             raise InfrastructureError(DOING, f"{count} workers", found, "ask for no more workers than the cluster has cores")
-        pool.wait(0.1)
+        backend.wait(0.1)

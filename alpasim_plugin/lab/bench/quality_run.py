@@ -36,7 +36,7 @@ from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
 from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.plugins.parts import build
-from alpasim_plugin.runtime.parallel import parallel_map
+from alpasim_plugin.runtime.executors.local import map_jobs
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.store import read_json
 
@@ -152,7 +152,7 @@ class QualityRun:
 
     def finished(self, works: Sequence[Work]) -> Iterator[tuple[Work, dict[str, Any]]]:
         """Yield every work with its row as it is finished; rows that are up to date come from disk."""
-        yield from parallel_map(finish, works, self.jobs)
+        yield from map_jobs(finish, works, self.jobs)
 
     def measure(self, baseline: str, told: Told) -> tuple[dict[str, Any], list[Work]]:
         """Measure what is not measured yet and return the summary over all, and the works that it is about.

@@ -13,7 +13,7 @@ from alpasim_plugin.io.reading import parsing, read_json_object
 from alpasim_plugin.lab.bench.arm_choice import Choice, Score, choose, take, write_card
 from alpasim_plugin.lab.training.arms.plan import INITIAL, Plan, Training, comparison, training_names
 from alpasim_plugin.lab.training.arms.run import ArmsRun, train
-from alpasim_plugin.runtime.dependent import Say
+from alpasim_plugin.runtime.executors.local import Send
 
 SWEEP = "sweep"
 DOING = "training the arms"
@@ -135,14 +135,14 @@ def choice_name(arm: str) -> str:
     return f"{SWEEP}/{arm}"
 
 
-def work(task: StageTask | ChoiceTask, say: Say) -> None:
+def work(task: StageTask | ChoiceTask, send: Send) -> None:
     """Do one task; what is done already is left as it is.
 
     Raises:
         InputError: A folder that was begun with other options.
     """
     if isinstance(task, ChoiceTask):
-        say(_choose(task))
+        send(_choose(task))
         return
     folder, rate, choice = task.run.out / task.name, task.peak_lr, None
     record = _record(task.run, task.training.name)
@@ -154,12 +154,12 @@ def work(task: StageTask | ChoiceTask, say: Say) -> None:
         raise InputError(DOING, str(folder), found, "give the same --sweep, or another folder")
 
     def report(step: int, numbers: Mapping[str, float]) -> None:
-        say(Updated(step, numbers["loss"], numbers["s"]))
+        send(Updated(step, numbers["loss"], numbers["s"]))
 
     path = train(task.run, task.training, task.name, rate, task.steps, report)
     if choice is not None:
         write_card(folder, folder, choice)
-    say(Trained(path))
+    send(Trained(path))
 
 
 def _choose(task: ChoiceTask) -> Choice:

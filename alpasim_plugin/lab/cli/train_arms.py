@@ -33,7 +33,7 @@ from alpasim_plugin.lab.training.recipes.registry import with_perceptual_weight
 from alpasim_plugin.lab.training.trainer import Schedule
 from alpasim_plugin.lab.video_metrics.image_distance import distance_for_training
 from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.runtime.dependent import run_dependent
+from alpasim_plugin.runtime.executors.local import run_dependent
 
 EVERY_S = 20.0  # between lines of progress
 SHORT_S = 120.0  # a time left that is given in seconds

@@ -22,7 +22,7 @@ from alpasim_plugin.lab.training.scenes import SPLITS
 from alpasim_plugin.renderers.cache import cache_root
 from alpasim_plugin.renderers.reconstruction import KIND, ensure
 from alpasim_plugin.renderers.reconstruction_key import recipe_of, reconstruction_key
-from alpasim_plugin.runtime.parallel import parallel_map
+from alpasim_plugin.runtime.executors.local import map_jobs
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef, expand
 
@@ -48,7 +48,7 @@ def reconstructions(
     del debug
     refs = [ref for item in scenarios for ref in expand(item, overrides or ())]
     console, rows = Console(stderr=True), []
-    for number, (ref, row) in enumerate(parallel_map(_Fitted(again), refs, jobs), start=1):
+    for number, (ref, row) in enumerate(map_jobs(_Fitted(again), refs, jobs), start=1):
         rows.append({"path": ref.path, **row})
         console.print(f"[{number}/{len(refs)}] {row['scene_id']}: {row['what']}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
@@ -94,7 +94,7 @@ def pairs(
     console, began = Console(stderr=True), time.perf_counter()
     maker = _Maker(out, PairRecipe(source=source, max_offset_m=max_offset_m), seed)
     rows = []
-    for number, (scene, made) in enumerate(parallel_map(maker, work, jobs), start=1):
+    for number, (scene, made) in enumerate(map_jobs(maker, work, jobs), start=1):
         rows.append({"split": scene.split, "sequence": scene.path.stem, "folder": str(maker.folder(scene)), "made": made})
         note = "" if made else " (exists)"
         line = f"[{number}/{len(work)}] {scene.split}/{scene.path.stem}{note}, {time.perf_counter() - began:.0f} s"

@@ -17,7 +17,7 @@ from alpasim_plugin.lab.cli.training_options import AsJson, Debug
 from alpasim_plugin.lab.training.photograph_pairs import PhotographRecipe, make_photograph_pairs
 from alpasim_plugin.lab.training.transfer_pairs import make_transfer_sequence
 from alpasim_plugin.lab.training.transfer_scenes import SPLITS, Split, TransferScene, check_frozen, transfer_scene
-from alpasim_plugin.runtime.parallel import parallel_map
+from alpasim_plugin.runtime.executors.local import map_jobs
 
 PHOTOGRAPHS_EPILOG = "Example: `simrun train photographs photos/ --out data/photographs`"
 TRANSFER_EPILOG = "Example: `simrun train transfer --out data/transfer --jobs 2`"
@@ -40,7 +40,7 @@ def transfer(
     work = [transfer_scene(name, i) for name in splits_of(split) for i in range(min(count or SPLITS[name].count, SPLITS[name].count))]
     console, began, rows = Console(stderr=True), time.perf_counter(), []
     maker = _Maker(out)
-    for number, (scene, made) in enumerate(parallel_map(maker, work, jobs), start=1):
+    for number, (scene, made) in enumerate(map_jobs(maker, work, jobs), start=1):
         rows.append({"split": scene.split, "sequence": scene.name, "folder": str(maker.folder(scene)), "made": made})
         note = "" if made else " (exists)"
         line = f"[{number}/{len(work)}] {scene.split}/{scene.name}{note}, {time.perf_counter() - began:.0f} s"

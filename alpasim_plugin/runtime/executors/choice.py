@@ -1,17 +1,16 @@
-"""Which executor a run uses, by the text of ``--executor``, and its pool of workers."""
+"""Which executor a run uses, by the text of ``--executor``, and its workers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.executors.assignment import Assignment
-from alpasim_plugin.runtime.executors.base import Resources
-from alpasim_plugin.runtime.executors.dispatch import Pool
+from alpasim_plugin.runtime.executors.base import Backend, Resources
 
 DOING = "choosing an executor"
 
@@ -74,39 +73,33 @@ def kept_open(executor: Executor) -> Iterator[None]:
     if executor.kind != "ray":
         yield
         return
-    from alpasim_plugin.runtime.executors.ray_pool import connected
+    from alpasim_plugin.runtime.executors.ray_backend import connected
 
     with connected(executor.where or None):
         yield
 
 
 @contextmanager
-def opened_pool(executor: Executor, assignment: Assignment[Any], folder: Path) -> Iterator[Pool[Any]]:
-    """Open the pool of an executor that is not ``local`` for the block; at its end, however it ends, no worker is left.
+def opened_backend(executor: Executor, assignment: Assignment[Any], folder: Path) -> Iterator[Backend[Any]]:
+    """Open the workers of an executor that is not ``local`` for the block; at its end, however it ends, no worker is left.
 
     Args:
         executor: Which.
         assignment: What its workers do.
-        folder: A folder that Slurm's nodes see.
+        folder: The run folder.
 
     Raises:
         InputError: Its library is not installed.
         InfrastructureError: There is no cluster.
     """
-    if executor.kind == "ray":
-        from alpasim_plugin.runtime.executors.ray_pool import RayPool, connected
+    with kept_open(executor):
+        if executor.kind == "ray":
+            from alpasim_plugin.runtime.executors.ray_backend import RayBackend
 
-        with connected(executor.where or None):
-            pool: RayPool[Any] = RayPool(assignment)
-            try:
-                yield pool
-            finally:
-                pool.close()
-        return
-    from alpasim_plugin.runtime.executors.slurm_pool import SlurmPool
+            backend: Backend[Any] = RayBackend(assignment)
+        else:
+            from alpasim_plugin.runtime.executors.slurm_backend import SlurmBackend
 
-    jobs: SlurmPool[Any] = SlurmPool(assignment, executor.where, folder)
-    try:
-        yield jobs
-    finally:
-        jobs.close()
+            backend = SlurmBackend(assignment, executor.where, folder)
+        with closing(backend):
+            yield backend

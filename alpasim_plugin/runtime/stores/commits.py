@@ -13,15 +13,22 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import socket
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.executors.parcel import Parcel
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.parts import digest
+from alpasim_plugin.runtime.cell import run_cell
+from alpasim_plugin.runtime.executors.result import RolloutResult, pack, unpack
+from alpasim_plugin.runtime.plan import Cell, RunOptions
 from alpasim_plugin.runtime.stores.objects import Objects, open_objects
+from scenarios.suite import ScenarioRef
 
 DOING = "reading a rollout from a store"
 PART_KEYS, PART_S = 1000, 60.0  # a part of the index is written after so many keys or seconds
@@ -35,30 +42,30 @@ class Commits:
         self._objects = objects or open_objects(url)
         self.index = Index(self._objects)
 
-    def find(self, key: str) -> Parcel | None:
+    def find(self, key: str) -> RolloutResult | None:
         """Return a committed rollout; None where there is none.
 
         Raises:
             InfrastructureError: A file is missing or not what was committed, or the store does not answer.
         """
         stated = self._objects.read(_name(key))
-        return None if stated is None else self._parcel(key, json.loads(stated))
+        return None if stated is None else self._result(key, json.loads(stated))
 
-    def commit(self, key: str, parcel: Parcel) -> Parcel:
+    def commit(self, key: str, result: RolloutResult) -> RolloutResult:
         """Commit a rollout and return what is committed: this one, or the one that came first."""
-        attempt = f"attempts/{parcel.manifest['path']}/{os.urandom(8).hex()}"
-        for name, data in parcel.files.items():
+        attempt = f"attempts/{result.manifest['path']}/{os.urandom(8).hex()}"
+        for name, data in result.files.items():
             self._objects.write(f"{attempt}/{name}", data)
-        stated = {"attempt": attempt, "files": sorted(parcel.files), "manifest": parcel.manifest}
+        stated = {"attempt": attempt, "files": sorted(result.files), "manifest": result.manifest}
         data = json.dumps(stated, allow_nan=False).encode()
         if self._objects.create(_name(key), data):
-            return parcel
+            return result
         there = self._objects.read(_name(key))
         if there == data:  # the answer to our own commit was lost
-            return parcel
+            return result
         if there is None:
             raise InfrastructureError("committing a rollout", f"{self.url}/{_name(key)}", "it exists, and cannot be read", "try again")
-        return self._parcel(key, json.loads(there))
+        return self._result(key, json.loads(there))
 
     def publish(self, root: Path, names: Sequence[str]) -> None:
         """Copy files of a finished run folder to the store; ``latest`` names them when all are there."""
@@ -67,7 +74,7 @@ class Commits:
             self._objects.write(f"{attempt}/{name}", (root / name).read_bytes())
         self._objects.write("latest", attempt.encode())
 
-    def _parcel(self, key: str, stated: dict[str, Any]) -> Parcel:
+    def _result(self, key: str, stated: dict[str, Any]) -> RolloutResult:
         files = {}
         for name in stated["files"]:
             data = self._objects.read(f"{stated['attempt']}/{name}")
@@ -77,7 +84,7 @@ class Commits:
                 do_this = "remove that commit; the same command then drives the rollout again"
                 raise InfrastructureError(DOING, f"{self.url}/{_name(key)}", found, do_this)
             files[name] = data
-        return Parcel(stated["manifest"], files)
+        return RolloutResult(stated["manifest"], files)
 
 
 def _name(key: str) -> str:
@@ -123,3 +130,76 @@ class Index:
 
 def _part(number: int) -> str:
     return f"index/{number:06d}.json"
+
+
+class KnownCommits:
+    """The driver's view of a store: what it knows to be committed.
+
+    Args:
+        commits: The store.
+        options: Of the run.
+        reuse_undigested: Also reuse rollouts with parts that have no digest.
+    """
+
+    def __init__(self, commits: Commits, options: RunOptions, reuse_undigested: bool) -> None:
+        self.commits, self._options = commits, options
+        self.fresh = "" if reuse_undigested else os.urandom(8).hex()
+        commits.index.load()
+
+    def find(self, cell: Cell) -> RolloutResult | None:
+        """Return a rollout that the index names."""
+        key = commit_key(cell, self._options, self.fresh)
+        return self.commits.find(key) if key in self.commits.index.keys else None
+
+    def add(self, cell: Cell, manifest: Mapping[str, Any]) -> None:
+        """Take in a rollout that a worker has committed."""
+        if manifest["status"] == "ok":
+            self.commits.index.add([commit_key(cell, self._options, self.fresh)])
+
+
+def commit_key(cell: Cell, options: RunOptions, fresh: str = "") -> str:
+    """Return the name of a rollout in a store: a digest of everything that decides its log and its pictures.
+
+    Args:
+        cell: The rollout.
+        options: Of the run.
+        fresh: Makes the key of a rollout with a part that has no digest another one, so that it is driven again; empty: it may be reused.
+    """
+    return digest([cell.rollout_key, options.video, cell.stops_at_path_end, fresh if cell.undigested else ""])
+
+
+def run_stored_cell(
+    cell: Cell,
+    options: RunOptions,
+    root: Path,
+    threads: int,
+    store: str,
+    fresh: str = "",
+    load: Callable[[ScenarioRef], Scenario] | None = None,
+) -> dict[str, Any]:
+    """Take a cell from the store, or run and commit it; return its manifest. Failed rollouts are not committed.
+
+    Args:
+        cell, options, root, threads, load: As for `alpasim_plugin.runtime.cell.run_cell`.
+        store: URL.
+        fresh: As for `commit_key`.
+
+    Raises:
+        InfrastructureError: The store does not answer, or holds a damaged rollout.
+    """
+    commits, key = opened(store), commit_key(cell, options, fresh)
+    known = commits.find(key)
+    if known is not None:
+        return unpack(known, root)
+    manifest = run_cell(cell, options, root, threads, load=load)
+    if manifest["status"] != "ok":
+        return manifest
+    own = pack(root / cell.folder, socket.gethostname())
+    first = commits.commit(key, own)
+    return manifest if first is own else unpack(first, root)
+
+
+@lru_cache(maxsize=4)
+def opened(store: str) -> Commits:
+    """Return the store of a URL, opened once per process."""
+    return Commits(store)

@@ -1,11 +1,20 @@
-"""Put scenes, weights and other files on a node once, by content: whatever path they have on the driver, their SHA-256 is their name.
+"""The files of a node: what it is sent, and the folder in which it drives.
 
+Scenes, weights and other files are put on a node once, by content: whatever path they have on the driver, their SHA-256 is their name.
 $SIMRUN_CACHE/placed/SHA256/NAME on the node; the first worker that needs a content fetches it, the others of the node wait for it.
+Machines may share the file system of the scratch folder: each has a folder of its own in it, since only it can tell which of its
+processes still run.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
+import socket
+import stat
+import tempfile
+import time
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,12 +22,15 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.io.atomic import write_bytes
+from alpasim_plugin.io.atomic import disk_error, write_bytes
 from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.plugins.parts.source import OWN_ROOT
+from alpasim_plugin.process.processes import is_running
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.runtime.executors.base import Node
+from alpasim_plugin.runtime.writing import remove_left_overs
 
+GONE_S = 5.0  # within which a killed process must be gone
 KIND = "placed"
 M = TypeVar("M", bound=BaseModel)
 
@@ -133,3 +145,54 @@ def with_paths(settings: M, moved: dict[str, str]) -> M:
             continue
         changed[name] = new
     return settings.model_copy(update=changed)
+
+
+def scratch_root() -> Path:
+    """Return where this node drives: a folder of the user and machine below ``$SIMRUN_SCRATCH``, or the system's temporary one."""
+    return Path(os.environ.get("SIMRUN_SCRATCH") or tempfile.gettempdir(), f"simrun-{os.getuid()}-{socket.gethostname()}")
+
+
+def measured_folder(run: str) -> Path | None:
+    """Return where the processes of a run on this node share what they measure (`alpasim_plugin.io.measured`).
+
+    None: nowhere, since `scratch_root` cannot be made, belongs to another user, or others may write there. Its name can be guessed, so
+    whoever was there first could decide what this run takes for its machine's speed.
+    """
+    root = scratch_root()
+    try:
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        state = root.lstat()
+    except OSError:
+        return None
+    is_private = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o022
+    return root / "measured" / run if is_private else None
+
+
+def sweep(pids: Sequence[int] = ()) -> None:
+    """Remove what killed workers have left on this node, once these processes are gone.
+
+    Only names that simrun gives are touched, and only those of processes that run no more.
+    """
+    until_s = time.monotonic() + GONE_S
+    while any(is_running(pid) for pid in pids) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    if scratch_root().is_dir():
+        remove_left_overs(scratch_root())
+
+
+def private_folder(path: Path, doing: str) -> Path:
+    """Make a folder that only this user can read and write, and return it: what is unpickled may lie in such a folder alone.
+
+    Raises:
+        InfrastructureError: It cannot be made, is a link, or another user could write it.
+    """
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        state = path.lstat()
+    except OSError as error:
+        raise disk_error(path, error, doing) from error
+    owned = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid()
+    if not owned or state.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        found = f"mode {stat.S_IMODE(state.st_mode):o} of user {state.st_uid}" if owned else f"a link, or of user {state.st_uid}"
+        raise InfrastructureError(doing, str(path), f"not private to this user ({found})", "remove it, or name another folder")
+    return path

@@ -8,19 +8,19 @@ import pickle
 import signal
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.runtime.executors.assignment import Assignment
-from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
-from alpasim_plugin.runtime.executors.scratch import sweep
-from alpasim_plugin.runtime.executors.serving import Serving
+from alpasim_plugin.runtime.executors.base import Backend, Died, Done, Event, Place, Rules
+from alpasim_plugin.runtime.executors.node import Serving
+from alpasim_plugin.runtime.executors.node_files import sweep
 
-A = TypeVar("A")
+J = TypeVar("J")
 
 DOING = "working on a Ray cluster"
 LOOK_S = 1.0  # between looks at the nodes
@@ -40,7 +40,7 @@ class _Worker:
     actor: Any
     node: str
     begun: Any  # answered when its process runs
-    ref: Any  # what it is asked: to accept the work, or to do items; None: idle
+    ref: Any  # what it is asked: to accept the work, or to do jobs; None: idle
     since_s: float  # when it was asked for, then when its process was seen to run
     has_begun: bool = False
     pid: int = 0
@@ -102,17 +102,17 @@ def _signals_as_raised() -> Iterator[None]:
         raise error.__cause__ from None
 
 
-class RayPool(Generic[A]):
-    """Workers on a Ray cluster; see `alpasim_plugin.runtime.executors.dispatch.Pool`.
+class RayBackend(Backend[J]):
+    """Workers on a Ray cluster; see `alpasim_plugin.runtime.executors.base.Backend`.
 
     Args:
         assignment: What the workers do.
         start_s: Seconds for a worker to start, and again for it to be ready. A node that fails this without another worker is set aside.
     """
 
-    chunk_s = 1.0
+    rules = Rules(chunk_s=1.0)
 
-    def __init__(self, assignment: Assignment[A], start_s: float = START_S) -> None:
+    def __init__(self, assignment: Assignment[J], start_s: float = START_S) -> None:
         import ray
 
         self._ray, self._given, self._start_s = ray, assignment, start_s
@@ -122,7 +122,7 @@ class RayPool(Generic[A]):
         self._next = 0
         self._events: list[Event] = []
         self._refused: dict[str, str] = {}  # node -> why
-        self._remedy = SAME_VERSIONS  # against the last refusal
+        self._do_this = SAME_VERSIONS  # against the last refusal
         self._pings: dict[str, tuple[Any, float]] = {}  # node -> a process there that needs no core, when it was asked for
         self._accepted: set[str] = set()
         self._failed: dict[str, tuple[int, float]] = {}  # node -> failed starts, time of the last
@@ -132,11 +132,7 @@ class RayPool(Generic[A]):
         self._looked_s = -LOOK_S
         self._alive_s = time.monotonic()
 
-    def inherited(self, items: Sequence[A]) -> Iterable[tuple[int, Any]]:
-        """Yield nothing: actors end with their driver."""
-        return ()
-
-    def free(self) -> list[Place]:
+    def free(self, wanted: int) -> list[Place]:
         """Start workers where there is room and return those without work.
 
         Raises:
@@ -146,12 +142,12 @@ class RayPool(Generic[A]):
             self._look()
         return [Place(number, one.node) for number, one in self._workers.items() if one.ready and one.ref is None]
 
-    def start(self, worker: int, items: Sequence[A]) -> None:
-        """Hand items to a free worker."""
-        needed = dict.fromkeys(sha256 for item in items for sha256 in self._given.work.needs(item))
+    def start(self, worker: int, jobs: Sequence[J]) -> None:
+        """Hand jobs to a free worker."""
+        needed = dict.fromkeys(sha256 for job in jobs for sha256 in self._given.work.needs(job))
         refs = {sha256: self._reference(sha256) for sha256 in needed}
         one = self._workers[worker]
-        one.ref = one.actor.do.remote(pickle.dumps(list(items)), refs)
+        one.ref = one.actor.do.remote(pickle.dumps(list(jobs)), refs)
 
     def wait(self, timeout_s: float) -> list[Event]:
         """Wait until workers answer or end."""
@@ -163,7 +159,7 @@ class RayPool(Generic[A]):
                 self._ray.wait(list(asked), num_returns=1, timeout=timeout_s)
         if asked:
             for ref in self._ray.wait(list(asked), num_returns=len(asked), timeout=0)[0]:
-                self._hear(asked[ref])
+                self._receive(asked[ref])
         events, self._events = self._events, []
         return events
 
@@ -182,11 +178,11 @@ class RayPool(Generic[A]):
         """Use a node no more."""
         self._refuse(node, why, LOOK_THERE)
 
-    def _refuse(self, node: str, why: str, remedy: str) -> None:
+    def _refuse(self, node: str, why: str, do_this: str) -> None:
         if node in self._refused:
             return
-        self._refused[node], self._remedy = why, remedy
-        self._given.noticed(f"node {node} is set aside: {why}")
+        self._refused[node], self._do_this = why, do_this
+        self._given.notify(f"node {node} is set aside: {why}")
         for number in [n for n, one in self._workers.items() if one.node == node]:
             if self._workers[number].ready and self._workers[number].ref is not None:
                 self._events.append(Died(number, node, "its node was set aside", of_node=True))
@@ -229,12 +225,12 @@ class RayPool(Generic[A]):
             self._alive_s = now
         if alive and not room:
             found = "; ".join(f"{name}: {why}" for name, why in self._refused.items())
-            raise InfrastructureError(DOING, "all of its nodes", f"no node takes the work: {found}", self._remedy)
+            raise InfrastructureError(DOING, "all of its nodes", f"no node takes the work: {found}", self._do_this)
         if (room and not any(room.values())) or now - self._alive_s > BARREN_S:
             found = "no node has that much" if room else f"no node for {BARREN_S:g} s"
             raise InfrastructureError(DOING, str(self._given.resources), found, "ask for less (--cores, --gpus, --memory), or add nodes")
         on = {name: sum(one.node == name for one in self._workers.values()) for name in room}
-        while len(self._workers) < self._given.most:
+        while len(self._workers) < self._given.workers:
             open_ = [name for name in room if on[name] < room[name] and not self._rests(name, now)]
             if not open_:
                 return
@@ -267,7 +263,7 @@ class RayPool(Generic[A]):
         if node not in self._pings:
             options = {"num_cpus": 0, "max_retries": 0, "scheduling_strategy": self._on(node)}
             self._pings[node] = self._ray.remote(_ping).options(**options).remote(), now_s
-            self._given.noticed(f"node {node} has started no worker for {self._start_s:g} s; others may hold its cores")
+            self._given.notify(f"node {node} has started no worker for {self._start_s:g} s; others may hold its cores")
             return True
         ping, asked_s = self._pings[node]
         if not self._ray.wait([ping], timeout=0)[0]:
@@ -302,7 +298,7 @@ class RayPool(Generic[A]):
         self._workers[self._next] = _Worker(actor, node, actor.begun.remote(), actor.accept.remote(self._blob), time.monotonic())
         self._next += 1
 
-    def _hear(self, number: int) -> None:
+    def _receive(self, number: int) -> None:
         """Take what a worker answers."""
         one = self._workers[number]
         errors = self._ray.exceptions

@@ -1,4 +1,4 @@
-"""What a node does for a run: it drives cells in a folder of its own and gives back parcels."""
+"""What a node does for a run: it drives cells in a folder of its own and gives back results."""
 
 from __future__ import annotations
 
@@ -19,18 +19,26 @@ from alpasim_plugin.renderers.reconstruction import KIND as MODELS
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runtime.cell import failed_manifest, run_cell
 from alpasim_plugin.runtime.executors.base import Faulty, Node
-from alpasim_plugin.runtime.executors.parcel import Parcel, pack
-from alpasim_plugin.runtime.executors.placing import Contents, is_here, paths_in, place, placed_path, with_paths
-from alpasim_plugin.runtime.executors.scratch import measured_folder, scratch_root
+from alpasim_plugin.runtime.executors.node_files import (
+    Contents,
+    is_here,
+    measured_folder,
+    paths_in,
+    place,
+    placed_path,
+    scratch_root,
+    with_paths,
+)
+from alpasim_plugin.runtime.executors.result import RolloutResult, pack
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
-from alpasim_plugin.runtime.stores.stored import commit_key, run_stored_cell
+from alpasim_plugin.runtime.stores.commits import commit_key, run_stored_cell
 from scenarios.suite import ScenarioRef
 
 HELD_SCENES = 4  # by each worker
 
 
 @dataclass(frozen=True)
-class Mission:
+class RolloutWork:
     """Drive cells of a run; pickled once per worker.
 
     Attributes:
@@ -41,7 +49,7 @@ class Mission:
         backgrounds: Scene -> its background file (path on the driver -> SHA-256).
         models: Scene -> files of its reconstruction (name -> SHA-256), where the driver has it; otherwise each node fits its own.
         store: URL of a store in which rollouts are looked up and committed.
-        fresh: As for `alpasim_plugin.runtime.stores.stored.commit_key`.
+        fresh: As for `alpasim_plugin.runtime.stores.commits.commit_key`.
     """
 
     run: str
@@ -53,7 +61,7 @@ class Mission:
     store: str | None = None
     fresh: str = ""
 
-    def __call__(self, item: Cell, node: Node) -> Parcel | Faulty[Parcel]:
+    def __call__(self, item: Cell, node: Node) -> RolloutResult | Faulty[RolloutResult]:
         """Drive one cell; what says more of the node than of the rollout comes back as `Faulty`."""
         cell = item
         share_measurements(measured_folder(self.run))
@@ -61,14 +69,14 @@ class Mission:
             with scratch_folder(scratch_root() / "rollout", "driving on a node") as scratch:
                 here = self._placed(cell, node)
                 self._drive(here, scratch, node)
-                parcel = pack(scratch / cell.folder, node.name)
+                result = pack(scratch / cell.folder, node.name)
         except InfrastructureError as error:
             return self._faulty(cell, node, error)
         except OSError as error:
             return self._faulty(cell, node, disk_error(scratch_root(), error))
-        if parcel.manifest["status"] != "ok" and parcel.manifest["error"]["failure_class"] == InfrastructureError.failure_class:
-            return Faulty(parcel, parcel.manifest["error"]["found"])
-        return parcel
+        if result.manifest["status"] != "ok" and result.manifest["error"]["failure_class"] == InfrastructureError.failure_class:
+            return Faulty(result, result.manifest["error"]["found"])
+        return result
 
     def _drive(self, cell: Cell, scratch: Path, node: Node) -> None:
         def load(ref: ScenarioRef) -> Scenario:
@@ -89,9 +97,9 @@ class Mission:
         files = [sha256 for part in parts if part is not None for sha256 in part.files.values()]
         return [self.scenes[cell.scene], *self.models.get(cell.scene, {}).values(), *self.backgrounds.get(cell.scene, {}).values(), *files]
 
-    def _faulty(self, cell: Cell, node: Node, error: SimrunError) -> Faulty[Parcel]:
+    def _faulty(self, cell: Cell, node: Node, error: SimrunError) -> Faulty[RolloutResult]:
         manifest = failed_manifest(cell, error) | {"node": node.name, "files": {}}
-        return Faulty(Parcel(manifest, {}), error.found)
+        return Faulty(RolloutResult(manifest, {}), error.found)
 
     def _scenario(self, scene: str, node: Node) -> Scenario:
         """Return a scene, whose background file is one of this node."""
@@ -157,7 +165,9 @@ def place_model(scenario: Scenario, files: Mapping[str, str], node: Node) -> Non
     cached(MODELS, key, make, lambda folder: folder, f"reconstruction of {scenario.scene_id} for {node.name}")
 
 
-def mission_of(plan: RunPlan, run: str, cells: Sequence[Cell], threads: int, store: str | None, fresh: str) -> tuple[Mission, Contents]:
+def rollout_work(
+    plan: RunPlan, run: str, cells: Sequence[Cell], threads: int, store: str | None, fresh: str
+) -> tuple[RolloutWork, Contents]:
     """Return what the nodes need to drive cells of a plan, and the contents that they will ask for.
 
     Raises:
@@ -180,4 +190,4 @@ def mission_of(plan: RunPlan, run: str, cells: Sequence[Cell], threads: int, sto
     for part in plan.parts:
         for file in part.files:
             contents.add_file(Path(file))
-    return Mission(run, plan.options, threads, scenes, backgrounds, models, store, fresh), contents
+    return RolloutWork(run, plan.options, threads, scenes, backgrounds, models, store, fresh), contents

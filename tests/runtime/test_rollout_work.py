@@ -7,10 +7,10 @@ from pathlib import Path
 
 from alpasim_plugin.io import measured
 from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.runtime.executors.mission import mission_of
-from alpasim_plugin.runtime.executors.parcel import Parcel
-from alpasim_plugin.runtime.executors.scratch import measured_folder
-from alpasim_plugin.runtime.fixer_table import chosen
+from alpasim_plugin.runtime.executors.job import rollout_work
+from alpasim_plugin.runtime.executors.node_files import measured_folder
+from alpasim_plugin.runtime.executors.result import RolloutResult
+from alpasim_plugin.runtime.provenance import chosen
 from tests.runtime.test_decide import plan_of
 
 
@@ -19,10 +19,10 @@ def test_workers_of_a_run_on_a_node_share_their_measurements(tmp_path: Path, mon
     plan = plan_of(scenes=1)
     try:
         for run in ("first", "second"):
-            mission, contents = mission_of(plan, run, plan.cells[:1], 1, None, "")
-            parcel = pickle.loads(pickle.dumps(mission))(plan.cells[0], Node("n1", contents.read))
-            assert isinstance(parcel, Parcel)
-            assert (parcel.manifest["status"], parcel.manifest["node"]) == ("ok", "n1")
+            work, contents = rollout_work(plan, run, plan.cells[:1], 1, None, "")
+            result = pickle.loads(pickle.dumps(work))(plan.cells[0], Node("n1", contents.read))
+            assert isinstance(result, RolloutResult)
+            assert (result.manifest["status"], result.manifest["node"]) == ("ok", "n1")
             folder = measured_folder(run)
             assert folder is not None
             assert measured._folder == folder

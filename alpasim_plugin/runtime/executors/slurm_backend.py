@@ -1,13 +1,16 @@
-"""Jobs of Slurm through submitit: each job is one chunk of items, and answers through a folder that all nodes see.
+"""Jobs of Slurm through submitit: each is one chunk of the pool's jobs, and answers through a folder that all nodes see.
 
-RUN/.slurm/SESSION/jobs          one line per job: its number, and for a local one when its process started
-                  /placed/SHA    contents, by their SHA-256
-                  /N_*.pkl, .out what submitit writes; gone as soon as a result was taken
+$SIMRUN_SLURM/RUN/SESSION/jobs          one line per job: its number, and for a local one when its process started
+                         /placed/SHA    contents, by their SHA-256
+                         /N_*.pkl, .out what submitit writes; gone as soon as a result was taken
+RUN is a digest of the run folder's path. Work and results are pickles, which run code when they are read, so they lie outside of the run
+folder, which may come from anybody, in a folder that only this user can read and write.
 A driver that was killed leaves its session. The next one takes over the results that lie there and cancels what still runs.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
 import shutil
@@ -16,7 +19,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.lazy import require_library
@@ -24,14 +27,12 @@ from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.process.processes import is_running, started_of
 from alpasim_plugin.process.subprocesses import safe_path
 from alpasim_plugin.runtime.executors.assignment import Assignment
-from alpasim_plugin.runtime.executors.base import Faulty
-from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place
-from alpasim_plugin.runtime.executors.scratch import sweep
-from alpasim_plugin.runtime.executors.serving import JobAnswer, serve_job
+from alpasim_plugin.runtime.executors.base import Backend, Died, Done, Event, Faulty, Place, Rules
+from alpasim_plugin.runtime.executors.node import JobAnswer, serve_job
+from alpasim_plugin.runtime.executors.node_files import private_folder, sweep
 
-A = TypeVar("A")
+J = TypeVar("J")
 
-FOLDER = ".slurm"
 DOING = "working in jobs of Slurm"
 LOCAL = "@local"  # instead of a partition: submitit's local executor, to try everything but Slurm itself
 JOB_MIN = 240  # time limit of a job, minutes
@@ -41,28 +42,28 @@ MOST_REFUSALS = 3  # of nodes, while none was accepted
 MOST_JOBS = 256  # at a time
 
 
-class SlurmPool(Generic[A]):
-    """Jobs as workers; see `alpasim_plugin.runtime.executors.dispatch.Pool`. A worker is a slot for a job.
+class SlurmBackend(Backend[J]):
+    """Jobs as workers; see `alpasim_plugin.runtime.executors.base.Backend`. A worker is a slot for a job.
 
     Args:
         assignment: What the jobs do.
         partition: Of Slurm; empty: its default. ``@local``: processes of this machine.
-        folder: A folder that all nodes see.
+        folder: The run folder.
 
     Raises:
         InputError: submitit is not installed.
-        InfrastructureError: There is no Slurm.
+        InfrastructureError: There is no Slurm, or no private folder (`sessions_folder`).
     """
 
-    chunk_s = 600.0
+    rules = Rules(chunk_s=600.0)
 
-    def __init__(self, assignment: Assignment[A], partition: str, folder: Path) -> None:
+    def __init__(self, assignment: Assignment[J], partition: str, folder: Path) -> None:
         submitit = require_library("submitit", "choosing an executor", "--executor slurm", "pip install 'alpasim-onefixer[slurm]'")
         self._given = assignment
         self._is_local = partition == LOCAL
-        self._inherited = _take_over(folder / FOLDER, assignment.noticed)
-        self._session = folder / FOLDER / f"{os.getpid()}.{os.urandom(4).hex()}"
-        self._session.mkdir(parents=True)
+        sessions = sessions_folder(folder)
+        self._inherited = _take_over(sessions, assignment.notify)
+        self._session = private_folder(sessions / f"{os.getpid()}.{os.urandom(4).hex()}", DOING)
         self._blob = self._placed(assignment.contents.add_bytes(pickle.dumps(assignment.work)))
         try:
             self._executor = submitit.AutoExecutor(folder=str(self._session), cluster="local" if self._is_local else "slurm")
@@ -72,40 +73,40 @@ class SlurmPool(Generic[A]):
         self._executor.update_parameters(**self._parameters("" if self._is_local else partition))
         self._jobs: dict[int, Any] = {}  # slot -> job
         self._ended_s: dict[int, float] = {}  # slot -> when its job was first seen to have ended without a result
-        self._slots = range(min(assignment.most, MOST_JOBS))
+        self._slots = range(min(assignment.workers, MOST_JOBS))
         self._accepted: set[str] = set()
         self._refused: dict[str, str] = {}
 
-    def inherited(self, items: Sequence[A]) -> Iterator[tuple[int, Any]]:
-        """Yield index and result of items that an earlier driver's jobs have done."""
-        for index, item in enumerate(items):
-            key = self._given.work.key(item)
+    def inherited(self, jobs: Sequence[J]) -> Iterator[tuple[int, Any]]:
+        """Yield index and result of jobs that an earlier driver's jobs have done."""
+        for index, job in enumerate(jobs):
+            key = self._given.work.key(job)
             if key in self._inherited:
                 yield index, self._inherited.pop(key)
 
-    def free(self) -> list[Place]:
+    def free(self, wanted: int) -> list[Place]:
         """Return slots without a job. Nobody knows on which node Slurm will put the next one."""
         return [Place(slot, "") for slot in self._slots if slot not in self._jobs]
 
-    def start(self, worker: int, items: Sequence[A]) -> None:
+    def start(self, worker: int, jobs: Sequence[J]) -> None:
         """Submit a job."""
-        for sha256 in dict.fromkeys(one for item in items for one in self._given.work.needs(item)):
+        for sha256 in dict.fromkeys(one for job in jobs for one in self._given.work.needs(job)):
             self._placed(sha256)
-        keys = [self._given.work.key(item) for item in items]
+        keys = [self._given.work.key(one) for one in jobs]
         with safe_path():
-            job = self._executor.submit(
+            submitted = self._executor.submit(
                 serve_job,
                 str(self._session),
                 self._blob.name,
-                pickle.dumps(list(items)),
+                pickle.dumps(list(jobs)),
                 keys,
                 dict(self._given.expected),
                 self._given.targets,
                 self._given.resources.cores,
             )
-        self._jobs[worker] = job
+        self._jobs[worker] = submitted
         with (self._session / "jobs").open("a") as file:
-            file.write(f"{job.job_id} {started_of(int(job.job_id)) if self._is_local else ''}\n")
+            file.write(f"{submitted.job_id} {started_of(int(submitted.job_id)) if self._is_local else ''}\n")
 
     def wait(self, timeout_s: float) -> list[Event]:
         """Wait until jobs answer or end."""
@@ -131,7 +132,7 @@ class SlurmPool(Generic[A]):
         if node in self._refused:
             return
         self._refused[node] = why
-        self._given.noticed(f"node {node} is set aside: {why}")
+        self._given.notify(f"node {node} is set aside: {why}")
         if not self._is_local:
             self._executor.update_parameters(slurm_exclude=",".join(sorted(self._refused)))
         if not self._accepted - self._refused.keys() and (self._is_local or len(self._refused) >= MOST_REFUSALS):
@@ -174,7 +175,7 @@ class SlurmPool(Generic[A]):
             if outcome != "success":
                 return Died(slot, "", f"job {job.job_id}: {str(answer).strip().splitlines()[-1]}")
             _forget(job.paths.folder, job.job_id)
-            return self._heard(slot, answer)
+            return self._answered(slot, answer)
         if not job.done():
             return None
         if time.monotonic() - self._ended_s.setdefault(slot, time.monotonic()) < GRACE_S:
@@ -182,12 +183,25 @@ class SlurmPool(Generic[A]):
         del self._jobs[slot], self._ended_s[slot]
         return Died(slot, "", f"job {job.job_id} ended without a result ({job.state})", of_node=job.state == "NODE_FAIL")
 
-    def _heard(self, slot: int, answer: JobAnswer) -> Event:
+    def _answered(self, slot: int, answer: JobAnswer) -> Event:
         if answer.reasons:
             self.set_aside(answer.node, "; ".join(answer.reasons))
             return Died(slot, answer.node, "its node was set aside", of_node=True)
         self._accepted.add(answer.node)
         return Done(slot, answer.node, pickle.loads(answer.answers))
+
+
+def sessions_folder(run: Path) -> Path:
+    """Return the folder of a run's sessions: outside of it, private to this user, and on a file system that all nodes see.
+
+    It is below ``$SIMRUN_SLURM``, or ``simrun/slurm`` of the user's state folder (``$XDG_STATE_HOME``, ``~/.local/state``).
+
+    Raises:
+        InfrastructureError: Another user could write there, or it cannot be made.
+    """
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    base = private_folder(Path(os.environ.get("SIMRUN_SLURM") or Path(state, "simrun", "slurm")), DOING)
+    return private_folder(base / hashlib.sha256(os.fsencode(run.resolve())).hexdigest()[:16], DOING)
 
 
 def _forget(folder: Path, job_id: str) -> None:
@@ -196,7 +210,7 @@ def _forget(folder: Path, job_id: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def _take_over(folder: Path, noticed: Callable[[str], None]) -> dict[str, Any]:
+def _take_over(folder: Path, notify: Callable[[str], None]) -> dict[str, Any]:
     """Return the results that killed drivers' jobs have left, cancel what runs, and remove the sessions. The run folder's lock is held."""
     results: dict[str, Any] = {}
     for session in sorted(folder.iterdir()) if folder.is_dir() else []:
@@ -209,7 +223,7 @@ def _take_over(folder: Path, noticed: Callable[[str], None]) -> dict[str, Any]:
             if outcome == "success" and not answer.reasons:
                 done = zip(answer.keys, pickle.loads(answer.answers), strict=True)
                 results |= {key: got for key, got in done if not isinstance(got, Exception | Faulty)}
-        noticed(f"an earlier run was cut off: {len(results)} of its results are taken over, {len(running)} of its jobs are cancelled")
+        notify(f"an earlier run was cut off: {len(results)} of its results are taken over, {len(running)} of its jobs are cancelled")
         shutil.rmtree(session)
     return results
 

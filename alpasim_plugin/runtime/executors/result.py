@@ -17,7 +17,7 @@ NAMES = (*DRIVEN, *DERIVED)
 
 
 @dataclass(frozen=True)
-class Parcel:
+class RolloutResult:
     """A rollout.
 
     Attributes:
@@ -29,7 +29,7 @@ class Parcel:
     files: Mapping[str, bytes]
 
 
-def pack(folder: Path, node: str) -> Parcel:
+def pack(folder: Path, node: str) -> RolloutResult:
     """Read a rollout's folder, whose manifest was just written.
 
     Raises:
@@ -39,28 +39,28 @@ def pack(folder: Path, node: str) -> Parcel:
     manifest, _ = read_manifest(folder)
     names = list(manifest["files"]) or [OUTPUT_NAME]  # of a failed rollout only what its parts printed
     files = {name: (folder / name).read_bytes() for name in names if (folder / name).exists()}
-    return Parcel({"node": node, **manifest}, files)
+    return RolloutResult({"node": node, **manifest}, files)
 
 
-def unpack(parcel: Parcel, root: Path) -> dict[str, Any]:
+def unpack(result: RolloutResult, root: Path) -> dict[str, Any]:
     """Write a rollout below a run folder, its manifest last, and return the manifest.
 
     Raises:
         InfrastructureError: A file is not what the node wrote, or the disk refuses.
     """
-    folder = root / parcel.manifest["path"]
-    for name, facts in parcel.manifest["files"].items():
-        if hashlib.sha256(parcel.files[name]).hexdigest() != facts["sha256"]:
-            where = f"{parcel.manifest['path']}/{name} from {parcel.manifest['node']}"
+    folder = root / result.manifest["path"]
+    for name, facts in result.manifest["files"].items():
+        if hashlib.sha256(result.files[name]).hexdigest() != facts["sha256"]:
+            where = f"{result.manifest['path']}/{name} from {result.manifest['node']}"
             raise InfrastructureError("receiving a rollout", where, "not the content that the node wrote", "give the same command again")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in (MANIFEST, *NAMES):  # the manifest first: without it nothing is trusted
             (folder / name).unlink(missing_ok=True)
-        for name, data in parcel.files.items():
+        for name, data in result.files.items():
             (folder / name).write_bytes(data)
     except OSError as error:
         raise disk_error(folder, error, "writing a rollout") from error
-    manifest = {name: value for name, value in parcel.manifest.items() if name != "files"}
+    manifest = {name: value for name, value in result.manifest.items() if name != "files"}
     write_manifest(folder, manifest)
     return manifest

@@ -1,4 +1,4 @@
-"""The far side of a pool: a process on a node that says whether it may work, and then answers items.
+"""The far side of a pool: a process on a node that says whether it may work, and then answers with results.
 
 Numerical libraries read the number of their threads when they are imported, so this module imports none.
 """
@@ -16,8 +16,7 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.process.subprocesses import own_path_only
-from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.runtime.workers import THREAD_VARIABLES
+from alpasim_plugin.runtime.executors.base import THREAD_VARIABLES, Node
 
 
 class Serving:
@@ -26,7 +25,7 @@ class Serving:
     Args:
         node: Name of the node.
         threads: Of numerical libraries; set before they are imported.
-        expected: What `alpasim_plugin.runtime.executors.identity.identity_of` says on the driver.
+        expected: What `alpasim_plugin.runtime.executors.assignment.identity_of` says on the driver.
         targets: Modules of parts that are not simrun's.
     """
 
@@ -41,8 +40,8 @@ class Serving:
 
     def accept(self, work: bytes) -> tuple[int, list[str]]:
         """Compare this node with the driver; take the work if nothing differs. Return the process number and what differs."""
-        from alpasim_plugin.runtime.executors.identity import differences, identity_of
-        from alpasim_plugin.runtime.executors.scratch import sweep
+        from alpasim_plugin.runtime.executors.assignment import differences, identity_of
+        from alpasim_plugin.runtime.executors.node_files import sweep
 
         sweep()
         reasons = differences(self._expected, identity_of(self._targets))
@@ -50,11 +49,11 @@ class Serving:
             self._work = pickle.loads(work)
         return os.getpid(), reasons
 
-    def do(self, items: bytes, refs: Mapping[str, Any]) -> bytes:
-        """Answer items; ``refs`` are Ray's references to the contents that they need, by SHA-256."""
+    def do(self, jobs: bytes, refs: Mapping[str, Any]) -> bytes:
+        """Do jobs; ``refs`` are Ray's references to the contents that they need, by SHA-256."""
         import ray
 
-        return serve(self._work, pickle.loads(items), Node(self._node, lambda sha256: bytes(ray.get(refs[sha256]))))
+        return serve(self._work, pickle.loads(jobs), Node(self._node, lambda sha256: bytes(ray.get(refs[sha256]))))
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class JobAnswer:
     Attributes:
         node: Name of its node.
         reasons: What the node has that the driver has not; with any, nothing was done.
-        keys: Of its items.
+        keys: Of its work.
         answers: As `serve` returns them.
     """
 
@@ -75,36 +74,36 @@ class JobAnswer:
 
 
 def serve_job(
-    folder: str, work: str, items: bytes, keys: Sequence[str], expected: Mapping[str, str], targets: Sequence[str], threads: int
+    folder: str, work: str, jobs: bytes, keys: Sequence[str], expected: Mapping[str, str], targets: Sequence[str], threads: int
 ) -> JobAnswer:
-    """Answer items in a job of Slurm; contents are files of a folder that all nodes see.
+    """Do the pool's jobs in a job of Slurm; contents are files of a folder that all nodes see.
 
     Args:
         folder: The session's folder.
         work: SHA-256 of the pickled work, among the contents.
-        items: Pickled.
-        keys: One per item.
+        jobs: Pickled.
+        keys: One per job.
         expected, targets, threads: As `Serving` takes them.
     """
     own_path_only()
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
-    from alpasim_plugin.runtime.executors.identity import differences, identity_of
-    from alpasim_plugin.runtime.executors.scratch import sweep
+    from alpasim_plugin.runtime.executors.assignment import differences, identity_of
+    from alpasim_plugin.runtime.executors.node_files import sweep
 
     sweep()
     node = Node(os.environ.get("SLURMD_NODENAME") or socket.gethostname(), lambda sha256: Path(folder, "placed", sha256).read_bytes())
     reasons = differences(expected, identity_of(targets))
     if reasons:
         return JobAnswer(node.name, reasons, keys, b"")
-    return JobAnswer(node.name, (), keys, serve(pickle.loads(node.fetch(work)), pickle.loads(items), node))
+    return JobAnswer(node.name, (), keys, serve(pickle.loads(node.fetch(work)), pickle.loads(jobs), node))
 
 
-def serve(work: Callable[[Any, Node], Any], items: Sequence[Any], node: Node) -> bytes:
-    """Return the pickled answers to items: results, or exceptions that the work raised."""
+def serve(work: Callable[[Any, Node], Any], jobs: Sequence[Any], node: Node) -> bytes:
+    """Return the pickled answers to jobs: results, or exceptions that the work raised."""
     answers: list[Any] = []
-    for item in items:
+    for job in jobs:
         try:
-            answer: Any = work(item, node)
+            answer: Any = work(job, node)
             pickle.dumps(answer)
         except Exception as error:
             error.add_note(traceback.format_exc())

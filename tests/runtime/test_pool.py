@@ -9,11 +9,10 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.executors.base import Faulty
+from alpasim_plugin.runtime.executors.assignment import differences, identity_of, targets_of
+from alpasim_plugin.runtime.executors.base import Died, Done, Event, Faulty, Lost, Place, Rules
 from alpasim_plugin.runtime.executors.choice import LOCAL, parse_executor
-from alpasim_plugin.runtime.executors.dispatch import Died, Done, Event, Place, dispatch
-from alpasim_plugin.runtime.executors.identity import differences, identity_of, targets_of
-from alpasim_plugin.runtime.workers import Lost
+from alpasim_plugin.runtime.executors.pool import run_jobs
 
 STEP_S = 1.0
 
@@ -24,7 +23,7 @@ class Stage:
     ``dies`` kills its worker, ``raises`` fails, ``hangs@a`` never ends on node a, ``bad@a`` is faulty on node a.
     """
 
-    chunk_s = 10.0
+    rules = Rules(chunk_s=10.0)
 
     def __init__(self, *nodes: str) -> None:
         self.now_s = 0.0
@@ -38,7 +37,7 @@ class Stage:
     def inherited(self, items: Sequence[str]) -> Iterable[tuple[int, Any]]:
         return [(i, "left over") for i, item in enumerate(items) if item == "inherited"]
 
-    def free(self) -> list[Place]:
+    def free(self, wanted: int) -> list[Place]:
         for due_s in [due_s for due_s in self.to_come if due_s <= self.now_s]:
             self.workers[len(self.workers)] = self.to_come.pop(due_s)
         return [Place(n, node) for n, node in self.workers.items() if n not in self.busy]
@@ -85,7 +84,7 @@ class Stage:
 
 
 def drive(stage: Stage, items: list[str], limit_s: float | None = None) -> dict[str, Any]:
-    return dict(dispatch(stage, items, lambda text: None, limit_s, lambda: stage.now_s))
+    return dict(run_jobs(stage, items, lambda text: None, limit_s, lambda: stage.now_s))
 
 
 def test_short_items_go_in_chunks_and_the_last_ones_singly() -> None:
@@ -107,7 +106,7 @@ def test_long_items_go_singly() -> None:
 
 def test_a_worker_has_one_unit_until_its_results_were_taken() -> None:
     stage = Stage("a", "b")
-    outcomes = dispatch(stage, [f"20s {i}" for i in range(50)], print, None, lambda: stage.now_s)
+    outcomes = run_jobs(stage, [f"20s {i}" for i in range(50)], print, None, lambda: stage.now_s)
     next(outcomes)
     assert len(stage.handed) <= 3
 
@@ -167,6 +166,23 @@ def test_an_item_that_hangs_is_ended_at_the_limit() -> None:
     found = drive(stage, ["hangs@a", "1s"], limit_s=5.0)
     assert found["hangs@a"].hung
     assert found["1s"] == "1S"
+
+
+def test_a_job_waits_for_those_that_it_depends_on_and_holds_up_no_other() -> None:
+    stage = Stage("a", "b")
+    items = ["20s first", "1s", "1s after the first", "1s free"]
+    found = dict(run_jobs(stage, items, lambda text: None, None, lambda: stage.now_s, {2: [0]}))
+    assert found == {item: item.upper() for item in items}
+    assert [handed for _, (handed,) in stage.handed] == ["20s first", "1s", "1s free", "1s after the first"]
+
+
+def test_a_backend_without_second_tries_gives_up_what_died_and_copies_nothing() -> None:
+    stage = Stage("", "")
+    stage.rules = Rules(chunk_s=0.0, most_losses=1, copies=False)
+    found = drive(stage, ["dies", *[f"0.5s {i}" for i in range(8)], "100s"])
+    assert found["dies"] == Lost("killed by SIGKILL", do_this=stage.rules.after_dying)
+    assert {len(items) for _, items in stage.handed} == {1}
+    assert len(stage.handed) == 10
 
 
 def test_an_error_of_the_work_ends_it() -> None:
