@@ -10,9 +10,8 @@ import typer
 
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.core.escape import terminal
-from alpasim_plugin.runtime.check import Inspection, inspect_run
-from alpasim_plugin.runtime.contents import RUN_INFO
-from alpasim_plugin.runtime.manifests import DERIVED, MANIFEST
+from alpasim_plugin.run_folder.check import Inspection, inspect_run
+from alpasim_plugin.run_folder.schema import DERIVED, MANIFEST, RUN_INFO
 from alpasim_plugin.runtime.repair import repair_run
 
 DAMAGED, NOT_REPAIRED = 1, 4

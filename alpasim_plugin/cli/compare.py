@@ -14,9 +14,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.repair import use_run
 from evaluators.gate.across import Comparison, compare_runs, compare_within
 from evaluators.gate.spec import load_gate
+from evaluators.opening import read_run
 from evaluators.report.metric_info import HEADLINE, in_percent
 from evaluators.report.numbers import plural
-from evaluators.report.run_folder import read_run
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.sequential.record import stopping_note
 

@@ -11,12 +11,13 @@ from typing import Any
 from alpasim_plugin.cli.progress import Lines, Silent
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.process.signals import Stopped
+from alpasim_plugin.run_folder.schema import slug
 from alpasim_plugin.runtime.decide import Decided, Design, execute_decision, key_of
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from evaluators.gate import GateSpec, check_made_alike, read_baseline, rows_of_run
 from evaluators.gate.stored import StoredSide, stored_side
+from evaluators.opening import read_run
 from evaluators.report.decision import metric_lines, verdict_line
-from evaluators.report.run_folder import read_run
 from evaluators.sequential import control
 from evaluators.sequential.control import Control
 from evaluators.sequential.decision import State

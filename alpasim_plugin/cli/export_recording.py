@@ -12,11 +12,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.recordings.content import DOING, Recording, collect
 from alpasim_plugin.recordings.mcap_file import require_mcap, write_mcap
 from alpasim_plugin.recordings.rerun_file import require_rerun, write_rrd
-from alpasim_plugin.runtime.contents import CONTENTS
+from alpasim_plugin.run_folder.schema import CONTENTS
 from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.unfinished import read_so_far
 from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted
 from alpasim_plugin.viewer.page_data import read_logs
+from evaluators.opening import read_so_far
 
 FORMATS: dict[str, Callable[[Recording, Path], Mapping[str, int]]] = {"mcap": write_mcap, "rrd": write_rrd}
 REQUIRE: dict[str, Callable[[], object]] = {"mcap": require_mcap, "rrd": require_rerun}

@@ -12,13 +12,12 @@ import typer
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.plugins.parts import resolve, resolve_renderer
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.schema import PROBE_JSON, slug
 from alpasim_plugin.runtime.fork import Change, fork_rollout
 from alpasim_plugin.runtime.logged_rollout import find_rollout
-from alpasim_plugin.runtime.plan import slug
 from alpasim_plugin.runtime.probe import probe_rollout, write_probe
-from alpasim_plugin.runtime.probe_files import PROBE_JSON
 from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.store import read_json
 
 FORK_EPILOG = """
 Examples:

@@ -32,8 +32,8 @@ from evaluators.gate import (
     table_of_run,
     write_baseline,
 )
+from evaluators.opening import read_run
 from evaluators.report.gate import write_gate_files
-from evaluators.report.run_folder import read_run
 from evaluators.sequential.question import Population, Question
 from evaluators.sequential.record import stopping_note
 

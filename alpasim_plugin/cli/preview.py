@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.plan import slug
+from alpasim_plugin.run_folder.schema import slug
 from alpasim_plugin.runtime.preview import DOING, draw_preview
 from scenarios.load import load_scenario
 

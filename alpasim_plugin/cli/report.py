@@ -11,10 +11,11 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.runtime.contents import SUMMARY, read_run_json
+from alpasim_plugin.run_folder.manifests import read_run_json
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.schema import SUMMARY
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.runtime.store import read_json
 from evaluators.report import render_table
 
 EPILOG = "Example: `simrun report runs/us101`"

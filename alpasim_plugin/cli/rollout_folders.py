@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.contents import CONTENTS, RUN_INFO
-from alpasim_plugin.runtime.manifests import MANIFEST, read_manifest
+from alpasim_plugin.run_folder.manifests import read_manifest
+from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO
 from alpasim_plugin.viewer.cells import Wanted
 
 

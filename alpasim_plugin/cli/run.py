@@ -25,8 +25,8 @@ from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from evaluators import PRESETS
+from evaluators.opening import read_run
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
-from evaluators.report.run_folder import read_run
 from scenarios.library import shipped_names
 from scenarios.suite import expand
 

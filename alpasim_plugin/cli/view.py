@@ -13,14 +13,14 @@ from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.cli.rollout_folders import find_cell, narrowed
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.runtime.contents import CONTENTS
+from alpasim_plugin.run_folder.schema import CONTENTS
 from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.runtime.unfinished import read_so_far
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options
 from alpasim_plugin.viewer.pictures import Fineness
 from alpasim_plugin.viewer.serve import RunServer, loopback
 from alpasim_plugin.viewer.write import write_page
+from evaluators.opening import read_so_far
 
 DOING = "watching rollouts"
 PAGE = "view.html"

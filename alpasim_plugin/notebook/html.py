@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.report.frames import inline_jpeg
 from evaluators.report.headline import find
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
 from evaluators.report.numbers import DASH, short
-from evaluators.report.run_folder import Rollout, Run
 from evaluators.report.tables import metric_rows
 
 MOST_RENDERERS = 6

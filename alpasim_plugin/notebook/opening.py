@@ -12,12 +12,14 @@ import pyarrow.compute as pc
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import RolloutLog
-from alpasim_plugin.io.reading.tables import read_parquet
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.notebook.frames import Library, frame_of, paired_table, require, summary_table, valid_only
 from alpasim_plugin.notebook.html import outcome, rollout_html, run_html, title
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import KEYS, LOG_NAME, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE
+from evaluators.opening import read_run
 from evaluators.report.headline import find
-from evaluators.report.run_folder import AGAIN, DOING, KEY_COLUMNS, ROLLOUT_COLUMNS, STEP_COLUMNS, Rollout, Run, read_run
 
 
 def open_run(folder: str | Path, frames: Library = "pandas") -> OpenRun:
@@ -59,8 +61,7 @@ class OpenRun:
     @cached_property
     def rollouts(self) -> Any:
         """Give a frame with a row a rollout: renderer, policy, scene, seed, status, every metric and ``METRIC_valid``."""
-        table = read_parquet(self.folder / "rollouts.parquet", DOING, ROLLOUT_COLUMNS, AGAIN)
-        return frame_of(valid_only(table), self._library)
+        return frame_of(valid_only(ROLLOUTS_TABLE.read(self.folder / ROLLOUTS)), self._library)
 
     @cached_property
     def steps(self) -> Any:
@@ -86,7 +87,7 @@ class OpenRun:
         Raises:
             InputError: None fits, or several.
         """
-        wanted = dict(zip(KEY_COLUMNS, (renderer, policy, scene, seed), strict=True))
+        wanted = dict(zip(KEYS, (renderer, policy, scene, seed), strict=True))
         found = [r for r in self._run.rollouts if all(value in (None, getattr(r, key)) for key, value in wanted.items())]
         if len(found) != 1:
             asked = ", ".join(f"{key} {value!r}" for key, value in wanted.items() if value is not None)
@@ -109,7 +110,7 @@ class OpenRun:
 
     @cached_property
     def _steps(self) -> pa.Table:
-        return read_parquet(self.folder / "steps.parquet", DOING, STEP_COLUMNS, AGAIN)
+        return STEPS_TABLE.read(self.folder / STEPS)
 
 
 class OpenRollout:
@@ -142,7 +143,7 @@ class OpenRollout:
         The index is ``t_us`` in pandas; in polars it is a column.
         """
         table = self._open._steps
-        mine = [pc.equal(table[key], pa.scalar(value, table[key].type)) for key, value in zip(KEY_COLUMNS, self._rollout.cell, strict=True)]
+        mine = [pc.equal(table[key], pa.scalar(value, table[key].type)) for key, value in zip(KEYS, self._rollout.cell, strict=True)]
         keep = pc.and_(pc.and_(mine[0], mine[1]), pc.and_(mine[2], mine[3]))
         own = table.filter(pc.and_(keep, table["valid"])).select(["t_us", "metric", "value"])
         frame = frame_of(own, self._open._library)
@@ -156,7 +157,7 @@ class OpenRollout:
         Raises:
             InputError: The log is missing or damaged.
         """
-        return read_asl(self.folder / "rollout.asl", images=images)
+        return read_asl(self.folder / LOG_NAME, images=images)
 
     def __repr__(self) -> str:
         return f"{title(self._rollout)}: {self.verdict}"

@@ -19,14 +19,14 @@ from alpasim_plugin.core.types import Policy, Renderer, Scenario
 from alpasim_plugin.io.atomic import disk_error
 from alpasim_plugin.plugins.parts import build, complete
 from alpasim_plugin.process.stdout import parts_print_to_stderr
+from alpasim_plugin.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest
+from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, FRAMES_NAME, LOG_NAME, MANIFEST, OUTPUT_NAME, VIDEO_NAME
+from alpasim_plugin.run_folder.writer import write_steps
 from alpasim_plugin.runtime.compose import make_renderer
-from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, STEPS_NAME, Remedy, RolloutState, inspect_rollout, write_manifest
-from alpasim_plugin.runtime.pictures import VIDEO_NAME
 from alpasim_plugin.runtime.plan import Cell, RunOptions
-from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME, OUTPUT_NAME, Recorder
+from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from alpasim_plugin.runtime.scoring import score_log
-from alpasim_plugin.runtime.store import STEPS_SCHEMA, write_table
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
 
@@ -189,13 +189,13 @@ def find_rollout_state(
     known: bool = False,
     retry: bool = False,
     video: str = "none",
-) -> tuple[Remedy, RolloutState]:
+) -> tuple[RepairAction, RolloutState]:
     """Return what a cell needs, and the rollout as it is found on disk.
 
     A rollout with another content key is driven again; so are those with a part that has no digest unless ``reuse_undigested`` is set, and
     failed ones, except where the policy is at fault: the same policy would fail again (``retry`` drives these too).
     One that was driven without the ``video`` that is asked for now is driven again as well. See
-    `alpasim_plugin.runtime.manifests.inspect_rollout` for ``full`` and ``known``.
+    `alpasim_plugin.run_folder.manifests.inspect_rollout` for ``full`` and ``known``.
     """
     state = inspect_rollout(root, cell.folder.as_posix(), full, known)
     manifest = state.manifest
@@ -212,14 +212,14 @@ def find_rollout_state(
     wants_video = video == "all" or (video == "failures" and bool(manifest.get("events")))
     if wants_video and VIDEO_NAME not in manifest["files"] and manifest.get("video") != video:
         return "drive", state
-    if state.remedy == "none" and manifest.get("score_key") != cell.score_key:
+    if state.action == "none" and manifest.get("score_key") != cell.score_key:
         return "score", state
-    return state.remedy, state
+    return state.action, state
 
 
 def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> dict[str, Any]:
     scored = score_log(folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators)
-    write_table(folder / STEPS_NAME, [cell.names | row for row in scored.steps], STEPS_SCHEMA)
+    write_steps(folder, [cell.names | row for row in scored.steps])
     return {"metrics": scored.metrics, "events": scored.events, "contacts": scored.contacts, "censored": scored.censored}
 
 

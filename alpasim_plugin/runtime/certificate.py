@@ -15,9 +15,9 @@ from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.io.atomic import scratch_folder
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.trace import Key, digests, first_difference, sha256, trace_log
+from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME, STEPS_NAME
 from alpasim_plugin.runtime.cell import run_cell
 from alpasim_plugin.runtime.plan import Cell, RunPlan
-from alpasim_plugin.runtime.recorder import FRAMES_NAME, LOG_NAME
 
 Certify = Literal["none", "one"]
 
@@ -129,7 +129,7 @@ def rollout_trace(folder: Path, manifest: Mapping[str, Any]) -> dict[str, dict[K
         InputError: A file is missing or damaged.
     """
     trace = log_trace(folder)
-    table = pq.read_table(folder / "steps.parquet", columns=["t_us", "metric", "value", "valid", "reason"])
+    table = pq.read_table(folder / STEPS_NAME, columns=["t_us", "metric", "value", "valid", "reason"])
     values: dict[Key, list[str]] = defaultdict(list)
     columns: list[list[Any]] = [table[name].to_pylist() for name in table.column_names]
     for t_us, metric, *rest in zip(*columns, strict=True):

@@ -18,16 +18,16 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.plugins.parts import digest
 from alpasim_plugin.process.subprocesses import end_children
+from alpasim_plugin.run_folder.manifests import find_contents, read_run_json, write_run_json
+from alpasim_plugin.run_folder.sides import RendererRows, by_renderer
+from alpasim_plugin.run_folder.writer import rollout_rows, writing
 from alpasim_plugin.runtime.certificate import Certify, certify
-from alpasim_plugin.runtime.contents import find_contents, read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import HowToRun, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor, kept_open
 from alpasim_plugin.runtime.plan import Cell, RunPlan, part_of
 from alpasim_plugin.runtime.run import Progress, RunResult, claim, finish_run, on_done, publish, write_run_info
-from alpasim_plugin.runtime.tables import pool_of, rollout_rows
-from alpasim_plugin.runtime.writing import writing
+from alpasim_plugin.runtime.summary import pool_of
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
-from evaluators.aggregate.rows import RendererRows, by_renderer
 from evaluators.gate.judge import failures_of
 from evaluators.gate.stored import StoredSide
 from evaluators.sequential.control import Control, adjusted_draws

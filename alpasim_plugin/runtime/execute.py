@@ -23,6 +23,7 @@ from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.measured import share_measurements
 from alpasim_plugin.renderers.cache import cache_root, cached
 from alpasim_plugin.renderers.reconstruction_key import is_reconstructed
+from alpasim_plugin.run_folder.manifests import write_manifest
 from alpasim_plugin.runtime.cell import failed_manifest, find_rollout_state, rescore_cell, run_cell
 from alpasim_plugin.runtime.executors.assignment import assignment_as_here, targets_of
 from alpasim_plugin.runtime.executors.base import Lost
@@ -31,7 +32,6 @@ from alpasim_plugin.runtime.executors.local import run_in_processes, run_or_retr
 from alpasim_plugin.runtime.executors.node_files import measured_folder
 from alpasim_plugin.runtime.executors.pool import run_jobs
 from alpasim_plugin.runtime.executors.result import unpack
-from alpasim_plugin.runtime.manifests import write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runtime.provenance import hardware
 from alpasim_plugin.runtime.stores.commits import KnownCommits, opened, run_stored_cell

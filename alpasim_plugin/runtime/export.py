@@ -29,13 +29,12 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.rename import Renaming, Stage, copy_log
 from alpasim_plugin.log.session import session_uuid
 from alpasim_plugin.plugins.parts import resolve_renderer
+from alpasim_plugin.run_folder.manifests import read_contents, read_manifest
+from alpasim_plugin.run_folder.schema import LOG_NAME, slug
 from alpasim_plugin.runtime.compose import make_renderer
-from alpasim_plugin.runtime.contents import read_contents
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.export_frames import AddedFrames
-from alpasim_plugin.runtime.manifests import read_manifest
-from alpasim_plugin.runtime.plan import RunOptions, slug
-from alpasim_plugin.runtime.recorder import LOG_NAME
+from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.score_logs import check_vouched
 from evaluators.alpasim import EvalSettings
 from scenarios.cosmos_camera import FRONT_WIDE

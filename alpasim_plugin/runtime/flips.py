@@ -5,6 +5,7 @@ Written to the run folder as ``flips.json`` and ``flips/*.jpg``, since the repor
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.log import decode_image, encode_image, read_asl
-from alpasim_plugin.runtime.probe_files import find_probe
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.schema import LOG_NAME, PROBE_JSON, probe_folder
+from evaluators.opening import read_run
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US, first_divergence
 from evaluators.report.flips import FLIPS_NAME, Flip, find_flips
-from evaluators.report.run_folder import read_run
 
 MAX_FLIPS = 60  # cells whose logs are read
 PICTURE_WIDTH = 560
@@ -50,7 +53,7 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
     if probe is not None:
         return dict(probe) | {"source": "probe"}
     try:
-        logs = {r.renderer: _read(root / r.path / "rollout.asl") for r in (flip.base, flip.other)}
+        logs = {r.renderer: _read(root / r.path / LOG_NAME) for r in (flip.base, flip.other)}
     except SimrunError as error:
         return {"t_us": None, "reason": f"a log could not be read: {error.found}"}
     one, other = logs.values()
@@ -64,6 +67,19 @@ def _divergence(root: Path, flip: Flip, name: str) -> dict[str, Any]:
     if None in frames.values():
         divergence["frames_reason"] = "a log without camera images (--images none, or a policy without cameras)"
     return divergence | {"source": "logs", "ahead_us": found.ahead_us, "frames": {r: path for r, path in frames.items() if path}}
+
+
+def find_probe(root: Path, driven: Rollout, other: str) -> Mapping[str, Any] | None:
+    """Return the first divergence that a probe along a rollout found between its renderer and another; None without such a probe."""
+    for path in sorted((root / probe_folder(*driven.cell)).glob(f"*/{PROBE_JSON}")):
+        for pair in read_json(path)["pairs"]:
+            if pair["reference"] == driven.renderer and pair["renderer"] == other:
+                first = pair["first_divergence"]
+                if first is None:
+                    return {"t_us": None, "reason": "a probe at identical poses found no divergence"}
+                frames = {r: (path.parent / name).relative_to(root).as_posix() for r, name in first["frames"].items()}
+                return dict(first) | {"frames": frames}
+    return None
 
 
 def _picture(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:

@@ -35,17 +35,16 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log.trace import Difference, Trace, first_difference
 from alpasim_plugin.plugins.parts import digest, resolve, resolve_renderer
+from alpasim_plugin.run_folder.manifests import read_run_json, write_manifest, write_run_json
+from alpasim_plugin.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO
+from alpasim_plugin.run_folder.writer import writing
 from alpasim_plugin.runtime.cell import RolloutParts, build_parts, run_cell
 from alpasim_plugin.runtime.certificate import log_trace
-from alpasim_plugin.runtime.contents import read_run_json, write_run_json
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
-from alpasim_plugin.runtime.manifests import MANIFEST, write_manifest
 from alpasim_plugin.runtime.plan import Cell, RunOptions, RunPlan, score_key
-from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.run import RunResult, finish_run, write_run_info
-from alpasim_plugin.runtime.tables import pool_of
-from alpasim_plugin.runtime.writing import writing
+from alpasim_plugin.runtime.summary import pool_of
 
 DOING = "continuing a logged rollout"
 UNCHANGED = "replay"
@@ -230,7 +229,7 @@ def _check(past: LoggedRollout, change: Change, root: Path) -> None:
         found = f"the rollout lasts {length_us * 1e-6:g} s"
         raise InputError(DOING, f"--at {change.after_us * 1e-6:g}", found, "choose an instant within it, in seconds after the first frame")
     past.check_repeatable(DOING)
-    if (root / "run.json").exists():
+    if (root / RUN_INFO).exists():
         raise InputError(DOING, f"--out {root}", "it holds a run already", "choose another --out")
 
 

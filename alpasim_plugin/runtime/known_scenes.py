@@ -10,7 +10,7 @@ from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario, Scene
-from alpasim_plugin.runtime.scene_dump import LoggedScene
+from alpasim_plugin.run_folder.scenes import LoggedScene
 from scenarios.load import load_scenario
 from scenarios.suite import load_suite
 from scenarios.usdz import read_usdz, usdz_scene_id

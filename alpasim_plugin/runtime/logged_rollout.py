@@ -9,13 +9,11 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts import overrides_of, resolve_renderer
-from alpasim_plugin.runtime.contents import read_run_json
-from alpasim_plugin.runtime.manifests import inspect_rollout
+from alpasim_plugin.run_folder.manifests import inspect_rollout, read_run_json
+from alpasim_plugin.run_folder.schema import KEYS, ROLLOUTS, ROLLOUTS_TABLE, RUN_INFO, cell_name
 from alpasim_plugin.runtime.plan import Cell, RunOptions, make_plan, refuse_commands
 from scenarios.suite import ScenarioRef
 
@@ -40,7 +38,7 @@ class LoggedRollout:
     @property
     def name(self) -> str:
         """Give the name by which `find_rollout` finds it."""
-        return rollout_name(self.cell.renderer.name, self.cell.policy.name, self.cell.scene, self.cell.seed)
+        return cell_name(*self.cell.names.values())
 
     def check_repeatable(self, doing: str) -> None:
         """Refuse a rollout that cannot be replayed.
@@ -57,11 +55,6 @@ class LoggedRollout:
         if self.scenario.latency.kind == "measured":
             found = "its latency is measured: the delay of its plans depended on the machine"
             raise InputError(doing, self.name, found, "run it with --set latency.kind=fixed")
-
-
-def rollout_name(renderer: str, policy: str, scene: str, seed: int) -> str:
-    """Return ``RENDERER/POLICY/SCENE/SEED``."""
-    return f"{renderer}/{policy}/{scene}/{seed}"
 
 
 def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRollout:
@@ -87,7 +80,7 @@ def find_rollout(root: Path, name: str, scenario: str | None = None) -> LoggedRo
     stated: Mapping[str, Any] = (info["scenes"].get(row["scene"]) or {}).get("ref") or {}
     where = scenario or stated.get("path")
     if where is None:
-        raise InputError(DOING, f"{root / 'run.json'}", "it has no path of the scenario", "name it with --scenario PATH")
+        raise InputError(DOING, f"{root / RUN_INFO}", "it has no path of the scenario", "name it with --scenario PATH")
     ref = ScenarioRef(where, stated.get("seed"), tuple(stated.get("overrides", ())), stated.get("source"))
     options = _options(info)
     refuse_commands([row["policy"]], DOING, str(root))
@@ -116,11 +109,9 @@ def _options(info: Mapping[str, Any]) -> RunOptions:
 
 
 def _row(root: Path, name: str) -> dict[str, Any]:
-    path = root / "rollouts.parquet"
-    if not path.is_file():
-        raise InputError(DOING, str(path), "no such file", "name a folder written by simrun run")
-    rows = pq.read_table(path, columns=["renderer", "policy", "scene", "seed", "status", "path", "failure"]).to_pylist()
-    by_name = {rollout_name(row["renderer"], row["policy"], row["scene"], row["seed"]): row for row in rows}
+    path = root / ROLLOUTS
+    rows = ROLLOUTS_TABLE.read(path, DOING, "name a folder written by simrun run", (*KEYS, "status", "path", "failure")).to_pylist()
+    by_name = {cell_name(*(row[key] for key in KEYS)): row for row in rows}
     wanted = name.strip("/")
     row = by_name.get(wanted) or next((r for r in rows if wanted in (r["path"], r["path"].removeprefix("rollouts/"))), None)
     if row is None:

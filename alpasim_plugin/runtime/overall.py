@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.contents import ROLLOUTS, damaged_files, find_contents, read_run_json
-from evaluators.aggregate.columns import AGAIN, DOING, RolloutTable
+from alpasim_plugin.run_folder.columns import AGAIN, DOING, RolloutTable
+from alpasim_plugin.run_folder.manifests import damaged_files, find_contents, read_run_json
+from alpasim_plugin.run_folder.schema import ROLLOUTS
 from evaluators.aggregate.overall import numbers
 from evaluators.metrics import declare_from
 

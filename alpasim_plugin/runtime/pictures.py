@@ -10,8 +10,8 @@ from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.io.atomic import write_bytes
 from alpasim_plugin.log import encode_image, write_mp4
+from alpasim_plugin.run_folder.schema import STRIP_NAME, VIDEO_NAME
 
-STRIP_NAME, VIDEO_NAME = "strip.jpg", "front.mp4"
 STRIP_FRACTIONS = (0.1, 0.37, 0.63, 0.9)  # times of the strip's frames, as fractions of the rollout
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,13 +13,13 @@ from alpasim_plugin.plugins.parts import PartSpec, RendererSpec, digest, resolve
 from alpasim_plugin.plugins.parts.loading import COMMAND
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.renderers.background import background_note
+from alpasim_plugin.run_folder.schema import rollout_folder
 from evaluators import resolve_evaluators
 from evaluators.presets import preset
 from scenarios.load import code_digest_of, load_scenario
 from scenarios.suite import ScenarioRef
 
 DOING = "planning a run"
-SLUG_LENGTH = 80
 LOOP, SCORING = "alpasim_plugin.runtime.rollout", "alpasim_plugin.runtime.scoring"  # modules whose code, with its imports, decides
 
 
@@ -266,19 +265,3 @@ def score_key(rollout_key: str, preset_name: str, evaluators: Sequence[PartSpec]
 def scoring_content(preset_name: str, evaluators: Sequence[PartSpec]) -> tuple[Any, ...]:
     """Return what a `score_key` covers besides the rollout: the preset, the code of the scoring, the digest of every evaluator."""
     return preset(preset_name).as_dict(), own_code_digest(SCORING), [(spec.name, spec.digest) for spec in evaluators]
-
-
-def rollout_folder(renderer: str, policy: str, scene: str, seed: int) -> Path:
-    """Return a rollout's folder below the run folder."""
-    return Path("rollouts", slug(renderer), slug(policy), slug(scene), str(seed))
-
-
-def slug(name: str) -> str:
-    """Return a name that is safe as one folder; different names have different slugs.
-
-    Example:
-        >>> slug("onefixer@1"), slug("nre://host:50051")
-        ('onefixer@1', 'nre-host-50051-9d6a75a3')
-    """
-    safe = re.sub(r"[^A-Za-z0-9._@+-]+", "-", name).strip("-.")[:SLUG_LENGTH]
-    return name if safe == name and safe else f"{safe}-{digest(name)[:8]}"

@@ -24,15 +24,15 @@ from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.trace import first_difference
 from alpasim_plugin.plugins.parts import resolve_renderer
+from alpasim_plugin.run_folder.schema import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
+from alpasim_plugin.run_folder.writer import write_table
 from alpasim_plugin.runtime.cell import build_parts
 from alpasim_plugin.runtime.certificate import log_trace
 from alpasim_plugin.runtime.execute import thread_budget
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan
 from alpasim_plugin.runtime.logged_rollout import LoggedRollout
-from alpasim_plugin.runtime.probe_files import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
-from alpasim_plugin.runtime.store import write_table
 from evaluators.plan_gap import DIVERGED_M, HORIZON_US, plan_gap
 
 HORIZONS_S = (1.0, 3.0)

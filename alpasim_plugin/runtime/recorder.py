@@ -33,6 +33,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
 from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.loop_state import PathEnd
 from alpasim_plugin.runtime.pictures import Pictures
 from alpasim_plugin.world.ego import ego_states_from_log
@@ -41,7 +42,6 @@ REACH_S = 1.0
 MOVING_MPS = 1.0  # below, a plan's speed says nothing about its unit
 SLACK, SLACK_M = 2.0, 5.0  # a plan may ask for more than the vehicle gives: only what is far beyond counts
 WARN_SHARE, MIN_PLANS = 0.2, 5
-LOG_NAME, FRAMES_NAME, OUTPUT_NAME = "rollout.asl", "frames.jsonl", "output.log"
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 

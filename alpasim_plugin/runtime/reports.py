@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from alpasim_plugin.runtime.contents import PAGES
+from alpasim_plugin.run_folder.schema import PAGES
 
 Key = tuple[str, str, str, int]  # renderer, policy, scene, seed
 

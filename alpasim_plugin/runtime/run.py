@@ -12,38 +12,32 @@ from typing import Any, Protocol
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.plugins.parts.source import own_code_digest
 from alpasim_plugin.process.subprocesses import end_children
 from alpasim_plugin.renderers.reconstruction_key import model_key
-from alpasim_plugin.runtime.cell import find_rollout_state
-from alpasim_plugin.runtime.certificate import Certify, certify
-from alpasim_plugin.runtime.contents import (
-    CONTENTS,
-    REPORTS,
-    RUN_INFO,
-    SCENES,
-    SUMMARY,
-    TABLES,
+from alpasim_plugin.run_folder.manifests import (
     Contents,
     damaged_files,
     find_contents,
     read_contents,
+    read_manifest,
     read_run_json,
     write_contents,
     write_run_json,
 )
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.scenes import write_scene
+from alpasim_plugin.run_folder.schema import CONTENTS, REPORTS, RUN_INFO, SUMMARY, TABLES, slug
+from alpasim_plugin.run_folder.writer import writing
+from alpasim_plugin.runtime.cell import find_rollout_state
+from alpasim_plugin.runtime.certificate import Certify, certify
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runtime.executors.choice import LOCAL, Executor
-from alpasim_plugin.runtime.manifests import read_manifest
-from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan, slug
+from alpasim_plugin.runtime.plan import LOOP, SCORING, RunPlan
 from alpasim_plugin.runtime.provenance import chosen, hardware, project, versions
 from alpasim_plugin.runtime.reports import write_reports
-from alpasim_plugin.runtime.scene_dump import scene_as_json
-from alpasim_plugin.runtime.store import read_json
 from alpasim_plugin.runtime.stores.commits import opened
-from alpasim_plugin.runtime.tables import pool_of, write_tables
-from alpasim_plugin.runtime.writing import writing
+from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
 from evaluators.metrics import declared
 from scenarios.suite import ScenarioRef
@@ -175,7 +169,7 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     info = read_run_json(root)
     outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
     write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
-    summary = write_tables(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
+    summary = write_summary(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
@@ -256,8 +250,8 @@ def _held(root: Path, contents: Contents | None, noticed: Callable[[str], None])
 
 
 def _write_scenes(root: Path, plan: RunPlan) -> None:
-    for scene_id, scenario in plan.scenarios.items():
-        write_json(root / SCENES / f"{slug(scene_id)}.json", scene_as_json(scenario))
+    for scenario in plan.scenarios.values():
+        write_scene(root, scenario)
 
 
 def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads) -> None:

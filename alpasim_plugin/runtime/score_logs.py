@@ -16,14 +16,12 @@ from alpasim_plugin.io.checksums import problem_of
 from alpasim_plugin.io.config import load_yaml
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.plugins.parts import PartSpec
-from alpasim_plugin.runtime.contents import RUN_INFO
+from alpasim_plugin.run_folder.manifests import read_manifest
+from alpasim_plugin.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
+from alpasim_plugin.run_folder.writer import write_steps
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.loop_state import PathEnd
-from alpasim_plugin.runtime.manifests import MANIFEST, STEPS_NAME, read_manifest
-from alpasim_plugin.runtime.plan import slug
-from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.scoring import contacts_of, tabulate
-from alpasim_plugin.runtime.store import steps_schema, write_table
 from evaluators import reduce_rollout, score
 from evaluators.alpasim import ScoredRollout
 from evaluators.presets import Preset
@@ -130,7 +128,7 @@ def _score(
     manifest |= {"status": "ok", "metrics": one.metrics, "events": one.events, "censored": one.censored}
     manifest |= {"contacts": one.contacts, "path": _folder(manifest, taken)}
     keys = {key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "rollout")}
-    write_table(root / manifest["path"] / STEPS_NAME, [keys | row for row in one.steps], steps_schema(of_logs=True))
+    write_steps(root / manifest["path"], [keys | row for row in one.steps], of_logs=True)
     run_uuid, run_name = run_names(log)
     return LogScore(manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name))
 
@@ -220,7 +218,7 @@ def _failed(manifest: dict[str, Any], error: SimrunError, root: Path, taken: set
 
 def _folder(manifest: dict[str, Any], taken: set[str]) -> str:
     """Return the folder of a log's results, relative to the run folder; logs with the same names get numbers."""
-    base = "/".join(["rollouts", *(slug(str(manifest[key])) for key in ("renderer", "policy", "scene", "rollout"))])
+    base = rollout_folder(*(str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout"))).as_posix()
     path, n = base, 2
     while path in taken:
         path, n = f"{base}-{n}", n + 1

@@ -14,18 +14,17 @@ from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.plugins.parts import PartSpec, digest
 from alpasim_plugin.plugins.parts.source import own_code_digest
-from alpasim_plugin.runtime.contents import AGGREGATE, CONTENTS, SCENES, find_contents, read_run_json, write_run_json
+from alpasim_plugin.run_folder.manifests import find_contents, read_run_json, write_manifest, write_run_json
+from alpasim_plugin.run_folder.scenes import write_scene
+from alpasim_plugin.run_folder.schema import AGGREGATE, CONTENTS, slug
+from alpasim_plugin.run_folder.writer import write_parquet, writing
 from alpasim_plugin.runtime.execute import Threads
 from alpasim_plugin.runtime.known_scenes import KnownScenes
-from alpasim_plugin.runtime.manifests import write_manifest
-from alpasim_plugin.runtime.plan import SCORING, slug
+from alpasim_plugin.runtime.plan import SCORING
 from alpasim_plugin.runtime.provenance import hardware, versions
 from alpasim_plugin.runtime.run import SCHEMA_VERSION, finish_run, origin_of
-from alpasim_plugin.runtime.scene_dump import scene_as_json
 from alpasim_plugin.runtime.score_logs import LogScore, exit_code, score_logs
-from alpasim_plugin.runtime.store import write_parquet
-from alpasim_plugin.runtime.tables import pool_of
-from alpasim_plugin.runtime.writing import writing
+from alpasim_plugin.runtime.summary import pool_of
 from evaluators.aggregate.reduce import RolloutValue
 from evaluators.alpasim import (
     EvalSettings,
@@ -180,8 +179,8 @@ def _write_info(
     command: Sequence[str],
 ) -> None:
     used = {one.manifest["scene"]: scenes.of(one.manifest["scene"]) for one in scores if one.scored is not None}
-    for scene_id, scene in used.items():
-        write_json(root / SCENES / f"{slug(scene_id)}.json", scene_as_json(scene))
+    for scene in used.values():
+        write_scene(root, scene)
 
     def names(column: str) -> list[Any]:
         return list(dict.fromkeys(one.manifest[column] for one in scores))

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.plugins.parts import names
+from alpasim_plugin.run_folder.sides import Row
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
 from alpasim_plugin.runtime.run import Progress, execute_run
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures, worst
-from evaluators.aggregate.rows import Row
 from evaluators.gate import GateSpec, GateVerdict, judge, rows_of_run
-from evaluators.report.run_folder import read_run
+from evaluators.opening import read_run
 from scenarios.suite import load_suite
 
 SUITE = "suites/gate_self_test"

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.report.flips import Flip, baseline_of, events, find_flips, in_words
-from evaluators.report.run_folder import Rollout, Run
 
 DOING = "choosing rollouts to watch"
 QUIET_CELLS = 3  # cells in which nothing happened, shown by default

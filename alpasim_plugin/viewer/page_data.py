@@ -9,6 +9,8 @@ from typing import Any
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.run_folder.reader import Run, read_json
+from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
 from alpasim_plugin.viewer.map_data import map_data, recorded_drive
@@ -18,7 +20,6 @@ from evaluators.metrics import METRICS
 from evaluators.report.events import clock_zero_us
 from evaluators.report.flips import FLIPS_NAME, baseline_of
 from evaluators.report.metric_info import meaning, ordered
-from evaluators.report.run_folder import Rollout, Run, read_json
 
 DOING = "reading a rollout to watch"
 LOG = "rollout.asl"

@@ -15,11 +15,11 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.run_folder.reader import RunSoFar
 from alpasim_plugin.viewer.budget import as_json
 from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted
 from alpasim_plugin.viewer.page import Options, render
 from alpasim_plugin.viewer.page_data import cell_data, index_data, read_logs
-from alpasim_plugin.viewer.so_far import RunSoFar
 
 DOING = "serving a run"
 LEAST_AGE_S = 1.0  # the folder is not looked through more often than this,

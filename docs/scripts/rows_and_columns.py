@@ -19,7 +19,7 @@ from alpasim_plugin.process.processes import resident_mb
 from evaluators.aggregate.paired import paired
 from evaluators.gate import GateVerdict, judge, judge_table, load_gate, rows_of_run, table_of_run
 from evaluators.gate.across import compare_within
-from evaluators.report.run_folder import read_run
+from evaluators.opening import read_run
 
 
 def gate_by_rows(folder: Path) -> GateVerdict:

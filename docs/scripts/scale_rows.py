@@ -21,10 +21,10 @@ import pyarrow.parquet as pq
 import scipy
 
 from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY, write_contents, write_run_json
-from alpasim_plugin.runtime.plan import rollout_folder
-from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet
-from evaluators.aggregate.columns import RolloutTable
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.manifests import write_contents, write_run_json
+from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE, SUMMARY, rollout_folder
+from alpasim_plugin.run_folder.writer import write_parquet
 from evaluators.aggregate.overall import numbers
 from evaluators.metrics import info
 
@@ -51,7 +51,7 @@ METRICS = (
 
 def chunks(rollouts: int, seeds: int, key: int) -> Iterator[pa.RecordBatch]:
     """Yield the rows of a run, scene by scene, in the order in which a run has them."""
-    schema = rollouts_schema(METRICS)
+    schema = ROLLOUTS_TABLE.arrow(METRICS)
     scenes = -(-rollouts // (len(RENDERERS) * seeds))
     for first in range(0, scenes, CHUNK_SCENES):
         rng = np.random.Generator(np.random.Philox(key=[key, first]))
@@ -119,10 +119,10 @@ def _rows(rng: np.random.Generator, first: int, scenes: int, seeds: int) -> dict
 def write_drawn_run(root: Path, rollouts: int, seeds: int = 10, key: int = 1) -> None:
     """Write a run folder: ``run.json``, ``rollouts.parquet``, an empty ``steps.parquet``, ``summary.json``, ``contents.json``."""
     root.mkdir(parents=True, exist_ok=True)
-    with pq.ParquetWriter(root / ROLLOUTS, rollouts_schema(METRICS), compression="zstd") as writer:
+    with pq.ParquetWriter(root / ROLLOUTS, ROLLOUTS_TABLE.arrow(METRICS), compression="zstd") as writer:
         for batch in chunks(rollouts, seeds, key):
             writer.write_batch(batch)
-    write_parquet(root / STEPS, steps_schema(False).empty_table())
+    write_parquet(root / STEPS, STEPS_TABLE.arrow().empty_table())
     scenes = -(-rollouts // (len(RENDERERS) * seeds))
     info_of_run = {
         "schema_version": 1,

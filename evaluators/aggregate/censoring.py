@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.types import F64
-from evaluators.aggregate.rows import RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
+from alpasim_plugin.run_folder.sides import RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
 from evaluators.metrics import info
 
 STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")

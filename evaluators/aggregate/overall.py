@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from evaluators.aggregate.columns import RendererColumns, RolloutTable
+from alpasim_plugin.run_folder.columns import RendererColumns, RolloutTable
+from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.aggregate.paired import base_pairs_of_sides, paired_sides
 from evaluators.aggregate.summary import aggregate_sides
 
@@ -39,7 +40,7 @@ def by_policy(of: Mapping[str, Any], table: Callable[[Any], Mapping[str, Any]]) 
     out: dict[str, Any] = {}
     for policy, some in of.items():
         part = table(some)
-        out |= part if len(of) == 1 else {f"{renderer}/{policy}": entry for renderer, entry in part.items()}
+        out |= part if len(of) == 1 else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
     return out
 
 

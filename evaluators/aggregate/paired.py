@@ -13,9 +13,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64, Bool
+from alpasim_plugin.run_folder.sides import Cell, Row, Side, by_renderer, metric_names
 from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, n_clusters, t_bounds, t_interval, within
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
-from evaluators.aggregate.rows import Cell, Row, Side, by_renderer, metric_names
 from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
 from evaluators.metrics import difference_range, info
 

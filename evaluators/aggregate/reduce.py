@@ -6,7 +6,7 @@ collision event are dropped, the event's own step stays; flags are reduced by th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,11 +38,6 @@ class RolloutValue:
         """Return the fields for a manifest; an infinite value, for which JSON has no number, is the text "inf" or "-inf"."""
         infinite = self.value is not None and np.isinf(self.value)
         return self.__dict__ | ({"value": str(self.value)} if infinite else {})
-
-
-def value_in_manifest(entry: Mapping[str, Any]) -> float | None:
-    """Return the value that `RolloutValue.as_dict` wrote."""
-    return None if entry["value"] is None else float(entry["value"])
 
 
 @dataclass(frozen=True)

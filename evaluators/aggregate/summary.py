@@ -10,9 +10,9 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.run_folder.sides import Row, Side, by_renderer, metric_names
 from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, n_clusters, normal_half_width, wilson_rate, within
-from evaluators.aggregate.rows import Row, Side, by_renderer, metric_names
 from evaluators.metrics import info, value_range
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.aggregate.columns import RolloutTable
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.aggregate.paired import LISTED, compare
 from evaluators.aggregate.verdict import default_margin
 from evaluators.gate.baseline import check_scenes, scene_hashes
 from evaluators.gate.rows import table_of_run
-from evaluators.report.run_folder import Run
 
 DOING = "comparing runs"
 
@@ -105,7 +106,7 @@ def _pairs(
         here, there = table.sides(policy), base.sides(of_base, policy) if of_base in base.policies else {}
         for renderer, other in partner.items():
             if renderer in here and other in there:
-                variant = renderer if len(table.policies) == 1 else f"{renderer}/{policy}"
+                variant = renderer if len(table.policies) == 1 else cell_name(renderer, policy)
                 out[variant] = {
                     name: compare(
                         here[renderer], there[other], name, prefix + other, (margins or {}).get(name, default_margin(name)), listed

@@ -7,18 +7,41 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import TypedDict
+
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.io.reading.files import as_shape, kind_of
-from evaluators.aggregate.rows import Row
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.sides import Row
 from evaluators.gate.rows import rows_of_run
-from evaluators.report.run_folder import Run, read_run
-from evaluators.report.shapes import BaselineRow, StoredBaseline
+from evaluators.opening import read_run
 
 SCHEMA_VERSION = 1
 DOING = "comparing with a stored baseline"
 APPROVE = "make the run again as the baseline was made, or approve a new baseline with simrun gate RUN --write-baseline FILE"
+
+
+class StoredBaseline(TypedDict):
+    """A stored baseline of the gate."""
+
+    preset: str
+    scenes: dict[str, str]
+    weights: dict[str, Any]
+    rows: list[dict[str, Any]]
+    made_with: dict[str, Any]
+    schema_version: int
+
+
+class BaselineRow(TypedDict):
+    """The key and the status of a row of a stored baseline; its metrics are numbers or null, with flags NAME_valid."""
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+    status: str
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from alpasim_plugin.run_folder.sides import Row
 from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
-from evaluators.aggregate.rows import Row
 from evaluators.gate.judge import Check, GateVerdict, judge
 from evaluators.gate.spec import GateSpec
 from evaluators.report.decision import MetricRow, metric_rows

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.aggregate.columns import RolloutTable
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.sides import Row, Side, by_renderer, failure_of, is_ok
 from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.rows import Row, Side, by_renderer, failure_of, is_ok
 from evaluators.gate.rows import of_policy, policies_of
 from evaluators.gate.spec import GateSpec, MetricRule
 from evaluators.metrics import info

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from evaluators.aggregate.columns import RolloutTable
-from evaluators.aggregate.rows import Row
-from evaluators.report.run_folder import ROLLOUTS, Run
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.schema import ROLLOUTS
+from alpasim_plugin.run_folder.sides import Row
 
 
 def table_of_run(run: Run) -> RolloutTable:
@@ -20,7 +21,7 @@ def table_of_run(run: Run) -> RolloutTable:
 
 
 def rows_of_run(run: Run) -> list[dict[str, Any]]:
-    """Return one flat row per planned rollout: key, fate, and METRIC with METRIC_valid."""
+    """Return one flat row per planned rollout: key, status, and METRIC with METRIC_valid."""
     rows = []
     for rollout in run.rollouts:
         row: dict[str, Any] = {

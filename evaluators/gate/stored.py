@@ -8,7 +8,7 @@ from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.plugins.parts import digest
-from evaluators.aggregate.rows import Row, is_ok
+from alpasim_plugin.run_folder.sides import Row, is_ok
 from evaluators.gate.rows import of_policy, policies_of
 
 DOING = "comparing with a stored baseline"

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from alpasim_plugin.run_folder.rows import Rollout, Series
 from evaluators.report.events import Event, clock_zero_us, events_of
 from evaluators.report.numbers import fixed
 from evaluators.report.road_users import RoadUser, corners, road_users
-from evaluators.report.run_folder import Rollout, Series
 
 F64 = npt.NDArray[np.float64]
 Variants = Mapping[tuple[str, str], tuple[int, int]]  # (renderer, policy) -> (colour index, dash index)

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.report.numbers import duration, finite, plural
-from evaluators.report.run_folder import Run
 
 
 @dataclass(frozen=True)

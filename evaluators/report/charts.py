@@ -20,9 +20,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from alpasim_plugin.run_folder.rows import Rollout, Series
 from evaluators.report.events import events_of
 from evaluators.report.numbers import LEAST_SPAN
-from evaluators.report.run_folder import Rollout, Series
 
 N_COLOURS = 8
 SIZE_IN = (4.6, 2.7)  # about 440 x 260 CSS pixels: legible at its own size on a phone

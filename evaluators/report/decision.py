@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.aggregate.outcome import WORDS
 from evaluators.metrics import info
 from evaluators.report.ending import LABEL
 from evaluators.report.metric_info import in_percent
 from evaluators.report.numbers import decimals, fixed
-from evaluators.report.run_folder import Run
 from evaluators.sequential.record import Decision, read_decision
 
 WORST_CASE = "any bound"

@@ -6,10 +6,11 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.report.flips import find_flips
 from evaluators.report.headline import Finding, find
 from evaluators.report.numbers import finite, fixed
-from evaluators.report.run_folder import Rollout, Run
 
 LABEL = 9  # width of the labels
 MORE_SCENES = "suites/urban"

@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from evaluators.report.run_folder import Own, Rollout, Run, Series, series_by_cell
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Own, Rollout, Series, series_by_cell
 
 COLLISION = ("collision_any", "collision_at_fault", "collision_front", "collision_lateral", "collision_rear")
 SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}

@@ -20,10 +20,10 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.metrics import METRICS
 from evaluators.report.events import COLLISION
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
-from evaluators.report.run_folder import Run
 
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a failure's message

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.report.numbers import Cell, finite, fixed, interval, missing
-from evaluators.report.run_folder import Rollout, Run
 
 MAX_FAILURE_ROWS = 200
 

@@ -10,12 +10,12 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.report.charts import GRID, INK, MUTED, N_COLOURS, RC, SIZE_IN, VARIANT, Chart, new_axes, themed_svg
 from evaluators.report.headline import WORDS
 from evaluators.report.metric_info import HEADLINE, in_percent, ordered
 from evaluators.report.numbers import LEAST_SPAN, finite, interval
 from evaluators.report.pairs import pair_tables
-from evaluators.report.run_folder import Run
 from evaluators.report.strata import NOT_BESIDE, VALUES, Strata
 
 LETTER_PT, LINE_PT = 6.0, 12.0  # width and height of a letter of a name, points

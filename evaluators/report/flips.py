@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from alpasim_plugin.run_folder.reader import Run, read_json
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.report.frames import inline_jpeg
 from evaluators.report.numbers import Cell, fixed, missing, short
-from evaluators.report.run_folder import Rollout, Run, read_json
 
 FLIPS_NAME = "flips.json"
 OUTCOMES = {  # metric -> word, most severe first

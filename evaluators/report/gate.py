@@ -9,9 +9,9 @@ from pathlib import Path
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.gate.judge import Check, GateVerdict
 from evaluators.report.junit import junit
-from evaluators.report.run_folder import Run
 from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, table
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"

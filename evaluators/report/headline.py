@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.report.certificate import certificate_caution
 from evaluators.report.fixers import fixer_cautions
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
 from evaluators.report.pairs import pair_tables
 from evaluators.report.plans import plan_warnings
-from evaluators.report.run_folder import Run
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 

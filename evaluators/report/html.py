@@ -15,6 +15,10 @@ from markupsafe import Markup
 
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.run_folder.reader import Run, reporting
+from alpasim_plugin.run_folder.rows import Series
+from alpasim_plugin.run_folder.schema import AGAIN, DOING
+from evaluators.opening import read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
 from evaluators.report.certificate import certificate
@@ -30,7 +34,6 @@ from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
 from evaluators.report.provenance import provenance
-from evaluators.report.run_folder import AGAIN, DOING, Run, Series, read_run, reporting
 from evaluators.report.scene_table import SCENE_METRICS, scene_rows
 from evaluators.report.speed import speed
 from evaluators.report.strata import heads, strata, stratum_rows

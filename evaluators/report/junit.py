@@ -10,7 +10,9 @@ from pathlib import Path
 
 from alpasim_plugin.core.escape import xml as clean
 from alpasim_plugin.io.atomic import write_text
-from evaluators.report.run_folder import Rollout, Run, read_run, reporting
+from alpasim_plugin.run_folder.reader import Run, reporting
+from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import read_run
 
 MAX_WITH_VALUES = 2000  # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
 

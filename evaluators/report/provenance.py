@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evaluators.report.run_folder import Run
+from alpasim_plugin.run_folder.reader import Run
 
 MAX_SCENES = 1000
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.report.events import COLLISION
 from evaluators.report.metric_info import in_percent
 from evaluators.report.numbers import Cell, duration, fixed, missing, short
-from evaluators.report.run_folder import Rollout, Run
 
 MAX_SCENE_ROWS = 600  # more are a page that loads and scrolls slowly
 TELLING_ROWS = 200  # shown of a larger run

@@ -9,11 +9,12 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.aggregate.intervals import clustered
 from evaluators.report.events import COLLISION
 from evaluators.report.metric_info import meaning
 from evaluators.report.numbers import Cell, fixed, missing, plural, short
-from evaluators.report.run_folder import Own, Rollout, Run, series_by_cell
 
 DISTANCE, OPACITY = "lateral_offset_m", "opacity_mean"
 DISTANCE_EDGES_M = (0.25, 0.5, 1.0, 2.0)

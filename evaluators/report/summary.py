@@ -8,13 +8,15 @@ from pathlib import Path
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.run_folder.reader import Run, reporting
+from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import read_run
 from evaluators.report import tables
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
 from evaluators.report.fixers import COLUMNS, fixer_rows
 from evaluators.report.headline import find
 from evaluators.report.numbers import Cell, plural
 from evaluators.report.provenance import provenance
-from evaluators.report.run_folder import Rollout, Run, read_run, reporting
 from evaluators.report.speed import speed
 
 MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from alpasim_plugin.run_folder.reader import Run
 from evaluators.report.headline import more_scenes_text, tone_of
 from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, meaning, ordered
 from evaluators.report.numbers import (
@@ -23,7 +24,6 @@ from evaluators.report.numbers import (
     short,
 )
 from evaluators.report.pairs import pair_tables
-from evaluators.report.run_folder import Run
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.checksums import read_sealed
 from alpasim_plugin.io.lock import holder_of
 from alpasim_plugin.io.reading.files import as_shape, read_json_as
-from evaluators.report.shapes import RunInfo, Summary
+from alpasim_plugin.run_folder.schema import CONTENTS, LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
+from alpasim_plugin.run_folder.shapes import RunInfo, Summary
 
-RUN_INFO, SUMMARY, ROLLOUTS = "run.json", "summary.json", "rollouts.parquet"
-CONTENTS, LOCK = "contents.json", ".simrun.lock"
 DOING = "listing runs"
 CHECK = "simrun check RUN says what is damaged"
 
@@ -110,7 +109,7 @@ class RunEntry:
     def metric(self, metric: str, renderer: str, policy: str) -> Mapping[str, Any]:
         """Return the entry of a metric in ``summary.json``; empty where it has none."""
         table = self.summary.get("metrics") or {}
-        of = table.get(f"{renderer}/{policy}") or (table.get(renderer) if len(self.info.get("policies") or ()) == 1 else None) or {}
+        of = table.get(cell_name(renderer, policy)) or (table.get(renderer) if len(self.info.get("policies") or ()) == 1 else None) or {}
         return of.get(metric) or {}
 
     def as_dict(self) -> dict[str, Any]:

@@ -9,16 +9,15 @@ from itertools import pairwise
 from typing import Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.io.reading.tables import Kind, read_parquet
+from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, columns_of
+from alpasim_plugin.run_folder.sides import RendererRows, Row
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.rows import RendererRows, Row
 from evaluators.aggregate.verdict import default_margin
 from evaluators.metrics import declare_from
 from evaluators.runs.changes import Change, changes
-from evaluators.runs.entry import CHECK, ROLLOUTS, RunEntry, as_time
+from evaluators.runs.entry import CHECK, RunEntry, as_time
 
 DOING = "comparing many runs"
-KEYS: dict[str, Kind] = {"renderer": "text", "policy": "text", "scene": "text", "seed": "integer", "status": "text"}
 
 
 @dataclass(frozen=True)
@@ -225,13 +224,9 @@ class _Tables:
     def _split(self, entry: RunEntry) -> dict[tuple[str, str], list[Row]]:
         stated = {name for table in (entry.summary.get("metrics") or {}).values() for name in table}
         metrics = [name for name in self._metrics if name in stated]
-        columns = KEYS | {name: kind for metric in metrics for name, kind in _columns(metric)}
-        table = read_parquet(entry.folder / ROLLOUTS, DOING, columns, CHECK, only=True)
+        columns = [*ROLLOUTS_TABLE.required, *(column.name for column in columns_of(metrics))]
+        table = ROLLOUTS_TABLE.read(entry.folder / ROLLOUTS, DOING, CHECK, columns)
         split: dict[tuple[str, str], list[Row]] = {}
         for row in table.to_pylist():
             split.setdefault((row["renderer"], row["policy"]), []).append(row)
         return split
-
-
-def _columns(metric: str) -> tuple[tuple[str, Kind], tuple[str, Kind]]:
-    return (metric, "number"), (f"{metric}_valid", "flag")

@@ -19,7 +19,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.plugins.parts import digest
-from evaluators.aggregate.rows import Row, by_renderer
+from alpasim_plugin.run_folder.sides import Row, by_renderer
 from evaluators.sequential.draws import Draws, without_replacement
 from evaluators.sequential.question import MetricQuestion
 from evaluators.sequential.strata import Strata, families_of, stratified

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.types import F64, Bool
-from evaluators.aggregate.rows import Side
+from alpasim_plugin.run_folder.sides import Side
 from evaluators.metrics import info
 
 

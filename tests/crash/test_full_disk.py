@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
-from alpasim_plugin.runtime.check import inspect_run
+from alpasim_plugin.run_folder.check import inspect_run
 from tests.runtime.test_run_folders import plan_of, run
 from tests.runtime.test_runs import comparable
 

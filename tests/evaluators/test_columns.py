@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.run_folder import columns
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.sides import RendererRows
 from evaluators import aggregate, paired
-from evaluators.aggregate import columns
-from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.overall import numbers
 from evaluators.aggregate.paired import base_pairs
-from evaluators.aggregate.rows import RendererRows
 from evaluators.gate import GateSpec, judge, judge_table
 
 METRICS = ("offroad", "progress", "lateral_distance_m", "min_distance_to_obstacle_m")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from evaluators.aggregate.rows import by_renderer
+from alpasim_plugin.run_folder.sides import by_renderer
 from evaluators.sequential.differences import SceneDifferences, scene_differences
 from evaluators.sequential.seeds import best_seeds, next_seeds, scarce_seeds, variances
 

@@ -164,7 +164,7 @@ def make_run(folder: Path) -> None:
 
 def make_baseline(folder: Path) -> None:
     from evaluators.gate import write_baseline
-    from evaluators.report.run_folder import read_run
+    from evaluators.opening import read_run
 
     make_run(folder)
     write_baseline(read_run(folder / "run"), folder / "baseline.json")

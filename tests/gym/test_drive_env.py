@@ -16,8 +16,9 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Observation, Plan, Policy
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.run_folder.schema import LOG_NAME
 from alpasim_plugin.runtime.compose import make_renderer
-from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
+from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout
 from evaluators import score
 from policies import make_policy

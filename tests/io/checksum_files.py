@@ -1,4 +1,4 @@
-"""Make a folder that a test wrote or changed by hand into one that a run wrote: with seals, digests and contents."""
+"""Make a folder that a test wrote or changed by hand into one that a run wrote: with checksums and contents."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from alpasim_plugin.io.checksums import SEAL
-from alpasim_plugin.runtime.contents import write_contents, write_run_json
-from alpasim_plugin.runtime.manifests import MANIFEST, STEPS_NAME, read_manifest, write_manifest
+from alpasim_plugin.run_folder.manifests import read_manifest, write_contents, write_manifest, write_run_json
+from alpasim_plugin.run_folder.schema import MANIFEST, STEPS_NAME
 
 
 def vouch_for(root: Path) -> Path:

@@ -17,8 +17,8 @@ from scipy.interpolate import CubicSpline
 
 from evaluators.aggregate import aggregate, censoring, paired
 from evaluators.aggregate.paired import base_pairs
+from evaluators.opening import read_run
 from evaluators.report.flips import find_flips
-from evaluators.report.run_folder import read_run
 
 METRICS = (
     "collision_any",

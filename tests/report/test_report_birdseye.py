@@ -10,9 +10,11 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import read_run
 from evaluators.report.birdseye import path_data, scene_view
 from evaluators.report.events import events_of, read_series
-from evaluators.report.run_folder import Rollout, Run, read_run
 from tests.report.make_run import Plan, make_run
 
 VARIANTS = {("a", "p"): (0, 0)}

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from alpasim_plugin.run_folder.reader import Run
+from evaluators.opening import read_run
 from evaluators.report.headline import find, tone_of
-from evaluators.report.run_folder import Run, read_run
 from tests.report.make_run import Plan, make_run
 
 

@@ -14,9 +14,9 @@ import pytest
 
 import evaluators.report.html as html
 from alpasim_plugin.core.errors import InfrastructureError
+from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.report.charts import Curve, line_chart
-from evaluators.report.run_folder import read_run
 from tests.report.make_run import Plan, make_run
 
 VOID = {"meta", "link", "img", "input", "br", "wbr"}

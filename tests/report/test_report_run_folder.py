@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.report.run_folder import read_run, series_by_cell
+from alpasim_plugin.run_folder.rows import series_by_cell
+from evaluators.opening import read_run
 
 
 def test_reads_every_rollout_with_its_key(usual_run: Path) -> None:

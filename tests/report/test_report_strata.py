@@ -7,11 +7,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.report.certificate import certificate
 from evaluators.report.figures import _line, forest, speed_against_error, strata_chart
 from evaluators.report.headline import find
-from evaluators.report.run_folder import Rollout, Run, read_run
 from evaluators.report.strata import strata, stratum_rows
 from tests.report.make_run import Plan, make_run
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from evaluators.opening import read_run
 from evaluators.report import render_table
 from evaluators.report.failures import failure_rows, ledger
 from evaluators.report.numbers import DASH
-from evaluators.report.run_folder import read_run
 from evaluators.report.scene_table import scene_rows
 from evaluators.report.speed import speed
 from evaluators.report.tables import columns, metric_rows, pair_rows
@@ -143,7 +143,7 @@ def test_speed_keeps_stages_that_only_some_renderers_have(usual_run: Path) -> No
 
 
 def test_renderer_without_frames_has_no_speed() -> None:
-    from evaluators.report.run_folder import Run
+    from alpasim_plugin.run_folder.reader import Run
 
     nothing = dict.fromkeys(("ms_per_frame_p50", "ms_per_frame_mean", "ms_per_frame_p95", "frames_per_s", "first_frame_ms"))
     speeds = {"a": nothing | {"stages": {}}}

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.runtime.contents import write_contents, write_run_json
-from alpasim_plugin.runtime.store import rollouts_schema, write_table
+from alpasim_plugin.run_folder.manifests import write_contents, write_run_json
+from alpasim_plugin.run_folder.schema import ROLLOUTS_TABLE
+from alpasim_plugin.run_folder.writer import write_table
 from evaluators import aggregate
 
 COMMITS = ("3f2a9c1d" * 5, "8b07ee42" * 5, "c51d9a60" * 5)
@@ -47,7 +48,7 @@ def make_one(root: Path, one: Many) -> Path:
     folder = root / one.name
     rows = rows_of(one)
     write_run_json(folder, info_of(one) | {"outcome": {"n_rollouts": len(rows), "n_failed": 0}})
-    write_table(folder / "rollouts.parquet", rows, rollouts_schema(METRICS))
+    write_table(folder / "rollouts.parquet", rows, ROLLOUTS_TABLE.arrow(METRICS))
     metrics: dict[str, Any] = {}
     for policy in one.policies:
         found = aggregate([row for row in rows if row["policy"] == policy])

@@ -9,7 +9,9 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from evaluators.report.run_folder import Run, read_run, series_by_cell
+from alpasim_plugin.run_folder.reader import Run
+from alpasim_plugin.run_folder.rows import series_by_cell
+from evaluators.opening import read_run
 from tests.report.make_run import Plan, make_run
 
 duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed: pip install duckdb")

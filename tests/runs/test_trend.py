@@ -12,7 +12,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from evaluators.gate.across import compare_runs
-from evaluators.report.run_folder import read_run
+from evaluators.opening import read_run
 from evaluators.runs.changes import changes
 from evaluators.runs.entry import RunEntry
 from evaluators.runs.find import find_runs

@@ -11,9 +11,9 @@ import pytest
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario, SensorSpec
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.renderers.gaussian import CleanRenderer
+from alpasim_plugin.run_folder.manifests import read_manifest
 from alpasim_plugin.runtime.certificate import Certify, certificate_line, certify
 from alpasim_plugin.runtime.execute import HowToRun, Threads, execute
-from alpasim_plugin.runtime.manifests import read_manifest
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
 from policies import ConstantVelocity

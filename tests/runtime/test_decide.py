@@ -11,12 +11,11 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.contents import CONTENTS
+from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST
 from alpasim_plugin.runtime.decide import Decided, Design, drawing_order, execute_decision, key_of
-from alpasim_plugin.runtime.manifests import MANIFEST
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
+from evaluators.opening import read_run
 from evaluators.report.html import render_report
-from evaluators.report.run_folder import read_run
 from evaluators.sequential.question import Question, metric_question
 from evaluators.sequential.record import DECISION, read_decision
 from scenarios.suite import ScenarioRef, expand

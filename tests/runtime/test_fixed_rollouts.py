@@ -28,7 +28,8 @@ from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.renderers import make_renderer
-from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
+from alpasim_plugin.run_folder.schema import LOG_NAME
+from alpasim_plugin.runtime.recorder import Recorder
 from policies.simple import LogReplay
 from tests.examples import first_of
 from tests.fixers.block_fixers import Blend, GivesFloats, GuardSteps, LosesAFrame, Raises, ShiftsTime, fixed_offline

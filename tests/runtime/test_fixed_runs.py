@@ -16,7 +16,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.runtime.cell import MANIFEST
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.runtime.tables import speed
+from alpasim_plugin.runtime.summary import speed
 from scenarios.suite import expand
 from tests.runtime.test_runs import Announced, comparable
 

@@ -13,7 +13,8 @@ from alpasim_plugin import make_policy, make_renderer, run_rollout
 from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory
 from alpasim_plugin.core.types import Frame, Latency, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec
-from alpasim_plugin.runtime.recorder import LOG_NAME, Recorder
+from alpasim_plugin.run_folder.schema import LOG_NAME
+from alpasim_plugin.runtime.recorder import Recorder
 from tests.examples import first_of
 
 

@@ -13,12 +13,12 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.io.atomic import temporary_path
-from alpasim_plugin.runtime.check import inspect_run
+from alpasim_plugin.run_folder.check import inspect_run
+from alpasim_plugin.run_folder.writer import remove_left_overs
 from alpasim_plugin.runtime.logged_rollout import find_rollout
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import execute_run
 from alpasim_plugin.runtime.score_logs import check_vouched
-from alpasim_plugin.runtime.writing import remove_left_overs
 from scenarios.suite import expand
 from tests.runtime.test_runs import Announced, comparable
 

@@ -14,9 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.run_folder.schema import slug
 from alpasim_plugin.runtime.cell import MANIFEST
 from alpasim_plugin.runtime.execute import Threads, thread_budget
-from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan, slug
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, execute_run
 from scenarios.suite import expand
 from tests.runtime.grey_renderer import GREY

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.io.checksums import SEAL
+from alpasim_plugin.run_folder.manifests import write_manifest
+from alpasim_plugin.run_folder.reader import read_json
+from alpasim_plugin.run_folder.schema import LOG_NAME, MANIFEST
 from alpasim_plugin.runtime import plan
-from alpasim_plugin.runtime.manifests import MANIFEST, write_manifest
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
-from alpasim_plugin.runtime.recorder import LOG_NAME
 from alpasim_plugin.runtime.run import execute_run
-from alpasim_plugin.runtime.store import read_json
 from scenarios.suite import expand
 from tests.runtime.test_runs import Announced
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.store import read_json
+from alpasim_plugin.run_folder.reader import read_json
 
 
 @pytest.mark.parametrize(("content", "found"), [(None, "no such file"), ("{", "broken JSON")])

@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.geometry import quat_from_yaw, se3
 from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, Trajectory, Vehicle
 from alpasim_plugin.log import AslWriter, RolloutHeader, write_facts
-from alpasim_plugin.runtime.contents import write_run_json
-from alpasim_plugin.runtime.manifests import write_manifest
-from evaluators.report.run_folder import Rollout, read_run
+from alpasim_plugin.run_folder.manifests import write_manifest, write_run_json
+from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import read_run
 from tests.report.make_run import DT_US, Plan, make_run
 
 CAMERA = CameraSpec("front", 64, 36, np.array([[40.0, 0, 32], [0, 40, 18], [0, 0, 1]]), np.eye(4))

@@ -10,13 +10,12 @@ from urllib.parse import quote
 
 import pytest
 
-from alpasim_plugin.runtime.unfinished import read_so_far
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import Options
 from alpasim_plugin.viewer.serve import RunServer
 from alpasim_plugin.viewer.write import write_page
+from evaluators.opening import read_run, read_so_far
 from evaluators.report import write_report
-from evaluators.report.run_folder import read_run
 from tests.report.browser import Browser
 from tests.report.make_run import Plan
 from tests.viewer.axe import MISSING, SERIOUS, find_axe, findings

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import alpasim_plugin.lab.video_metrics.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
 from alpasim_plugin.process.processes import resident_mb
 from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
-from evaluators.aggregate.columns import RolloutTable
+from alpasim_plugin.run_folder.columns import RolloutTable
 from evaluators.aggregate.summary import aggregate, aggregate_sides
 from evaluators.metrics import METRICS
 

@@ -42,8 +42,8 @@ from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, available, load_distance, weights_folder
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.plugins.parts import build, resolve
+from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.runtime.executors.local import map_jobs
-from alpasim_plugin.runtime.store import read_json
 
 FRAMES = 198  # of a clip at most, as in the paper
 JUDGE_SEEDS = (0, 1)

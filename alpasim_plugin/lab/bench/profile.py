@@ -24,9 +24,9 @@ from alpasim_plugin.gaussians.raster.prepared import prepare
 from alpasim_plugin.lab.bench.aggregation import write_random_table
 from alpasim_plugin.lab.bench.evaluators import PAPER, busy_road
 from alpasim_plugin.lab.bench.raster import SKY, driving_camera, driving_like_scene
+from alpasim_plugin.run_folder.columns import RolloutTable
 from alpasim_plugin.runtime.cell import run_cell
 from alpasim_plugin.runtime.plan import RunOptions, make_plan
-from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.overall import numbers
 from evaluators.base import score
 from scenarios.suite import expand

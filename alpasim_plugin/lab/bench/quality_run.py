@@ -36,9 +36,9 @@ from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
 from alpasim_plugin.nets.checkpoints import file_sha256
 from alpasim_plugin.plugins.parts import build
+from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.runtime.executors.local import map_jobs
 from alpasim_plugin.runtime.provenance import hardware, versions
-from alpasim_plugin.runtime.store import read_json
 
 DOING = "measuring quality"
 Given = Literal["render", "truth", "lost-resolution"]  # what the fixers get

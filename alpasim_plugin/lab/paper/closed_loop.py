@@ -14,9 +14,9 @@ from alpasim_plugin.lab.paper.claims import behind
 from alpasim_plugin.lab.paper.measured import Difference, Measured
 from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.tables import markdown_table, paper_against_ours
+from alpasim_plugin.run_folder.sides import Row, by_renderer
 from evaluators.aggregate.intervals import Interval
 from evaluators.aggregate.paired import compare, paired_sides
-from evaluators.aggregate.rows import Row, by_renderer
 from evaluators.aggregate.summary import aggregate_sides
 from evaluators.aggregate.verdict import default_margin
 from evaluators.metrics import info

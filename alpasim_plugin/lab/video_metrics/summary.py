@@ -14,9 +14,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.lab.video_metrics.facts import FACTS, MS, SOMETIMES, WARP
+from alpasim_plugin.run_folder.sides import by_renderer
 from evaluators.aggregate.intervals import t_interval
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.rows import by_renderer
 
 Row = Mapping[str, Any]
 TRUTH = "truth"  # the variant of the ground-truth frames: only metrics without a reference are measured on it

@@ -27,8 +27,8 @@ from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.plugins.parts.source import OWN_ROOT
 from alpasim_plugin.process.processes import is_running
 from alpasim_plugin.renderers.cache import cached
+from alpasim_plugin.run_folder.writer import remove_left_overs
 from alpasim_plugin.runtime.executors.base import Node
-from alpasim_plugin.runtime.writing import remove_left_overs
 
 GONE_S = 5.0  # within which a killed process must be gone
 KIND = "placed"

@@ -10,8 +10,8 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.io.atomic import disk_error
-from alpasim_plugin.runtime.manifests import DERIVED, DRIVEN, MANIFEST, read_manifest, write_manifest
-from alpasim_plugin.runtime.recorder import OUTPUT_NAME
+from alpasim_plugin.run_folder.manifests import read_manifest, write_manifest
+from alpasim_plugin.run_folder.schema import DERIVED, DRIVEN, MANIFEST, OUTPUT_NAME
 
 NAMES = (*DRIVEN, *DERIVED)
 

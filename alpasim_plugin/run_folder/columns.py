@@ -2,7 +2,7 @@
 
 The key columns are read once and kept as codes (25 bytes a rollout). A metric is streamed in batches when a statistic asks for it; as
 many metrics are kept as `KEPT_BYTES` hold. So a million rollouts with fifty metrics fit in a few hundred megabytes, and more are only
-slower. `evaluators.aggregate.rows.RendererRows` is the readable reference.
+slower. `alpasim_plugin.run_folder.sides.RendererRows` is the readable reference.
 """
 
 from __future__ import annotations
@@ -22,17 +22,14 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.io.reading.tables import Kind, check_parquet
-from evaluators.aggregate.rows import Cell, Side
+from alpasim_plugin.run_folder.schema import ROLLOUTS_TABLE, VALID, metrics_in
+from alpasim_plugin.run_folder.sides import Cell, Side
 
 DOING = "aggregating rollouts"
 AGAIN = "write the tables of this run again with its own command"
-KEYS: dict[str, Kind] = {"renderer": "text", "policy": "text", "scene": "text", "seed": "integer", "status": "text"}
 TEXTS = ("renderer", "policy", "scene", "status", "failure_class")
-VALID = "_valid"
 KEPT_BYTES = 512 << 20  # metrics held in memory
 BATCH_ROWS = 1 << 17
-
 
 Reasons = Callable[[str, str], str]  # (renderer, metric)
 
@@ -58,13 +55,13 @@ class RolloutTable:
 
     def __init__(self, data: pads.Dataset, where: str, reasons: Reasons = _unknown) -> None:
         self._data, self._where, self.reasons = data, where, reasons
-        self.metrics = [name.removesuffix(VALID) for name in data.schema.names if name.endswith(VALID)]
+        self.metrics = list(metrics_in(data.schema.names))
         self._kept: dict[str, F64] = {}
         codes: dict[str, list[I64]] = {name: [] for name in ("renderer", "policy", "scene")}
         self._names: dict[str, dict[str, int]] = {name: {} for name in TEXTS}
         seeds, ok, failures = [], [], []
         has_class = "failure_class" in data.schema.names
-        for batch in self._batches([*KEYS, *(["failure_class"] if has_class else [])]):
+        for batch in self._batches([*ROLLOUTS_TABLE.required, *(["failure_class"] if has_class else [])]):
             for name, parts in codes.items():
                 parts.append(_codes(batch.column(name), self._names[name]))
             seeds.append(batch.column("seed").to_numpy(zero_copy_only=False).astype(np.int64, copy=False))
@@ -88,7 +85,7 @@ class RolloutTable:
             InputError: A file is no such table.
         """
         for path in paths:
-            check_parquet(path, DOING, KEYS, AGAIN)
+            ROLLOUTS_TABLE.check(path, DOING, AGAIN)
         where = ", ".join(map(str, paths[:3])) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
         with parsing(DOING, where, AGAIN, "no tables that fit together"):
             schema = pa.unify_schemas([pq.read_schema(path) for path in paths], promote_options="permissive")

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.contents import AGAIN, CONTENTS, DOING, RUN_INFO, Contents, damaged_files, read_contents, read_run_json
-from alpasim_plugin.runtime.manifests import MANIFEST, Damage, inspect_rollout
-from alpasim_plugin.runtime.plan import rollout_folder
+from alpasim_plugin.run_folder.manifests import AGAIN, Contents, Damage, damaged_files, inspect_rollout, read_contents, read_run_json
+from alpasim_plugin.run_folder.schema import CONTENTS, DOING, MANIFEST, ROLLOUTS_FOLDER, RUN_INFO, TABLES, rollout_folder
 
 NOT_FINISHED = "missing: the run is not finished, or an older version wrote it"
 NEWER = "newer than the tables"
-ROLLOUTS_FOLDER = "rollouts"
+REMADE = (*TABLES, CONTENTS, RUN_INFO)  # can be made again from the manifests
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,12 @@ class Inspection:
         """List what is damaged in the rollouts."""
         return [one for one in self.damage if one.cell and one.problem != NEWER]
 
+    @property
+    def is_remakable(self) -> bool:
+        """Tell whether everything that is damaged can be made again from the rollouts' manifests."""
+        of_rollouts = self.of_rollouts or self.unfinished or self.tables_only
+        return bool(self.cells) and not of_rollouts and all(one.file in REMADE or one.cell for one in self.of_run)
+
 
 def inspect_run(root: Path, full: bool = False, on_cell: Callable[[int, int], None] | None = None) -> Inspection:
     """Compare a run folder with its manifests and its contents.
@@ -81,7 +86,7 @@ def inspect_run(root: Path, full: bool = False, on_cell: Callable[[int, int], No
         damage += state.damage
         if state.manifest is None and not state.damage:
             unfinished.append(cell)
-        elif contents is not None and state.manifest is not None and state.seal != contents.rollouts[cell]:
+        elif contents is not None and state.manifest is not None and state.checksum != contents.rollouts[cell]:
             damage.append(Damage(cell, MANIFEST, NEWER))
         if on_cell is not None:
             on_cell(done, len(cells))

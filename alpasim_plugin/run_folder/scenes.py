@@ -1,17 +1,77 @@
-"""The part of a scenario that a report draws, as plain JSON, so that a run folder needs no source files."""
+"""``scenes/SCENE.json``: the part of a scenario that a report draws, so that a run folder needs no source files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import TypedDict
 
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.types import F64, Actor, LaneMap, Scenario, Scene, Trajectory, Vehicle
+from alpasim_plugin.io.atomic import write_json
+from alpasim_plugin.run_folder.schema import SCENES, slug
 
 ACTOR_STEP_US = 250_000
+
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
+
+
+class DrawnLane(TypedDict, total=False):
+    """A lane in a scene's file."""
+
+    left: Line | None
+    right: Line | None
+    paint: Annotated[list[str], Field(min_length=2, max_length=2)]
+
+
+class DrawnDrive(TypedDict):
+    """The recorded drive in a scene's file."""
+
+    x_m: list[Coordinate]
+    y_m: list[Coordinate]
+
+
+class Body(TypedDict, total=False):
+    """The ego's body in a scene's file."""
+
+    length_m: Coordinate
+    width_m: Coordinate
+    rear_axle_to_centre_m: Coordinate
+
+
+class DrawnActor(TypedDict, total=False):
+    """A road user in a scene's file; tracks as recorded or scripted."""
+
+    id: str
+    label: str
+    static: bool
+    reacts: bool
+    length_m: Coordinate
+    width_m: Coordinate
+    t_us: list[int]
+    x_m: list[Coordinate]
+    y_m: list[Coordinate]
+    yaw_rad: list[Coordinate]
+
+
+class SceneFile(TypedDict, total=False):
+    """``scenes/SCENE.json``: what the bird's-eye view draws."""
+
+    scene_id: str
+    source: str
+    start_us: int
+    lanes: list[DrawnLane]
+    road_edges: list[Line]
+    crosswalks: list[Line]
+    ego_log: DrawnDrive
+    vehicle: Body
+    actors: list[DrawnActor]
 
 
 @dataclass(frozen=True)
@@ -47,6 +107,11 @@ class LoggedScene:
     def vehicle(self) -> Vehicle:
         """Give the ego's body."""
         return self.scene.vehicle
+
+
+def write_scene(root: Path, scenario: Scenario | LoggedScene) -> None:
+    """Write the file of a scene into a run folder."""
+    write_json(root / SCENES / f"{slug(scenario.scene_id)}.json", scene_as_json(scenario))
 
 
 def scene_as_json(scenario: Scenario | LoggedScene) -> dict[str, Any]:

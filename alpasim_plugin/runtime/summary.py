@@ -1,60 +1,27 @@
-"""From manifests to the tables and the summary of a run folder (docs/architecture.md)."""
+"""``summary.json`` of a run folder: numbers, failures and times, made from the manifests."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.runtime.contents import ROLLOUTS, STEPS, SUMMARY
+from alpasim_plugin.run_folder.columns import RolloutTable
+from alpasim_plugin.run_folder.schema import KEYS, SUMMARY
+from alpasim_plugin.run_folder.writer import write_tables
 from alpasim_plugin.runtime.execute import Threads
-from alpasim_plugin.runtime.manifests import STEPS_NAME
 from alpasim_plugin.runtime.provenance import fixers
 from alpasim_plugin.runtime.recorder import plan_table
-from alpasim_plugin.runtime.store import rollouts_schema, steps_schema, write_parquet, write_parquet_parts
 from evaluators import censoring
-from evaluators.aggregate.columns import RolloutTable
 from evaluators.aggregate.overall import NO_BASES, by_policy, numbers
-from evaluators.aggregate.reduce import value_in_manifest
-
-CHUNK_ROWS = 4096
 
 
-def rollout_rows(manifests: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one flat row per rollout: its key, its status, and every metric with its validity."""
-    rows = []
-    for manifest in manifests:
-        error = manifest.get("error") or {}
-        row: dict[str, Any] = {
-            **{key: manifest[key] for key in ("renderer", "policy", "scene", "seed", "status", "path", "wall_s")},
-            **{key: manifest[key] for key in ("rollout",) if key in manifest},
-            "failure_class": error.get("failure_class"),
-            "failure": error.get("found"),
-            "frames": manifest.get("frames"),
-            "steps": manifest.get("steps"),
-        }
-        for name, entry in manifest.get("metrics", {}).items():
-            row[name] = value_in_manifest(entry)
-            row[f"{name}_valid"] = entry["valid"]
-        rows.append(row)
-    return rows
-
-
-def rollout_table(manifests: Sequence[dict[str, Any]]) -> pa.Table:
-    """Return the content of ``rollouts.parquet``, a row per manifest, made in chunks: rows as dictionaries take ten times the memory."""
-    metrics = list(dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {})))
-    schema = rollouts_schema(metrics, any("rollout" in manifest for manifest in manifests))
-    starts = range(0, len(manifests), CHUNK_ROWS)
-    batches = [pa.RecordBatch.from_pylist(rollout_rows(manifests[start : start + CHUNK_ROWS]), schema) for start in starts]
-    return pa.Table.from_batches(batches, schema)
-
-
-def write_tables(
+def write_summary(
     root: Path,
     manifests: Sequence[dict[str, Any]],
     preset: str,
@@ -62,7 +29,7 @@ def write_tables(
     more: Mapping[str, Any],
     bases: Mapping[str, str] = NO_BASES,
 ) -> dict[str, Any]:
-    """Write rollouts.parquet, steps.parquet and summary.json and return the summary.
+    """Write the tables and ``summary.json`` of a run folder and return the summary.
 
     Args:
         root: The run folder; the manifests' rollouts are below it.
@@ -73,10 +40,8 @@ def write_tables(
         bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
             baseline, the two are paired too.
     """
-    rollouts = rollout_table(manifests)
-    write_parquet(root / ROLLOUTS, rollouts)
+    rollouts = write_tables(root, manifests)
     done = [m for m in manifests if m["status"] == "ok"]
-    write_parquet_parts(root / STEPS, steps_schema("rollout" in rollouts.column_names), (root / m["path"] / STEPS_NAME for m in done))
     summary = {
         "preset": preset,
         **numbers(RolloutTable.of_table(rollouts), baseline, bases),
@@ -172,9 +137,6 @@ def pool_of(manifests: Sequence[dict[str, Any]], threads: Threads, wall_s: float
 
 def _failures(manifests: Sequence[dict[str, Any]]) -> dict[str, Any]:
     failed = [m for m in manifests if m["status"] != "ok"]
-    classes: dict[str, int] = {}
-    for manifest in failed:
-        name = manifest["error"]["failure_class"]
-        classes[name] = classes.get(name, 0) + 1
-    cells = [{k: m[k] for k in ("renderer", "policy", "scene", "seed", "path", "error")} for m in failed]
-    return {"n_failed": len(failed), "n_rollouts": len(manifests), "by_class": classes, "cells": cells}
+    by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
+    cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
+    return {"n_failed": len(failed), "n_rollouts": len(manifests), "by_class": by_class, "cells": cells}

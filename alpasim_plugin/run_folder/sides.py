@@ -1,4 +1,4 @@
-"""Rollout rows: reading metric values out of them, flat (rollouts.parquet) or nested (manifests), and laying them out by cell."""
+"""Rollouts laid out by cell, for statistics; here from rows in memory, flat (rollouts.parquet) or nested (manifests)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, Bool
+from alpasim_plugin.run_folder.schema import VALID, metrics_in
 
 Row = Mapping[str, Any]
 Cell = tuple[str, str, int]  # policy, scene, seed: what two renderers share
@@ -19,26 +20,28 @@ Cell = tuple[str, str, int]  # policy, scene, seed: what two renderers share
 def value_of(row: Row, metric: str) -> float | None:
     """Return a metric of a row, None where absent, not valid, or not finite."""
     nested = row.get("metrics")
-    if isinstance(nested, Mapping):
-        entry = nested.get(metric)
-        if entry is None:
-            return None
-        value, valid = (entry["value"], entry["valid"]) if isinstance(entry, Mapping) else (entry.value, entry.valid)
+    if not isinstance(nested, Mapping):
+        value, valid = row.get(metric), row.get(metric + VALID, True)
     else:
-        value, valid = row.get(metric), row.get(f"{metric}_valid", True)
-    if not valid or value is None:
-        return None
-    number = float(value)
-    return number if np.isfinite(number) else None
+        value, valid, _ = _entry_of(nested, metric)
+    return float(value) if valid and value is not None and np.isfinite(float(value)) else None
 
 
 def reason_of(row: Row, metric: str) -> str:
     """Return why a metric of a rollout is not valid, as far as the row knows."""
     nested = row.get("metrics")
-    entry = nested.get(metric) if isinstance(nested, Mapping) else None
+    if isinstance(nested, Mapping) and nested.get(metric) is not None:
+        return str(_entry_of(nested, metric)[2])
+    return str(row.get(f"{metric}_reason") or "not given")
+
+
+def _entry_of(metrics: Mapping[str, Any], metric: str) -> tuple[Any, Any, Any]:
+    """Return value, valid and reason of a metric of a manifest, or of a reduction that was not written yet."""
+    entry = metrics.get(metric)
     if entry is None:
-        return str(row.get(f"{metric}_reason") or "not given")
-    return str(entry["reason"] if isinstance(entry, Mapping) else entry.reason)
+        return None, False, ""
+    facts = entry if isinstance(entry, Mapping) else vars(entry)
+    return facts["value"], facts["valid"], facts["reason"]
 
 
 def failure_of(row: Row) -> str:
@@ -54,22 +57,15 @@ def metric_names(rows: Iterable[Row]) -> list[str]:
     for row in rows:
         nested = row.get("metrics")
         keys = tuple(nested if isinstance(nested, Mapping) else row)
-        if keys in seen:
-            continue
-        seen.add(keys)
-        flat = not isinstance(nested, Mapping)
-        names.update(dict.fromkeys(key[: -len("_valid")] if flat else key for key in keys if not flat or key.endswith("_valid")))
+        if keys not in seen:
+            seen.add(keys)
+            names.update(dict.fromkeys(keys if isinstance(nested, Mapping) else metrics_in(keys)))
     return list(names)
 
 
 def is_ok(row: Row) -> bool:
     """Return whether a rollout ran to its end."""
     return bool(row.get("status", "ok") == "ok")
-
-
-def renderers(rows: Iterable[Row]) -> list[str]:
-    """Return the renderers in order of appearance."""
-    return list(dict.fromkeys(str(row["renderer"]) for row in rows))
 
 
 def cell_of(row: Row) -> Cell:
@@ -132,7 +128,7 @@ class Side(ABC):
 
 @dataclass(frozen=True)
 class RendererRows(Side):
-    """A side made of rows in memory: for small tables, and the reference of `evaluators.aggregate.columns`."""
+    """A side made of rows in memory: for small tables, and the reference of `alpasim_plugin.run_folder.columns`."""
 
     rows: tuple[Row, ...]
     ok: Bool
@@ -158,7 +154,7 @@ class RendererRows(Side):
     def raw(self, metric: str) -> F64:
         """Return the metric of every row; see `Side.raw`."""
         if self._flat:
-            key = f"{metric}_valid"
+            key = metric + VALID
             found = np.array([row.get(metric) if row.get(key, True) else None for row in self.rows], dtype=np.float64)
         else:
             found = np.array([value_of(row, metric) for row in self.rows], dtype=np.float64)

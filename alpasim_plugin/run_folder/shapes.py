@@ -1,14 +1,15 @@
-"""Shapes of the JSON files of a run folder, as far as reports and gates rely on them; members that are not named may be anything.
+"""Shapes of the JSON files of a run folder, as far as readers rely on them; members that are not named may be anything.
 
 `alpasim_plugin.io.reading.read_json_as` compares a file with one of these before any of it is used.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field
 from typing_extensions import TypedDict
+
+from alpasim_plugin.io.checksums import FileFacts
 
 Number = float | None
 
@@ -66,6 +67,28 @@ class RunInfo(TypedDict, total=False):
     left_out: list[str]
     metrics: dict[str, Any]
     bases: dict[str, str]
+
+
+REQUIRED_OF_RUN = ("key", "command", "config", "preset", "renderers", "policies", "seeds", "scenes")  # every run.json has them
+
+
+class ManifestFile(TypedDict):
+    """``manifest.json`` of a rollout."""
+
+    files: dict[str, FileFacts]
+    renderer: str
+    policy: str
+    scene: str
+    path: str
+    status: str
+
+
+class ContentsFile(TypedDict):
+    """``contents.json``."""
+
+    files: dict[str, FileFacts]
+    rollouts: dict[str, str]
+    run: dict[str, Any]
 
 
 class Mean(TypedDict, total=False):
@@ -169,80 +192,3 @@ class Summary(TypedDict, total=False):
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
     plans: dict[str, dict[str, Any]]
-
-
-Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
-
-
-class DrawnLane(TypedDict, total=False):
-    """A lane in a scene's file."""
-
-    left: Line | None
-    right: Line | None
-    paint: Annotated[list[str], Field(min_length=2, max_length=2)]
-
-
-class DrawnDrive(TypedDict):
-    """The recorded drive in a scene's file."""
-
-    x_m: list[Coordinate]
-    y_m: list[Coordinate]
-
-
-class Body(TypedDict, total=False):
-    """The ego's body in a scene's file."""
-
-    length_m: Coordinate
-    width_m: Coordinate
-    rear_axle_to_centre_m: Coordinate
-
-
-class DrawnActor(TypedDict, total=False):
-    """A road user in a scene's file; tracks as recorded or scripted."""
-
-    id: str
-    label: str
-    static: bool
-    reacts: bool
-    length_m: Coordinate
-    width_m: Coordinate
-    t_us: list[int]
-    x_m: list[Coordinate]
-    y_m: list[Coordinate]
-    yaw_rad: list[Coordinate]
-
-
-class SceneFile(TypedDict, total=False):
-    """``scenes/SCENE.json``: what the bird's-eye view draws."""
-
-    scene_id: str
-    source: str
-    start_us: int
-    lanes: list[DrawnLane]
-    road_edges: list[Line]
-    crosswalks: list[Line]
-    ego_log: DrawnDrive
-    vehicle: Body
-    actors: list[DrawnActor]
-
-
-class StoredBaseline(TypedDict):
-    """A stored baseline of the gate."""
-
-    preset: str
-    scenes: dict[str, str]
-    weights: dict[str, Any]
-    rows: list[dict[str, Any]]
-    made_with: dict[str, Any]
-    schema_version: int
-
-
-class BaselineRow(TypedDict):
-    """The key and fate of a row of a stored baseline; its metrics are numbers or null, with flags NAME_valid."""
-
-    renderer: str
-    policy: str
-    scene: str
-    seed: int
-    status: str
