@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,16 +11,17 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import EvaluatorError, SimrunError
-from alpasim_plugin.core.types import I64, Bool, Evaluator, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.plugins.interfaces import Evaluator
 from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
 from alpasim_plugin.plugins.parts.builtin import BUILTIN
-from evaluators.metrics import declare, info
+from evaluators.metrics import METRICS, MetricTable, table_of
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset
 
 
 def resolve_evaluators(more: Sequence[str] = ()) -> tuple[PartSpec, ...]:
-    """Resolve every registered evaluator and declare the metrics that they bring.
+    """Resolve every registered evaluator; `evaluators.metrics.table_of` gives their metrics.
 
     Args:
         more: Further evaluators, as ``package.module:Class``.
@@ -28,20 +30,14 @@ def resolve_evaluators(more: Sequence[str] = ()) -> tuple[PartSpec, ...]:
         InputError: An evaluator cannot be imported, or two are named alike.
         EvaluatorError: Two declare one metric differently.
     """
-    return _declared((*names("evaluator"), *more))
+    specs = tuple(resolve("evaluator", name) for name in (*names("evaluator"), *more))
+    table_of(specs)
+    return specs
 
 
 def resolve_plugins() -> tuple[PartSpec, ...]:
-    """Resolve the evaluators of other packages alone, which makes their metrics known."""
-    return _declared([name for name in names("evaluator") if name not in BUILTIN["evaluator"]])
-
-
-def _declared(chosen: Sequence[str]) -> tuple[PartSpec, ...]:
-    specs = tuple(resolve("evaluator", name) for name in chosen)
-    for spec in specs:
-        for metric, facts in spec.metrics.items():
-            declare(metric, facts)
-    return specs
+    """Resolve the evaluators of other packages alone."""
+    return tuple(resolve("evaluator", name) for name in names("evaluator") if name not in BUILTIN["evaluator"])
 
 
 def score(
@@ -67,10 +63,10 @@ def score(
     chosen = find_preset(preset)
     check_rollout(rollout)
     out: dict[str, MetricSeries] = {}
-    for spec in resolve_evaluators() if evaluators is None else evaluators:
-        for metric, facts in spec.metrics.items():
-            declare(metric, facts)  # a worker process has not resolved the part, it only builds it
-        for one in run_evaluator(spec.name, build(spec, preset=chosen), rollout, scene):
+    specs = resolve_evaluators() if evaluators is None else evaluators
+    known = table_of(specs)
+    for spec in specs:
+        for one in run_evaluator(spec.name, build(spec, preset=chosen), rollout, scene, known):
             if one.name in out:
                 found = f"metric {one.name!r} was given twice"
                 raise EvaluatorError("scoring a rollout", f"evaluator {spec.name!r}", found, "rename one of them")
@@ -78,10 +74,14 @@ def score(
     return list(out.values())
 
 
-def run_evaluator(name: str, evaluator: Evaluator, rollout: RolloutLog, scene: Scene) -> list[MetricSeries]:
-    """Run one evaluator and check its answer; any failure becomes an EvaluatorError that names it."""
+def run_evaluator(name: str, evaluator: Evaluator, rollout: RolloutLog, scene: Scene, known: MetricTable = METRICS) -> list[MetricSeries]:
+    """Run one evaluator, check its answer and give every series its metric from a table.
+
+    Raises:
+        EvaluatorError: It failed, gave a metric that the table does not hold, or series of unlike lengths; it is named.
+    """
     try:
-        answer = list(evaluator(rollout, scene))
+        answer = [replace(one, metric=known.info(one.name)) for one in evaluator(rollout, scene)]
     except SimrunError:
         raise
     except Exception as exc:  # third-party code: the cause is chained, nothing is swallowed
@@ -106,7 +106,7 @@ def run_evaluator(name: str, evaluator: Evaluator, rollout: RolloutLog, scene: S
 def series(
     name: str, t_us: I64, value: npt.ArrayLike, valid: Bool | bool = True, reason: str = "", *, keep_values: bool = False
 ) -> MetricSeries:
-    """Build a series with the unit, direction and reduction that `METRICS` holds for the name.
+    """Build a series of one of our metrics, or of one that the evaluator's ``metrics`` hold: `score` then gives it what they say.
 
     Args:
         name: Metric.
@@ -116,12 +116,11 @@ def series(
         reason: Why steps are invalid; dropped where none is.
         keep_values: Leave values of invalid steps as they are (AlpaSim's tables do).
     """
-    facts = info(name)
     ok = np.broadcast_to(np.asarray(valid, dtype=np.bool_), t_us.shape).copy()
     values = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), t_us.shape))
     if not keep_values:
         values[~ok] = np.nan
-    return MetricSeries(name, t_us, values, ok, facts.aggregation, facts.unit, facts.direction, "" if bool(ok.all()) else reason)
+    return MetricSeries(METRICS.shown(name), t_us, values, ok, "" if bool(ok.all()) else reason)
 
 
 def relevant(rollout: RolloutLog) -> Bool:

@@ -1,26 +1,36 @@
-"""Open a run folder with the facts of its metrics known: the one place where readers of run folders meet `evaluators.metrics`."""
+"""Open a run folder together with what its metrics are: the one place where readers of run folders meet `evaluators.metrics`."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 from alpasim_plugin.run_folder import reader
-from evaluators.metrics import declare_from
+from alpasim_plugin.run_folder.reader import RunSoFar
+from evaluators.metrics import MetricTable
 
 
-def read_run(run_dir: Path | str) -> reader.Run:
-    """Read a run folder, and declare the metrics of third parties that it names; see `alpasim_plugin.run_folder.reader.read_run`.
+class Run(reader.Run):
+    """A run folder with its table of metrics."""
 
-    Raises:
-        EvaluatorError: It states other facts of a metric than are known here.
-    """
-    run = reader.read_run(run_dir)
-    declare_from(run.info)
-    return run
+    @cached_property
+    def table(self) -> MetricTable:
+        """Give what the run's metrics are, as the run itself says."""
+        return MetricTable.of_run(self.info)
+
+    @classmethod
+    def of(cls, run: reader.Run) -> Run:
+        """Return a run that was read with its table."""
+        return cls(run.folder, run.info, run.summary, run.rollouts, run.metric_names)
 
 
-def read_so_far(root: Path) -> reader.RunSoFar:
-    """Read a run folder that may still be written; see `read_run` and `alpasim_plugin.run_folder.reader.read_so_far`."""
+def read_run(run_dir: Path | str) -> Run:
+    """Read a run folder; see `alpasim_plugin.run_folder.reader.read_run`."""
+    return Run.of(reader.read_run(run_dir))
+
+
+def read_so_far(root: Path) -> RunSoFar:
+    """Read a run folder that may still be written; see `alpasim_plugin.run_folder.reader.read_so_far`."""
     found = reader.read_so_far(root)
-    declare_from(found.run.info)
-    return found
+    return replace(found, run=Run.of(found.run))

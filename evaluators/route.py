@@ -17,7 +17,7 @@ from alpasim_plugin.core.geometry import arc_lengths, interpolate, offset_trajec
 from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.base import relevant, series, with_preset
 from evaluators.footprint import ego_footprints, held, origin_of
-from evaluators.presets import Preset
+from evaluators.presets import PRESETS, Preset
 
 DIRECTION_M = 1.0
 _ROWS = 32  # points handled at once, so that what is computed of them stays in the processor's cache
@@ -140,7 +140,7 @@ def progress_so_far(path: F64, points: F64) -> F64:
     return out
 
 
-def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
+def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> list[MetricSeries]:
     """Give the recording-based metrics and ``eval_relevant`` per step."""
     t_us = rollout.ego.t_us
     origin = origin_of(rollout.ego_log, preset)
@@ -192,6 +192,12 @@ def evaluate_route(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
         series("route_distance_m", t_us, distance_m),
         series("lateral_bias_m", t_us, left_of(path, s, ego) * aside_m, has_side, no_direction),
     ]
+
+
+def lateral_bias(rollout: RolloutLog) -> MetricSeries:
+    """Return ``lateral_bias_m`` of a rollout, for tables of presets whose metrics do not have it, such as ``alpasim``."""
+    # The map plays no part in it.
+    return next(one for one in evaluate_route(rollout, None, PRESETS["paper"]) if one.name == "lateral_bias_m")
 
 
 def driven(ego: F64, first: int) -> F64:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Policy, Scenario
+from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
+from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import build, unidentified
 
 PLAN_HORIZON_S = 5.0  # AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four metrics

@@ -10,7 +10,8 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Policy, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Route, Scenario, SensorSpec
+from alpasim_plugin.plugins.interfaces import Policy
 from policies.base import camera_frame, front_camera, plan_times, seconds
 from policies.lane_filter import LaneState, predict, search, shift, update
 from policies.lane_plan import NOISE_SPEED, Blend, RoutePrior, blend, correlated_noise, idm_progress, route_prior, sample_sigma_m, sampled

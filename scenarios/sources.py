@@ -6,9 +6,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Source
 from alpasim_plugin.io.config import Document, load_yaml
 from alpasim_plugin.io.reading import parsing
+from alpasim_plugin.plugins.interfaces import Source
 from alpasim_plugin.plugins.parts import PartSpec, build, names, resolve
 from scenarios.budget import check_record
 from scenarios.recorded import RecordedLog

@@ -10,9 +10,8 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.io.atomic import write_json
-from alpasim_plugin.runtime.overall import aggregate_runs
+from alpasim_plugin.runtime.overall import aggregate_runs, joined_metrics
 from evaluators.report import render_table
-from evaluators.report.metric_info import HEADLINE
 from evaluators.report.tables import pair_rows
 
 EPILOG = """
@@ -42,9 +41,10 @@ def aggregate(
     if as_json:
         print(json.dumps(found))
         return
-    Console().print(render_table(found, headline_only=not every))
-    for row in pair_rows(found):
-        if every or row.metric in HEADLINE:
+    known = joined_metrics(runs)
+    Console().print(render_table(found, headline_only=not every, known=known))
+    for row in pair_rows(found, known):
+        if every or known.shown(row.metric).is_headline:
             numbers = f"{row.diff.text}, 95 % {row.interval.text}, p {row.p_value.text}".replace("\u00a0", " ")
             print(f"{row.variant} minus {row.baseline}: {row.metric} {numbers}: {row.verdict}")
     failures = found["failures"]

@@ -14,8 +14,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runtime.repair import use_run
 from evaluators.gate.across import Comparison, compare_runs, compare_within
 from evaluators.gate.spec import load_gate
+from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
-from evaluators.report.metric_info import HEADLINE, in_percent
 from evaluators.report.numbers import plural
 from evaluators.report.tables import PairRow, pair_rows
 from evaluators.sequential.record import stopping_note
@@ -45,14 +45,15 @@ def compare(
     del debug
     if len(runs) > 2:
         raise InputError("comparing runs", f"{len(runs)} folders", "more than two", "name one run, or two")
-    margins: dict[str, float] = {}
-    if gate is not None:
-        margins = {name: rule.margin for name, rule in load_gate(gate)[0].metrics.items() if rule.margin is not None}
     for run in runs:
         use_run(run, warn)
         if note := stopping_note(run):
             warn(note)
     found = [read_run(run) for run in runs]
+    margins: dict[str, float] = {}
+    if gate is not None:
+        rules = load_gate(gate, found[-1].table)[0].metrics
+        margins = {name: rule.margin for name, rule in rules.items() if rule.margin is not None}
     result = (
         compare_within(found[0], baseline, margins, EVERY_MISSING)
         if len(found) == 1
@@ -70,21 +71,21 @@ def compare(
             )
         )
         return
-    _print(result, [*HEADLINE, *margins] if not every else None)
+    _print(result, [*result.metrics.headline, *margins] if not every else None)
 
 
 def _print(result: Comparison, only: Sequence[str] | None) -> None:
     for note in result.notes:
         print(f"note: {note}")
     for variant, entries in (*result.paired.items(), *result.with_base.items()):
-        mine = [row for row in pair_rows({"paired": {variant: entries}}) if only is None or row.metric in only]
+        mine = [row for row in pair_rows({"paired": {variant: entries}}, result.metrics) if only is None or row.metric in only]
         baseline = next((str(entry["baseline"]) for entry in entries.values()), "nothing")
         print(f"\n{variant} minus {baseline}")
-        for line in [*_table(mine, entries), *_missing(entries)]:
+        for line in [*_table(mine, entries, result.metrics), *_missing(entries)]:
             print(line)
 
 
-def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]], known: MetricTable) -> list[str]:
     """Return one line per metric; lines are not wrapped."""
     lines = [("metric", "difference", "95 %", "p", "margin", "pairs", "verdict")]
     for row in rows:
@@ -92,7 +93,7 @@ def _table(rows: Sequence[PairRow], entries: Mapping[str, Mapping[str, Any]]) ->
         more = entry["more_scenes"]
         verdict = f"{entry['verdict']}, about {more} more scenes" if more else str(entry["verdict"])
         verdict += " (better)" if entry["difference"] == "better" else ""
-        scale = 100.0 if in_percent(row.metric, str(entry["unit"])) else 1.0
+        scale = 100.0 if known.shown(row.metric).in_percent else 1.0
         pairs = f"{entry['n_cells']} in {plural(int(entry['n_scenes']), 'scene')}"
         lines.append((row.metric, row.diff.text, row.interval.text, row.p_value.text, f"{scale * entry['margin']:g}", pairs, verdict))
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]

@@ -33,7 +33,7 @@ from evaluators.gate import (
     write_baseline,
 )
 from evaluators.opening import read_run
-from evaluators.report.gate import write_gate_files
+from evaluators.report.ci import write_gate_files
 from evaluators.sequential.question import Population, Question
 from evaluators.sequential.record import stopping_note
 
@@ -132,7 +132,7 @@ def gate(
         return
     if note := stopping_note(run):
         warn(note)
-    spec, source = load_gate(gate_file)
+    spec, source = load_gate(gate_file, found.table)
     preset = str(found.summary.get("preset"))
     if spec.preset is not None and spec.preset != preset:
         wanted = f"preset {preset!r}, the gate {source} is for {spec.preset!r}"
@@ -141,7 +141,7 @@ def gate(
     if baseline_file is not None:
         stored = read_baseline(baseline_file)
         check_matches(stored, found, baseline_file)
-    verdict = judge_table(table_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""))
+    verdict = judge_table(table_of_run(found), spec, None if stored is None else stored.rows, str(baseline_file or ""), found.table)
     files = write_gate_files(verdict, source, found, out or run)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "files": [str(path) for path in files]}))
@@ -174,7 +174,7 @@ def _until_decided(
     found = read_run(run)
     rows = rows_of_run(found)
     driven = {(str(row["scene"]), int(row["seed"])) for row in rows}
-    verdict = judge_decided(rows, spec, decided.record, None if stored is None else stored.of_cells(driven))
+    verdict = judge_decided(rows, spec, decided.record, None if stored is None else stored.of_cells(driven), found.table)
     files = write_gate_files(verdict, source, found, out or run)
     if as_json:
         print(json.dumps({**verdict.as_dict(), "decision": decided.record, "files": [str(path) for path in files]}))

@@ -63,7 +63,6 @@ def _scenarios() -> dict[str, str]:
 
 def _metrics() -> dict[str, str]:
     from evaluators.base import resolve_plugins
-    from evaluators.metrics import METRICS
+    from evaluators.metrics import table_of
 
-    resolve_plugins()
-    return {name: facts.help for name, facts in METRICS.items()}
+    return {name: facts.help for name, facts in table_of(resolve_plugins()).items()}

@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Fixer
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
+from alpasim_plugin.plugins.interfaces import Fixer
 from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_video
 

@@ -16,6 +16,7 @@ from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.schema import SUMMARY
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.reports import write_reports
+from evaluators.metrics import MetricTable
 from evaluators.report import render_table
 
 EPILOG = "Example: `simrun report runs/us101`"
@@ -41,5 +42,5 @@ def report(
     if as_json:
         print(json.dumps({"report": str(page), "summary": summary}))
     else:
-        Console().print(render_table(summary))
+        Console().print(render_table(summary, known=MetricTable.of_run(read_run_json(run))))
         print(f"report   {page}")

@@ -19,12 +19,14 @@ from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.limits import SEED, SEEDS
 from alpasim_plugin.process.signals import Stopped
+from alpasim_plugin.run_folder.manifests import read_run_json
 from alpasim_plugin.runtime.certificate import Certify, certificate_line
 from alpasim_plugin.runtime.execute import Threads, thread_budget
 from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runtime.run import RunResult, default_folder, execute_run
 from evaluators import PRESETS
+from evaluators.metrics import MetricTable
 from evaluators.opening import read_run
 from evaluators.report import ending_lines, fixer_lines, next_line, plan_warnings, render_table
 from scenarios.library import shipped_names
@@ -242,7 +244,7 @@ def _print_result(result: RunResult, as_json: bool, video: str) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
-    Console().print(render_table(result.summary, headline_only=True))
+    Console().print(render_table(result.summary, headline_only=True, known=MetricTable.of_run(read_run_json(result.root))))
     for line in fixer_lines(result.summary):
         print(line)
     for line in plan_warnings(result.summary):

@@ -15,7 +15,6 @@ from rich.console import Console
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
-from evaluators.report.metric_info import HEADLINE
 from evaluators.report.numbers import plural
 from evaluators.runs.choose import Choice, as_day, chosen, shown_folder
 from evaluators.runs.entry import DOING, STATES, RunEntry, State
@@ -81,7 +80,7 @@ def runs(
     taken = taken[:last]
     names = _metrics(metric or [], taken)
     if steps or page is not None:
-        _trend(taken, names or list(HEADLINE), places, page, as_json)
+        _trend(taken, names or list(METRICS.headline), places, page, as_json)
         _say(lost)
         return
     if as_json:

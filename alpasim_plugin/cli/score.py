@@ -13,12 +13,14 @@ from rich.console import Console
 from alpasim_plugin.cli.progress import describe
 from alpasim_plugin.cli.report import report_line
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.run_folder.manifests import read_run_json
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
 from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
 from evaluators import preset as find_preset
 from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
+from evaluators.metrics import MetricTable
 from evaluators.presets import Preset
 from evaluators.report import render_table
 
@@ -103,7 +105,7 @@ def _print(result: ScoreResult, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"out": str(result.root), "exit_code": result.exit_code, "summary": result.summary}))
         return
-    Console().print(render_table(result.summary, headline_only=True))
+    Console().print(render_table(result.summary, headline_only=True, known=MetricTable.of_run(read_run_json(result.root))))
     for cell in result.summary["failures"]["cells"][:5]:
         print(f"failed: {cell['error']['with']}: {cell['error']['found']} -> {cell['error']['do']}", file=sys.stderr)
     aggregation = result.summary.get("alpasim") or {}

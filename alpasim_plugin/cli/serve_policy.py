@@ -13,7 +13,8 @@ import typer
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, Security
 from alpasim_plugin.alpasim.server.one_policy import ADDRESS
-from alpasim_plugin.core.types import Policy, Scenario
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import PartSpec, build, resolve
 from alpasim_plugin.process.signals import Stopped
 from alpasim_plugin.runtime.known_scenes import scenario_finder

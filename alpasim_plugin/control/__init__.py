@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.core.types import Controller, Vehicle
+from alpasim_plugin.core.types import Vehicle
+from alpasim_plugin.plugins.interfaces import Controller
 from alpasim_plugin.plugins.parts import build, unidentified
 
 __all__ = ["Controller", "make_controller"]

@@ -10,7 +10,8 @@ import numpy as np
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, se2, wrap_angle, yaw_of
-from alpasim_plugin.core.types import Controller, EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.types import EgoState, Trajectory, Vehicle
+from alpasim_plugin.plugins.interfaces import Controller
 
 GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
 

@@ -18,7 +18,8 @@ import numpy as np
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop, planar, spatial
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
 from alpasim_plugin.core.geometry import yaw_from_quat
-from alpasim_plugin.core.types import F64, Controller, EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
+from alpasim_plugin.plugins.interfaces import Controller
 
 MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
 

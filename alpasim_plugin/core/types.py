@@ -22,16 +22,9 @@ from alpasim_plugin.core.map_types import LaneMap as LaneMap
 from alpasim_plugin.core.map_types import Marking as Marking
 from alpasim_plugin.core.map_types import Paint as Paint
 from alpasim_plugin.core.map_types import Route as Route
-from alpasim_plugin.plugins.interfaces import Aggregation as Aggregation
-from alpasim_plugin.plugins.interfaces import BlockRule as BlockRule
-from alpasim_plugin.plugins.interfaces import Controller as Controller
-from alpasim_plugin.plugins.interfaces import Direction as Direction
-from alpasim_plugin.plugins.interfaces import Evaluator as Evaluator
-from alpasim_plugin.plugins.interfaces import Fixer as Fixer
-from alpasim_plugin.plugins.interfaces import MetricInfo as MetricInfo
-from alpasim_plugin.plugins.interfaces import Policy as Policy
-from alpasim_plugin.plugins.interfaces import Renderer as Renderer
-from alpasim_plugin.plugins.interfaces import Source as Source
+from alpasim_plugin.core.metric_types import Aggregation as Aggregation
+from alpasim_plugin.core.metric_types import Direction as Direction
+from alpasim_plugin.core.metric_types import MetricInfo as MetricInfo
 
 F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
@@ -343,11 +336,13 @@ class RolloutLog:
 class MetricSeries:
     """Values of one metric over a rollout; a value is never bare: it has validity and, where invalid, a reason."""
 
-    name: str
+    metric: MetricInfo
     t_us: I64  # (T,)
     value: F64  # (T,); NaN where invalid
     valid: Bool  # (T,)
-    aggregation: Aggregation
-    unit: str  # "" for rates and flags
-    direction: Direction
     reason: str = ""  # why values are invalid, if any is
+
+    @property
+    def name(self) -> str:
+        """Give the metric's name."""
+        return self.metric.name

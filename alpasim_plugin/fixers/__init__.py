@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from alpasim_plugin.core.types import Fixer
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.plugins.interfaces import Fixer
 from alpasim_plugin.plugins.parts import build, unidentified
 
 __all__ = ["fixer_settings", "make_fixer"]

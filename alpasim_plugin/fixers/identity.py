@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from alpasim_plugin.core.types import U8, BlockRule, Fixer, Frame
+from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
 class IdentityFixer(Fixer):

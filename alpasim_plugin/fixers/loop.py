@@ -14,8 +14,9 @@ from typing import Any
 
 from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
 from alpasim_plugin.core.lazy import installed
-from alpasim_plugin.core.types import U8, Actor, BlockRule, Fixer, Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.core.types import U8, Actor, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.plugins.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.plugins.parts import complete
 from alpasim_plugin.plugins.parts.spec import MODES
 from alpasim_plugin.semantic_map.draw import draw_map

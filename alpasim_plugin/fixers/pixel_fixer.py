@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, I64, U8, BlockRule, Fixer, Frame
+from alpasim_plugin.core.types import F32, I64, U8, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
@@ -26,6 +26,7 @@ from alpasim_plugin.nets.machine_probe import take_threads
 from alpasim_plugin.nets.pixel_generator import GRID_PX, PixelState
 from alpasim_plugin.nets.pixel_source import content_key, pixel_noise, sparse_source
 from alpasim_plugin.nets.schedule import from_names, interpolant
+from alpasim_plugin.plugins.interfaces import BlockRule, Fixer
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from gymnasium.spaces import Box
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.control.base import check_interval, planar, spatial
 from alpasim_plugin.control.bicycle import Command, step
-from alpasim_plugin.core.types import F64, Controller, EgoState, Observation, Plan, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, EgoState, Observation, Plan, Trajectory, Vehicle
+from alpasim_plugin.plugins.interfaces import Controller
 
 PREDICTED_US, PREDICTED_STEP_US = 2_000_000, 100_000  # of the plan that stands in the log for a held command
 FORWARD_M, BACKWARD_M, ASIDE_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.metrics import MetricInfo
+from evaluators.opening import Run
 from evaluators.report.frames import inline_jpeg
 from evaluators.report.headline import find
-from evaluators.report.metric_info import HEADLINE, in_percent, ordered
 from evaluators.report.numbers import DASH, short
 from evaluators.report.tables import metric_rows
 
@@ -19,7 +19,8 @@ LEFT = 'style="text-align:left"'
 
 def run_html(run: Run) -> str:
     """Return a run: its verdict, its headline metrics by renderer, and a strip of frames of its first rollout."""
-    rows = [row for row in metric_rows(run.summary) if row.is_headline] or metric_rows(run.summary)
+    rows = metric_rows(run.summary, known=run.table)
+    rows = [row for row in rows if row.is_headline] or rows
     names = list(run.summary.get("metrics") or {})[:MOST_RENDERERS]
     lines = []
     for row in rows:
@@ -38,9 +39,9 @@ def run_html(run: Run) -> str:
 
 def rollout_html(run: Run, rollout: Rollout) -> str:
     """Return a rollout: how it ended, its headline metrics, and its strip of frames."""
-    units = {row.name: row.unit for row in metric_rows(run.summary)}
-    names = [name for name in ordered(rollout.metrics) if name in HEADLINE] or ordered(rollout.metrics)
-    lines = [[escape(name), _number(rollout.metrics.get(name), name, units.get(name, ""))] for name in names]
+    metrics = [run.table.shown(name) for name in run.table.ordered(rollout.metrics)]
+    metrics = [metric for metric in metrics if metric.is_headline] or metrics
+    lines = [[escape(metric.name), _number(rollout.metrics.get(metric.name), metric)] for metric in metrics]
     return _block(
         f"<b>{escape(outcome(rollout))}</b>",
         escape(title(rollout)),
@@ -62,10 +63,10 @@ def outcome(rollout: Rollout) -> str:
     return " and ".join(events) or "no event"
 
 
-def _number(value: float | None, name: str, unit: str) -> str:
+def _number(value: float | None, metric: MetricInfo) -> str:
     if value is None:
         return DASH
-    return f"{100 * value:.1f} %" if in_percent(name, unit) else escape(short(value, unit))
+    return f"{100 * value:.1f} %" if metric.in_percent else escape(short(value, metric.unit))
 
 
 def _picture(run: Run, rollout: Rollout) -> str:

@@ -15,10 +15,9 @@ from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.notebook.frames import Library, frame_of, paired_table, require, summary_table, valid_only
 from alpasim_plugin.notebook.html import outcome, rollout_html, run_html, title
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.run_folder.schema import KEYS, LOG_NAME, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_TABLE
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report.headline import find
 
 

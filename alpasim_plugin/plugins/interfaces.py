@@ -12,13 +12,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from alpasim_plugin.core.types import (
         U8,
         EgoState,
         Frame,
+        MetricInfo,
         MetricSeries,
         Observation,
         Plan,
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
         Trajectory,
     )
 
-Aggregation = Literal["mean", "median", "max", "min", "last"]
-Direction = Literal["lower", "higher", "none"]
 EMPTY: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -57,20 +56,6 @@ class BlockRule:
     def frames(self, block: int) -> int:
         """Return the number of frames of block ``block``, counted from 0."""
         return self.first if block == 0 else self.then
-
-
-@dataclass(frozen=True)
-class MetricInfo:
-    """What one metric means."""
-
-    unit: str  # "" for flags and ratios
-    direction: Direction  # the better side
-    aggregation: Aggregation  # over the scored steps of one rollout
-    help: str
-    is_flag: bool = False  # 0 or 1 per step; its mean over rollouts is a rate
-    derived: bool = False  # exists per rollout only, computed in the reduction
-    is_headline: bool = False  # reports lead with it
-    is_share: bool = False  # a fraction that is printed in percent; flags are anyway
 
 
 @dataclass(frozen=True)

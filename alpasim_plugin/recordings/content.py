@@ -13,11 +13,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.types import F64, I64, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import Logs, no_frames
 from alpasim_plugin.viewer.pictures import Source, sources
+from evaluators.opening import Run
 from evaluators.report.events import events_of
 
 DOING = "exporting a rollout"

@@ -16,11 +16,11 @@ from alpasim_plugin.core.types import F64, I64, Box, Trajectory
 from alpasim_plugin.io.atomic import atomic_file
 from alpasim_plugin.recordings.colors import MAP, ROAD_USER, Rgba, as_bytes, fainter, of_renderer
 from alpasim_plugin.recordings.content import DOING, Camera, Drive, Recording, present
+from evaluators.metrics import METRICS
 
 TIMELINE = "t"
 NS_PER_US = 1_000
 THICK_M, THIN_M = 0.15, 0.06  # radii
-FIRST_CURVES = ("lateral_distance_m", "lateral_offset_m", "ego_speed_mps", "min_distance_to_obstacle_m")  # shown at once, where there
 
 
 def write_rrd(recording: Recording, path: Path) -> dict[str, int]:
@@ -163,7 +163,7 @@ def _layout(rr: Any, recording: Recording) -> Any:
             for camera in drive.cameras
         ]
         columns.append(bp.Vertical(scene, bp.Tabs(*cameras), row_shares=[3, 2]) if cameras else scene)
-    known = [name for name in FIRST_CURVES if any(name in drive.metrics for drive in recording.drives)]
+    known = [name for name in METRICS.first_curves() if any(name in drive.metrics for drive in recording.drives)]
     others = sorted({name for drive in recording.drives for name in drive.metrics} - set(known))
     curves = [bp.TimeSeriesView(name=name, origin=f"/metrics/{rr.escape_entity_path_part(name)}") for name in [*known, *others]]
     below = [bp.Tabs(*curves)] if curves else []

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from alpasim_plugin.core.types import Renderer, Scenario
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.plugins.parts import build, unidentified
 
 

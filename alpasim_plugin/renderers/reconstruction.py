@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.scene.build_actors import build_actor
@@ -27,6 +27,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import Level, SceneGraph, SceneN
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.io.reading import read_json_as
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.renderers.gaussian import CleanRenderer, SurrogateRenderer, backend_of, camera_at, in_memory
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe, recipe_of, reconstruction_key

@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from typing_extensions import TypedDict
 
+from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.io.checksums import FileFacts
 
 Number = float | None
@@ -40,6 +42,15 @@ class OutcomeFacts(TypedDict):
     n_failed: int
 
 
+class MetricFacts(TypedDict):
+    """What a metric of the run is, in ``run.json``; `alpasim_plugin.core.types.MetricInfo` has the members that may follow."""
+
+    unit: str
+    direction: Direction
+    aggregation: Aggregation
+    help: str
+
+
 class RunInfo(TypedDict, total=False):
     """``run.json``."""
 
@@ -48,6 +59,7 @@ class RunInfo(TypedDict, total=False):
     project: ProjectFacts
     asked: list[str]
     parts: dict[str, dict[str, Any]]
+    metrics: dict[str, MetricFacts]
     fixers: dict[str, dict[str, Any]]
     code: dict[str, str]
     outcome: OutcomeFacts
@@ -65,7 +77,6 @@ class RunInfo(TypedDict, total=False):
     versions: dict[str, str | None]
     weights: dict[str, Any]
     left_out: list[str]
-    metrics: dict[str, Any]
     bases: dict[str, str]
 
 
@@ -192,3 +203,8 @@ class Summary(TypedDict, total=False):
     pool: dict[str, Any]
     fixers: dict[str, dict[str, Any]]
     plans: dict[str, dict[str, Any]]
+
+
+def pair_tables(summary: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """List the tables of paired differences with the variant of each: against the baseline, then fixers against their base."""
+    return [(variant, pairs) for key in ("paired", "paired_with_base") for variant, pairs in (summary.get(key) or {}).items() if pairs]

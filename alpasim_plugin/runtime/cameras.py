@@ -10,7 +10,8 @@ import numpy as np
 
 from alpasim_plugin.core.clock import Clock, Tick
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, I64, BlockRule, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.core.types import F64, I64, CameraSpec, RenderRequest, Scenario, SensorSpec, Trajectory
+from alpasim_plugin.plugins.interfaces import BlockRule
 from alpasim_plugin.runtime.loop_state import Forecaster, PredictedRequests, shutter_poses
 
 IN_BLOCKS = "setting up a loop in whole blocks of frames"

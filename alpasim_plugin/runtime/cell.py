@@ -15,8 +15,9 @@ import cv2
 
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.errors import PolicyError, SimrunError
-from alpasim_plugin.core.types import Policy, Renderer, Scenario
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io.atomic import disk_error
+from alpasim_plugin.plugins.interfaces import Policy, Renderer
 from alpasim_plugin.plugins.parts import build, complete
 from alpasim_plugin.process.stdout import parts_print_to_stderr
 from alpasim_plugin.run_folder.manifests import RepairAction, RolloutState, inspect_rollout, write_manifest

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from alpasim_plugin.core.types import Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, resolve_renderer
 from alpasim_plugin.runtime.guards import checked_frames
 

@@ -264,7 +264,7 @@ class _Drawing:
         for one in self.question.metrics:
             found = scene_differences(sides[self.candidate], base, one.metric, self.scenes)
             self.differences[one.metric] = found
-            values[one.metric] = found.harm(one.metric)
+            values[one.metric] = found.harm(one.direction)
             if self.question.population == "suite":
                 adjusted[one.metric] = adjusted_draws(values[one.metric], one, self.order, self.controls.get(one.metric), self.strata)
         self.state = state_after(self.question, values, self.horizon, adjusted, len(self.order))

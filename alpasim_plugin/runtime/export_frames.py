@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, se3
-from alpasim_plugin.core.types import F64, CameraSpec, Renderer, RenderRequest, RolloutLog, Trajectory
+from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, RolloutLog, Trajectory
 from alpasim_plugin.log.images import encode_image
 from alpasim_plugin.log.schema import wire_camera, wire_image, wire_render_request
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.runtime.guards import checked_frames
 from alpasim_plugin.runtime.loop_state import shutter_poses
 from alpasim_plugin.wire import logging_pb2, sensorsim_pb2

@@ -19,21 +19,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.types import (
-    Controller,
-    EgoState,
-    Frame,
-    Observation,
-    Plan,
-    Policy,
-    Renderer,
-    RenderRequest,
-    Route,
-    Scenario,
-    SensorSpec,
-    Trajectory,
-)
+from alpasim_plugin.core.types import EgoState, Frame, Observation, Plan, RenderRequest, Route, Scenario, SensorSpec, Trajectory
 from alpasim_plugin.log.trace import Difference, Trace, first_difference
+from alpasim_plugin.plugins.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.plugins.parts import digest, resolve, resolve_renderer
 from alpasim_plugin.run_folder.manifests import read_run_json, write_manifest, write_run_json
 from alpasim_plugin.run_folder.schema import LOG_NAME, MANIFEST, RUN_INFO

@@ -10,7 +10,8 @@ import numpy as np
 from alpasim_plugin.core.errors import PolicyError, RendererError, SimrunError
 from alpasim_plugin.core.pixels import is_black
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
-from alpasim_plugin.core.types import Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec
+from alpasim_plugin.core.types import Frame, Observation, Plan, RenderRequest, Route, SensorSpec
+from alpasim_plugin.plugins.interfaces import Policy, Renderer
 
 CHECK = "simrun check-policy finds all faults of a policy"
 TRACEBACK = "see the traceback in the rollout's manifest"

@@ -11,7 +11,7 @@ from alpasim_plugin.run_folder.columns import AGAIN, DOING, RolloutTable
 from alpasim_plugin.run_folder.manifests import damaged_files, find_contents, read_run_json
 from alpasim_plugin.run_folder.schema import ROLLOUTS
 from evaluators.aggregate.overall import numbers
-from evaluators.metrics import declare_from
+from evaluators.metrics import MetricTable
 
 
 def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[str, Any]:
@@ -27,7 +27,8 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
         ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``failures`` (docs/statistics.md).
 
     Raises:
-        InputError: A run is not finished or its tables are damaged; presets differ, or a scene has another content in another run; a folder
+        InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a metric is another one in another run; a
+            folder
             is named twice; no run has the baseline.
     """
     twice = [run for i, run in enumerate(runs) if run.resolve() in {other.resolve() for other in runs[:i]}]
@@ -40,18 +41,32 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> dict[st
     known = list(dict.fromkeys(name for policy in table.policies for name in table.sides(policy)))
     if baseline is not None and baseline not in known:
         raise InputError(DOING, f"--baseline {baseline}", "no rollout has it", f"choose one of {', '.join(known) or 'none'}")
+    known = _joined(infos, table.metrics)
     bases = {name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()}
     by_class = table.failures()
     return {
         "runs": [str(run) for run in runs],
         "preset": first["preset"],
-        **numbers(table, baseline or first["config"].get("baseline"), bases),
+        **numbers(table, baseline or first["config"].get("baseline"), bases, known),
         "failures": {"n_failed": sum(by_class.values()), "n_rollouts": table.n_rollouts, "by_class": by_class},
     }
 
 
+def joined_metrics(runs: Sequence[Path]) -> MetricTable:
+    """Return what the metrics of some runs are."""
+    return _joined({run: read_run_json(run) for run in runs}, ())
+
+
+def _joined(infos: Mapping[Path, Mapping[str, Any]], metrics: Sequence[str]) -> MetricTable:
+    first, *others = infos.items()
+    known = MetricTable.of_run(first[1])
+    for run, info in others:
+        known = known.joined(MetricTable.of_run(info), metrics, DOING, f"{first[0]} and {run}")
+    return known
+
+
 def _info_of(run: Path) -> dict[str, Any]:
-    """Return a run's description, and declare its metrics.
+    """Return a run's description.
 
     Raises:
         InputError: The run is not finished, or damaged.
@@ -61,7 +76,6 @@ def _info_of(run: Path) -> dict[str, Any]:
     damaged = None if contents is None else next((one for one in damaged_files(run, contents) if one.file == ROLLOUTS), None)
     if contents is None or damaged is not None:
         raise InputError(DOING, str(run), "the run is not finished" if damaged is None else str(damaged), AGAIN)
-    declare_from(info)
     return info
 
 

@@ -19,10 +19,11 @@ from matplotlib.figure import Figure
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.geometry import quat_from_yaw
-from alpasim_plugin.core.types import F64, Frame, Observation, Plan, Policy, Renderer, RenderRequest, Route, SensorSpec, Trajectory
+from alpasim_plugin.core.types import F64, Frame, Observation, Plan, RenderRequest, Route, SensorSpec, Trajectory
 from alpasim_plugin.io.atomic import write_bytes, write_json
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.trace import first_difference
+from alpasim_plugin.plugins.interfaces import Policy, Renderer
 from alpasim_plugin.plugins.parts import resolve_renderer
 from alpasim_plugin.run_folder.schema import PROBE_JSON, PROBE_PLOT, PROBE_TABLE, probe_folder
 from alpasim_plugin.run_folder.writer import write_table

@@ -23,7 +23,6 @@ from alpasim_plugin.core.types import (
     Frame,
     Observation,
     Plan,
-    Renderer,
     RenderRequest,
     RolloutLog,
     Scenario,
@@ -33,6 +32,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log import AslWriter, header_from_scenario, read_asl, write_facts
 from alpasim_plugin.log.session import session_uuid
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.runtime.loop_state import PathEnd
 from alpasim_plugin.runtime.pictures import Pictures

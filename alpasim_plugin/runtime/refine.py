@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F32, U8, Fixer, Frame
+from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, FixedBlock, StreamStats, refine_frames
 from alpasim_plugin.log.picture_folder import PictureFolderReader, PictureFolderWriter
 from alpasim_plugin.log.video_reader import TimedFrame, VideoFormat, VideoReader
 from alpasim_plugin.log.video_writer import VideoWriter
+from alpasim_plugin.plugins.interfaces import Fixer
 
 Reader = VideoReader | PictureFolderReader
 Writer = VideoWriter | PictureFolderWriter

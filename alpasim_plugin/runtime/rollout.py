@@ -7,7 +7,8 @@ from collections.abc import Generator, Mapping, Sequence
 
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.clock import Clock
-from alpasim_plugin.core.types import F64, Controller, Observation, Plan, Policy, Renderer, Scenario, SensorSpec
+from alpasim_plugin.core.types import F64, Observation, Plan, Scenario, SensorSpec
+from alpasim_plugin.plugins.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.plugins.parts import complete
 from alpasim_plugin.runtime.cameras import CameraRig, make_cadence
 from alpasim_plugin.runtime.guards import checked_frames, checked_plan, checked_sensors, reset_policy

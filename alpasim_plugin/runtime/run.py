@@ -39,7 +39,7 @@ from alpasim_plugin.runtime.reports import write_reports
 from alpasim_plugin.runtime.stores.commits import opened
 from alpasim_plugin.runtime.summary import pool_of, write_summary
 from evaluators.aggregate.outcome import Outcome, outcome_of_failures
-from evaluators.metrics import declared
+from evaluators.metrics import MetricTable, table_of
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
@@ -169,7 +169,8 @@ def finish_run(root: Path, manifests: Sequence[dict[str, Any]], more: Mapping[st
     info = read_run_json(root)
     outcome = {"n_rollouts": len(manifests), "n_failed": sum(m["status"] != "ok" for m in manifests)}  # for lists of many runs
     write_run_json(root, info | dict(more) | {"outcome": outcome, "chosen": chosen(manifests)})
-    summary = write_summary(root, manifests, info["preset"], info["config"].get("baseline"), more, info.get("bases") or {})
+    baseline, bases = info["config"].get("baseline"), info.get("bases") or {}
+    summary = write_summary(root, manifests, info["preset"], baseline, more, bases, MetricTable.of_run(info))
     write_reports(root, flips=info.get("kind") != "score", page=report)
     write_contents(root, {m["path"]: read_manifest(root / m["path"])[1] for m in manifests})
     return summary
@@ -276,7 +277,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
             "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
             "code": {"loop": own_code_digest(LOOP)[:12], "scoring": own_code_digest(SCORING)[:12]},
-            "metrics": declared(),
+            "metrics": table_of(parts).as_dict(),
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),
             "versions": versions(),

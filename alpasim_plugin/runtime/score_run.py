@@ -37,7 +37,7 @@ from evaluators.alpasim import (
     results_summary,
     scene_score,
 )
-from evaluators.metrics import declared, info
+from evaluators.metrics import METRICS, MetricTable, table_of
 from evaluators.presets import Preset
 
 
@@ -96,7 +96,7 @@ def execute_score(
         manifests = [one.manifest for one in scores]
         for manifest in manifests:
             write_manifest(root / manifest["path"], manifest)
-        _write_info(root, key, scores, scenes, preset, settings, command)
+        _write_info(root, key, scores, scenes, preset, settings, command, table_of(evaluators))
         code = exit_code(scores, settings is not None and settings.allow_aggregation_with_failed_rollouts, error)
         more = {"pool": pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None), "exit_code": code}
         summary = finish_run(root, manifests, more | ({} if aggregation is None else {"alpasim": aggregation}), report)
@@ -125,7 +125,7 @@ def _aggregate(
     for i, one in enumerate(reduced):
         values = dict(one.reduction.values)
         if i in marks:
-            facts = info("scene_score")
+            facts = METRICS["scene_score"]
             values["scene_score"] = RolloutValue(marks[i].score, True, "", facts.unit, facts.direction)
         good[i].manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
         good[i].manifest["scene_score"] = None if i not in marks else {"failure_reason": marks[i].failure_reason}
@@ -177,6 +177,7 @@ def _write_info(
     preset: Preset,
     settings: EvalSettings | None,
     command: Sequence[str],
+    metrics: MetricTable,
 ) -> None:
     used = {one.manifest["scene"]: scenes.of(one.manifest["scene"]) for one in scores if one.scored is not None}
     for scene in used.values():
@@ -200,7 +201,7 @@ def _write_info(
                 name: {"source": one.source, "content_hash": one.content_hash, "notes": list(one.notes)} for name, one in used.items()
             },
             "code": {"scoring": own_code_digest(SCORING)[:12]},
-            "metrics": declared(),
+            "metrics": metrics.as_dict(),
             "weights": {},
             "hardware": hardware(),
             "versions": versions(),

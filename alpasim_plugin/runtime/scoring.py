@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import arc_lengths, inverse, offset_trajectory, project, yaw_from_quat
+from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
 from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scenario
 from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.plugins.parts import PartSpec
 from evaluators import ContactEvent, Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
+from evaluators.route import lateral_bias
 
 # Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose, from the true pose.
 FIXER_FACTS = ("pose_error_m", "forecast_error_m")
@@ -58,7 +59,9 @@ def tabulate(
         frames: Facts per camera frame, if known.
         contacts: Result of `contacts_of`.
     """
-    rows = [row for one in series for row in _rows(one)]
+    # Reports draw the distance from the recorded path also of runs whose preset does not score it.
+    drawn = [] if any(one.name == "lateral_bias_m" for one in series) else [lateral_bias(rollout)]
+    rows = [row for one in (*series, *drawn) for row in _rows(one)]
     rows += _state_rows(rollout)
     rows += [_row(int(f["t_us"] or 0), "opacity_mean", f["opacity_mean"], "the renderer gives no opacity") for f in frames]
     rows += [_row(int(f["t_us"] or 0), name, f[name]) for name in FIXER_FACTS for f in frames if name in f]
@@ -93,27 +96,7 @@ def _state_rows(rollout: RolloutLog) -> list[dict[str, Any]]:
         "ego_yaw_rad": yaw_from_quat(rig.quat),
         "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
     }
-    rows = [_row(t, name, float(v)) for name, values in state.items() for t, v in zip(rig.t_us.tolist(), values, strict=True)]
-    path = rollout.ego_log.xyz
-    for t, at in zip(rig.t_us.tolist(), rig.xyz, strict=True):
-        rows.append(_row(t, "lateral_offset_m", _offset(path, at), "not beside the logged path"))
-    return rows
-
-
-def _offset(path: F64, at: F64) -> float | None:
-    """Return the signed distance from the logged path, left positive; None before its start and past its end."""
-    moved = np.flatnonzero(np.linalg.norm(path[:, :2] - path[0, :2], axis=1) > 0.5)
-    if not moved.size:
-        return None  # the recorded car stands still: there is no path
-    first = path[moved[0], :2] - path[0, :2]
-    back = np.flatnonzero(np.linalg.norm(path[:, :2] - path[-1, :2], axis=1) > 0.5)[-1]
-    last = path[-1, :2] - path[back, :2]
-    if (at[:2] - path[0, :2]) @ first < -0.1 and project(path, at)[0] <= 0.0:
-        return None
-    s, offset = project(path, at)
-    if s >= arc_lengths(path)[-1] and (at[:2] - path[-1, :2]) @ last > 0.1:
-        return None
-    return offset
+    return [_row(t, name, float(v)) for name, values in state.items() for t, v in zip(rig.t_us.tolist(), values, strict=True)]
 
 
 def _speeds(t_us: I64, xyz: F64) -> F64:

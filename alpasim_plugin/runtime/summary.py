@@ -19,6 +19,7 @@ from alpasim_plugin.runtime.provenance import fixers
 from alpasim_plugin.runtime.recorder import plan_table
 from evaluators import censoring
 from evaluators.aggregate.overall import NO_BASES, by_policy, numbers
+from evaluators.metrics import METRICS, MetricTable
 
 
 def write_summary(
@@ -28,6 +29,7 @@ def write_summary(
     baseline: str | None,
     more: Mapping[str, Any],
     bases: Mapping[str, str] = NO_BASES,
+    known: MetricTable = METRICS,
 ) -> dict[str, Any]:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
@@ -39,13 +41,14 @@ def write_summary(
         more: What the manifests do not tell, for the summary.
         bases: Renderer with a fixer -> the renderer below it; where the run has both and it is not the
             baseline, the two are paired too.
+        known: What the metrics are.
     """
     rollouts = write_tables(root, manifests)
     done = [m for m in manifests if m["status"] == "ok"]
     summary = {
         "preset": preset,
-        **numbers(RolloutTable.of_table(rollouts), baseline, bases),
-        "censoring": by_policy(_of_policies(manifests), censoring),
+        **numbers(RolloutTable.of_table(rollouts), baseline, bases, known),
+        "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
         "failures": _failures(manifests),
         "fixers": by_policy(_of_policies(done), fixers),
         "plans": by_policy(_of_policies(done), plan_table),

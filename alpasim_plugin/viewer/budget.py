@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import cell_data, read_logs
 from alpasim_plugin.viewer.pictures import Fineness
+from evaluators.opening import Run
 
 MOST_STRIDE = 4  # coarser frames than this are worse to watch than fewer cells
 

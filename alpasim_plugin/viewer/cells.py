@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import Run
 from evaluators.report.flips import Flip, baseline_of, events, find_flips, in_words
 
 DOING = "choosing rollouts to watch"

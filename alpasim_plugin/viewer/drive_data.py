@@ -13,9 +13,9 @@ import pyarrow.compute as pc
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F64, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log import read_facts
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout, series_by_cell
 from alpasim_plugin.viewer.units import Place, mrad, rounded
+from evaluators.opening import Run
 from evaluators.report.events import SERIES, Event, events_of
 
 PLAN_STEP_US = 500_000

@@ -11,11 +11,11 @@ from functools import cache
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.viewer.budget import as_json, fit, names
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.page_data import index_data
 from alpasim_plugin.viewer.pictures import Fineness
+from evaluators.opening import Run
 from evaluators.report.html import asset
 from evaluators.report.numbers import plural
 

@@ -9,21 +9,20 @@ from typing import Any
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.run_folder.reader import Run, read_json
+from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
 from alpasim_plugin.viewer.cells import WatchedCell
 from alpasim_plugin.viewer.drive_data import Tracks, drive_data, plans_part
 from alpasim_plugin.viewer.map_data import map_data, recorded_drive
 from alpasim_plugin.viewer.pictures import NO_FRAMES, Fineness, encoded, sources
 from alpasim_plugin.viewer.units import Place
-from evaluators.metrics import METRICS
+from evaluators.metrics import MetricInfo
+from evaluators.opening import Run
 from evaluators.report.events import clock_zero_us
 from evaluators.report.flips import FLIPS_NAME, baseline_of
-from evaluators.report.metric_info import meaning, ordered
 
 DOING = "reading a rollout to watch"
 LOG = "rollout.asl"
-FIRST_CURVES = ("lateral_offset_m", "ego_speed_mps", "min_distance_to_obstacle_m", "plan_deviation", "opacity_mean")
 
 
 Logs = Mapping[str, RolloutLog | SimrunError | None]  # folder of a rollout -> its log, or why it cannot be read
@@ -123,8 +122,8 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
         "run": run.folder.resolve().name,
         "renderers": run.renderers,
         "baseline": base,
-        "first_curves": FIRST_CURVES,
-        "metrics": {name: _metric(name, units.get(name) or {}) for name in ordered({*METRICS, *units})},
+        "first_curves": run.table.first_curves(),
+        "metrics": {name: _metric(run.table.shown(name), units.get(name) or {}) for name in run.table.ordered({*run.table, *units})},
         "cells": [
             {
                 "id": cell.id,
@@ -143,10 +142,8 @@ def index_data(run: Run, cells: Sequence[WatchedCell], here: Sequence[WatchedCel
     }
 
 
-def _metric(name: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    facts = METRICS.get(name)
-    unit = facts.unit if facts is not None else str(stated.get("unit") or "")
-    return {"unit": unit, "help": meaning(name), "flag": facts is not None and facts.is_flag}
+def _metric(metric: MetricInfo, stated: Mapping[str, Any]) -> dict[str, Any]:
+    return {"unit": metric.unit or str(stated.get("unit") or ""), "help": metric.help, "flag": metric.is_flag}
 
 
 def _flip_entries(run: Run, cell: WatchedCell) -> list[Mapping[str, Any]]:

@@ -15,8 +15,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import U8, LoggedImage, RolloutLog
 from alpasim_plugin.log import decode_image
 from alpasim_plugin.log.video_reader import VideoReader
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import Run
 
 VIDEO = "front.mp4"
 JPEG_QUALITY = 76

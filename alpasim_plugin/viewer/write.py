@@ -9,11 +9,11 @@ from urllib.parse import urlencode
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_text
-from alpasim_plugin.run_folder.reader import Run, reporting
+from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.viewer.cells import Wanted, WatchedCell, cells_of, check_wanted, shown_by_default, telling
 from alpasim_plugin.viewer.page import MB, Options, make_page
 from alpasim_plugin.viewer.pictures import Fineness
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 
 DOING = "writing a page to watch"
 FLIPS_PAGE, REPORT = "flips.html", "report.html"

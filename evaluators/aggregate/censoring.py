@@ -10,19 +10,20 @@ import numpy as np
 
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.run_folder.sides import RendererRows, Row, by_renderer, failure_of, metric_names, reason_of
-from evaluators.metrics import info
+from evaluators.metrics import METRICS, MetricTable
 
 STEP_RULES = ("steps_total", "steps_warmup", "steps_after_event", "steps_after_drift", "steps_scored")
 CUT_RULES = ("steps_after_event", "steps_after_drift")  # the policy drove there, but what happened does not count
 FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
 
 
-def censoring(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, dict[str, Any]]:
     """Count what did not enter the table, per renderer and cause.
 
     Args:
         rows: Rollout rows or manifests as for `aggregate`, with ``censored`` (a `Ledger` as dict), ``frames`` and ``frame_events`` where a
             rollout was scored, and ``failure_class`` or ``error`` where it failed.
+        known: What the metrics are.
 
     Returns:
         RENDERER -> ``rollouts`` (planned), ``failed`` (by failure class), ``dropped`` (by reason), the step counts of the ledger summed
@@ -33,10 +34,10 @@ def censoring(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         before the event was seen).
     """
     names = metric_names(rows)
-    return {name: _of_renderer(side, names) for name, side in by_renderer(rows).items()}
+    return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
 
 
-def _of_renderer(side: RendererRows, names: Sequence[str]) -> dict[str, Any]:
+def _of_renderer(side: RendererRows, names: Sequence[str], known: MetricTable) -> dict[str, Any]:
     done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
     ledgers = [row["censored"] for row in done if row.get("censored")]
     events: Counter[str] = Counter()
@@ -62,8 +63,9 @@ def _of_renderer(side: RendererRows, names: Sequence[str]) -> dict[str, Any]:
         if len(absent):
             reasons = Counter(reason_of(side.rows[i], name) for i in absent)
             out["invalid"][name] = {"rollouts": len(absent), "reasons": dict(reasons)}
-        if info(name).is_flag:
-            is_share = info(name).aggregation == "mean"
+        metric = known.info(name)
+        if metric.is_flag:
+            is_share = metric.aggregation == "mean"
             out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(values, cut, scored, is_share)
     return out
 

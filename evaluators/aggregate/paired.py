@@ -16,8 +16,8 @@ from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.run_folder.sides import Cell, Row, Side, by_renderer, metric_names
 from evaluators.aggregate.intervals import Interval, cluster_means, logit_t_bounds, n_clusters, t_bounds, t_interval, within
 from evaluators.aggregate.power import LEAST_DECIDED_FLAGS, more_scenes
-from evaluators.aggregate.verdict import default_margin, difference, harm, p_value, sign_test, verdict
-from evaluators.metrics import difference_range, info
+from evaluators.aggregate.verdict import difference, harm, p_value, sign_test, verdict
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
 
 LISTED = 50  # missing cells named per metric; the count is always whole
 NO_PAIR = "no scene-seed cell has this metric on both sides"
@@ -29,6 +29,7 @@ def paired(
     metrics: Sequence[str] | None = None,
     margins: Mapping[str, float] | None = None,
     listed: int = LISTED,
+    known: MetricTable = METRICS,
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Compare every renderer with a baseline, cell by cell.
 
@@ -36,8 +37,9 @@ def paired(
         rows: As for `aggregate`.
         baseline: Renderer that the others are compared with.
         metrics: Which metrics; all that any row has by default.
-        margins: How much worse is accepted, by metric, in its unit; `default_margin` for the others.
+        margins: How much worse is accepted, by metric, in its unit; the metric's own margin for the others.
         listed: How many missing cells to name per metric.
+        known: What the metrics are.
 
     Returns:
         RENDERER -> METRIC -> what `compare` gives.
@@ -45,27 +47,31 @@ def paired(
     Raises:
         InputError: No row has the baseline.
     """
-    return paired_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics, baseline, margins, listed)
+    return paired_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics, baseline, margins, listed, known)
 
 
 def paired_sides(
-    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str, margins: Mapping[str, float] | None = None, listed: int = LISTED
+    sides: Mapping[str, Side],
+    metrics: Sequence[str],
+    baseline: str,
+    margins: Mapping[str, float] | None = None,
+    listed: int = LISTED,
+    known: MetricTable = METRICS,
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Compare every renderer with a baseline; see `paired`.
 
     Args:
         sides: RENDERER -> its rollouts.
         metrics: Which metrics.
-        baseline, margins, listed: As for `paired`.
+        baseline, margins, listed, known: As for `paired`.
 
     Raises:
         InputError: No side is the baseline.
     """
     if baseline not in sides:
         raise InputError("pairing renderers", f"baseline {baseline!r}", "no rollout has it", f"choose one of {', '.join(sides)}")
-    chosen = {name: (margins or {}).get(name, default_margin(name)) for name in metrics}
     return {
-        renderer: {name: compare(side, sides[baseline], name, baseline, chosen[name], listed) for name in metrics}
+        renderer: {name: compare(side, sides[baseline], known.info(name), baseline, (margins or {}).get(name), listed) for name in metrics}
         for renderer, side in sides.items()
         if renderer != baseline
     }
@@ -86,18 +92,26 @@ def base_pairs(rows: Sequence[Row], baseline: str | None, bases: Mapping[str, st
 
 
 def base_pairs_of_sides(
-    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str]
+    sides: Mapping[str, Side], metrics: Sequence[str], baseline: str | None, bases: Mapping[str, str], known: MetricTable = METRICS
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Compare every renderer with a fixer with the renderer below it; see `base_pairs`."""
     chosen = {name: base for name, base in bases.items() if name in sides and base in sides and base != baseline and name != baseline}
     return {
-        name: {metric: compare(sides[name], sides[base], metric, base, default_margin(metric)) for metric in metrics}
-        for name, base in chosen.items()
+        name: {metric: compare(sides[name], sides[base], known.info(metric), base) for metric in metrics} for name, base in chosen.items()
     }
 
 
-def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, listed: int = LISTED) -> dict[str, Any]:
+def compare(
+    here: Side, there: Side, metric: MetricInfo, baseline: str, margin: float | None = None, listed: int = LISTED
+) -> dict[str, Any]:
     """Compare one metric of two renderers on their shared cells.
+
+    Args:
+        here, there: Their rollouts.
+        metric: What is compared.
+        baseline: What to call ``there``.
+        margin: How much worse is accepted, in the metric's unit; None: its own margin.
+        listed: How many missing cells to name.
 
     Returns:
         ``baseline``; ``diff`` (here minus there: mean over scenes of the scene's mean difference); ``ci95`` ([low, high], scenes as unit)
@@ -109,8 +123,8 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
         ``n_cells``, ``n_scenes``, ``n_missing`` and ``missing`` (planned cells without a pair: cell, side, why); ``unit``, ``direction``;
         ``reason`` where numbers are None, ``note`` where they need care.
     """
-    facts = info(metric)
-    pairs = _Pairs(here, there, metric)
+    margin = metric.accepted if margin is None else margin
+    pairs = _Pairs(here, there, metric.name)
     entry: dict[str, Any] = {
         "baseline": baseline,
         "diff": None,
@@ -125,9 +139,9 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
         "n_cells": len(pairs.mine),
         "n_scenes": n_clusters(pairs.scenes),
         "n_missing": pairs.n_missing,
-        "missing": pairs.missing(metric, listed),
-        "unit": facts.unit,
-        "direction": facts.direction,
+        "missing": pairs.missing(metric.name, listed),
+        "unit": metric.unit,
+        "direction": metric.direction,
     }
     if not len(pairs.mine):
         return entry | {"reason": NO_PAIR}
@@ -135,23 +149,23 @@ def compare(here: Side, there: Side, metric: str, baseline: str, margin: float, 
     means, _ = cluster_means(delta, pairs.scenes)
     up, down = int(np.sum(means > 0)), int(np.sum(means < 0))
     entry["scenes"] = {"up": up, "down": down, "same": len(means) - up - down, "p_value": sign_test(up, down)}
-    if facts.is_flag:
+    if metric.is_flag:
         gained, lost = int(np.sum((pairs.mine > 0) & (pairs.base == 0))), int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
         entry["cells"] = {"only_here": gained, "only_baseline": lost, "p_value": sign_test(gained, lost)}
-    interval = flag_interval(delta, pairs.scenes) if facts.is_flag else t_interval(means, "scenes")
-    interval = within(interval, *difference_range(metric))
+    interval = flag_interval(delta, pairs.scenes) if metric.is_flag else t_interval(means, "scenes")
+    interval = within(interval, *metric.difference_range)
     entry["diff"], entry["ci95"], entry["method"] = interval.centre, interval.bounds, interval.method or None
     if interval.reason:
         return entry | {"reason": interval.reason}
     if interval.note:
         entry["note"] = interval.note
     entry["spread"] = float(np.std(means, ddof=1))
-    entry["p_value"], entry["test"] = p_value(means, facts.is_flag)
-    entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, facts.direction)
-    entry["difference"] = difference(interval.bounds, entry["p_value"], facts.direction)
-    if entry["verdict"] == "undecided" and (facts.direction != "none" or margin > 0.0):
-        seen = abs(interval.centre) if facts.direction == "none" else harm([interval.centre] * 2, facts.direction)[0]
-        entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, facts.is_flag)
+    entry["p_value"], entry["test"] = p_value(means, metric.is_flag)
+    entry["verdict"] = verdict(interval.bounds, entry["p_value"], margin, metric.direction)
+    entry["difference"] = difference(interval.bounds, entry["p_value"], metric.direction)
+    if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
+        seen = abs(interval.centre) if metric.direction == "none" else harm([interval.centre] * 2, metric.direction)[0]
+        entry["more_scenes"] = more_scenes(seen, entry["spread"], len(means), margin, metric.is_flag)
     return entry
 
 

@@ -1,7 +1,7 @@
 """From series over a rollout to one value per metric: which steps count, and how their values are reduced.
 
 Order (paper, appendix "Closed-loop replay evaluation"): steps before the policy takes over are dropped; steps after the first off-road or
-collision event are dropped, the event's own step stays; flags are reduced by their maximum, other metrics as `METRICS` says.
+collision event are dropped, the event's own step stays; flags are reduced by their maximum, other metrics as they say themselves.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.types import F64, I64, Aggregation, Bool, Direction, MetricSeries
-from evaluators.metrics import info
+from alpasim_plugin.core.types import F64, I64, Aggregation, Bool, Direction, MetricInfo, MetricSeries
+from evaluators.metrics import METRICS
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset
 
@@ -108,7 +108,7 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = "paper
     if not ledger.dropped:
         line = table["eval_relevant"].t_us
         scored = line[(line >= first_us) & (line <= last_us)]
-        values["duration_frac_20s"] = _value("duration_frac_20s", float(scored[-1] - scored[0]) / 20e6)
+        values["duration_frac_20s"] = _value(METRICS["duration_frac_20s"], float(scored[-1] - scored[0]) / 20e6)
     if "progress_rel_to_total" in values:
         values["progress_clipped_rel"] = values["progress_rel_to_total"]
     return Reduction(values, ledger, () if ledger.dropped else _events(table, first_us, last_us))
@@ -125,10 +125,9 @@ def _any_of(name: str, parts: Sequence[MetricSeries]) -> MetricSeries:
     """Combine flags on one time line: 1 where any is known to be 1, unknown where none is and one is unknown."""
     fired = np.any([np.where(part.valid, part.value, 0.0) > 0 for part in parts], axis=0)
     known = fired | np.all([part.valid for part in parts], axis=0)
-    facts = info(name)
     value = np.where(known, fired.astype(np.float64), np.nan)
     reason = "" if bool(known.all()) else next(part.reason for part in parts if part.reason)
-    return MetricSeries(name, parts[0].t_us, value, known, facts.aggregation, facts.unit, facts.direction, reason)
+    return MetricSeries(METRICS[name], parts[0].t_us, value, known, reason)
 
 
 def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, Ledger]:
@@ -174,22 +173,22 @@ def _events(table: dict[str, MetricSeries], first_us: int, last_us: int) -> tupl
 
 def _reduce(one: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str) -> RolloutValue:
     if dropped:
-        return _value(one.name, None, dropped)
+        return _value(one.metric, None, dropped)
     rows = (one.t_us >= first_us) & (one.t_us <= last_us)
     value, valid = one.value[rows], one.valid[rows]
     if not len(value):
-        return _value(one.name, None, "no value among the scored steps")
+        return _value(one.metric, None, "no value among the scored steps")
     # Combined events have no value where a part is unknown; such rows are empty in AlpaSim's tables and never read.
-    if not preset.honour_valid and not info(one.name).derived:
-        return _value(one.name, _REDUCE[one.aggregation](value, one.t_us[rows]))
-    if one.aggregation == "last":
-        return _value(one.name, float(value[-1])) if valid[-1] else _value(one.name, None, one.reason)
+    if not preset.honour_valid and not one.metric.derived:
+        return _value(one.metric, _REDUCE[one.metric.aggregation](value, one.t_us[rows]))
+    if one.metric.aggregation == "last":
+        return _value(one.metric, float(value[-1])) if valid[-1] else _value(one.metric, None, one.reason)
     known = value[valid]
     fired = bool(np.any(known > 0))
-    if not len(known) or (info(one.name).is_flag and one.aggregation == "max" and not fired and not valid.all()):
+    if not len(known) or (one.metric.is_flag and one.metric.aggregation == "max" and not fired and not valid.all()):
         # A flag that did not fire where it is known may have fired where it is not: unknown, never zero.
-        return _value(one.name, None, one.reason)
-    return _value(one.name, _REDUCE[one.aggregation](known, one.t_us[rows][valid]))
+        return _value(one.metric, None, one.reason)
+    return _value(one.metric, _REDUCE[one.metric.aggregation](known, one.t_us[rows][valid]))
 
 
 _REDUCE: dict[Aggregation, Callable[[F64, I64], float]] = {
@@ -201,6 +200,5 @@ _REDUCE: dict[Aggregation, Callable[[F64, I64], float]] = {
 }
 
 
-def _value(name: str, value: float | None, reason: str = "") -> RolloutValue:
-    facts = info(name)
-    return RolloutValue(value, value is not None, reason, facts.unit, facts.direction)
+def _value(metric: MetricInfo, value: float | None, reason: str = "") -> RolloutValue:
+    return RolloutValue(value, value is not None, reason, metric.unit, metric.direction)

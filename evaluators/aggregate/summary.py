@@ -13,18 +13,21 @@ from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.run_folder.sides import Row, Side, by_renderer, metric_names
 from evaluators.aggregate.bootstrap import cluster_bootstrap, redraws
 from evaluators.aggregate.intervals import clustered, design_effect, exact_rate, n_clusters, normal_half_width, wilson_rate, within
-from evaluators.metrics import info, value_range
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
 
 BOOTSTRAP_SCENES = 1000  # beyond, the bootstrap costs seconds and says what the t interval says
 
 
-def aggregate(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> dict[str, dict[str, dict[str, Any]]]:
+def aggregate(
+    rows: Sequence[Row], metrics: Sequence[str] | None = None, known: MetricTable = METRICS
+) -> dict[str, dict[str, dict[str, Any]]]:
     """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 % interval.
 
     Args:
         rows: One mapping per rollout with ``renderer``, ``policy``, ``scene``, ``seed``, ``status`` and the metrics, either flat
             (``METRIC``, ``METRIC_valid``) or under ``metrics``. Rows whose status is not "ok" and invalid values do not enter.
         metrics: Which metrics; all that any row has by default.
+        known: What they are.
 
     Returns:
         RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered`` ([low, high], scenes as clusters) and
@@ -33,24 +36,26 @@ def aggregate(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> dict
         independent). What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` / ``ci95_clustered_reason`` /
         ``ci95_bootstrap_reason``; ``note`` qualifies the clustered interval.
     """
-    return aggregate_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics)
+    return aggregate_sides(by_renderer(rows), metric_names(rows) if metrics is None else metrics, known)
 
 
-def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str]) -> dict[str, dict[str, dict[str, Any]]]:
+def aggregate_sides(
+    sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable = METRICS
+) -> dict[str, dict[str, dict[str, Any]]]:
     """Average rollouts per renderer and metric; see `aggregate`.
 
     Args:
         sides: RENDERER -> its rollouts.
         metrics: Which metrics.
+        known: What they are.
     """
     # Metric by metric: renderers share its column and its draws.
-    found = {name: {renderer: _entry(side, name) for renderer, side in sides.items()} for name in metrics}
+    found = {name: {renderer: _entry(side, known.info(name)) for renderer, side in sides.items()} for name in metrics}
     return {renderer: {name: found[name][renderer] for name in metrics} for renderer in sides}
 
 
-def _entry(side: Side, metric: str) -> dict[str, Any]:
-    facts = info(metric)
-    by_cell = side.values(metric)
+def _entry(side: Side, metric: MetricInfo) -> dict[str, Any]:
+    by_cell = side.values(metric.name)
     known = np.isfinite(by_cell)
     values, scenes = by_cell[known], side.scene[known]
     n, n_ran = len(values), int(side.ok.sum())
@@ -64,8 +69,8 @@ def _entry(side: Side, metric: str) -> dict[str, Any]:
         "n_rollouts": n,
         "n_scenes": n_clusters(scenes),
         "n_invalid": max(n_ran - n, 0),
-        "unit": facts.unit,
-        "direction": facts.direction,
+        "unit": metric.unit,
+        "direction": metric.direction,
     }
     if n == 0:
         return entry | {"reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"}
@@ -73,15 +78,15 @@ def _entry(side: Side, metric: str) -> dict[str, Any]:
     entry["ci95"], why = normal_half_width(values)
     if why:
         entry["ci95_reason"] = why
-    interval = within(clustered(values, scenes, facts.is_flag), *value_range(metric))
+    interval = within(clustered(values, scenes, metric.is_flag), *metric.value_range)
     entry["ci95_clustered"], entry["ci95_clustered_method"] = interval.bounds, interval.method or None
     entry["design_effect"] = design_effect(values, scenes)
     if interval.reason:
         entry["ci95_clustered_reason"] = interval.reason
     if interval.note:
         entry["note"] = interval.note
-    entry |= _bootstrap(metric, values, scenes, entry["n_scenes"])
-    if facts.is_flag:
+    entry |= _bootstrap(metric.name, values, scenes, entry["n_scenes"])
+    if metric.is_flag:
         entry |= _counts(values)
     return entry
 

@@ -8,32 +8,12 @@ import numpy as np
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from alpasim_plugin.core.types import F64, Direction
-from evaluators.metrics import info
 
 Verdict = Literal["non-inferior", "worse", "undecided"]
 Difference = Literal["better", "worse", "none shown"]
 
 ALPHA = 0.05
-RATE_MARGIN = 0.02
 ROUNDING = 1e-12  # differences that vary by no more than this, relative, are equal
-# How much worse is accepted, in the metric's unit, where no gate says otherwise. A metric that is not here has none.
-MARGINS = {
-    "progress": 0.02,
-    "progress_rel": 0.02,
-    "lateral_distance_m": 0.1,
-    "route_distance_m": 0.1,
-    "lateral_bias_m": 0.1,
-    "dist_to_gt_trajectory": 0.25,
-    "dist_to_gt_location": 0.5,
-    "min_distance_to_obstacle_m": 0.25,
-    "min_distance_to_lane_boundary_m": 0.05,
-    "plan_deviation": 0.05,
-}
-
-
-def default_margin(metric: str) -> float:
-    """Return the margin of a metric where no gate sets one: `MARGINS`, 2 points for rates, else 0."""
-    return MARGINS.get(metric, RATE_MARGIN if info(metric).is_flag else 0.0)
 
 
 def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:

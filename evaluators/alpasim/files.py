@@ -38,7 +38,7 @@ def metrics_unprocessed_table(rollouts: Sequence[ScoredRollout]) -> pa.Table:
             columns["timestamps_us"] += one.t_us.tolist() or [None]
             columns["values"] += one.value.tolist() or [None]
             columns["valid"] += one.valid.tolist() or [None]
-            columns["time_aggregation"] += [one.aggregation] * n
+            columns["time_aggregation"] += [one.metric.aggregation] * n
             for name, value in zip(ids, (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name), strict=True):
                 ids[name] += [value] * n
     types = [pa.string(), pa.int64(), pa.float64(), pa.bool_(), pa.string(), *[pa.string()] * 4]

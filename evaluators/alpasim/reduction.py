@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.types import MetricSeries
+from alpasim_plugin.core.types import MetricInfo, MetricSeries
 from evaluators.aggregate.reduce import Reduction, RolloutValue, reduce_rollout
 from evaluators.base import series
 from evaluators.presets import Preset
@@ -54,7 +54,7 @@ def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[Reduce
     Raises:
         EvaluatorError: No rollout has a camera image: AlpaSim's aggregation needs the black-image test in at least one.
     """
-    names = list(dict.fromkeys(one.name for rollout in rollouts for one in rollout.series))
+    names = {one.name: one.metric for rollout in rollouts for one in rollout.series}
     if rollouts and "img_is_black" not in names:
         raise EvaluatorError(
             "aggregating as AlpaSim does", f"{len(rollouts)} rollouts", f"no image of camera {preset.image_camera!r} in any log",
@@ -63,7 +63,7 @@ def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[Reduce
     return [_reduce(rollout, names, preset) for rollout in rollouts]
 
 
-def _reduce(rollout: ScoredRollout, names: Sequence[str], preset: Preset) -> ReducedRollout:
+def _reduce(rollout: ScoredRollout, names: Mapping[str, MetricInfo], preset: Preset) -> ReducedRollout:
     own = {one.name for one in rollout.series}
     line = next(one.t_us for one in rollout.series if one.name == "eval_relevant")
     added = []
@@ -74,13 +74,8 @@ def _reduce(rollout: ScoredRollout, names: Sequence[str], preset: Preset) -> Red
     values = dict(reduction.values)
     if added and "offroad" not in names:
         del values["offroad"]
-    for name in names:
+    for name, metric in names.items():
         if name not in own:
-            facts = values.get(name) or _facts(name)
+            facts = values.get(name) or RolloutValue(None, False, "", metric.unit, metric.direction)
             values[name] = replace(facts, value=None, valid=False, reason=reduction.ledger.dropped or "not scored in this rollout")
     return ReducedRollout(rollout, replace(reduction, values=values))
-
-
-def _facts(name: str) -> RolloutValue:
-    empty = series(name, np.zeros(0, dtype=np.int64), np.zeros(0))
-    return RolloutValue(None, False, "", empty.unit, empty.direction)

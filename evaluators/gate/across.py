@@ -8,12 +8,12 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.schema import cell_name
 from evaluators.aggregate.paired import LISTED, compare
-from evaluators.aggregate.verdict import default_margin
 from evaluators.gate.baseline import check_scenes, scene_hashes
 from evaluators.gate.rows import table_of_run
+from evaluators.metrics import METRICS, MetricTable
+from evaluators.opening import Run
 
 DOING = "comparing runs"
 
@@ -26,12 +26,14 @@ class Comparison:
         paired: VARIANT -> METRIC -> what `evaluators.aggregate.paired.compare` gives; a variant is RENDERER, or RENDERER/POLICY where there
             are several policies.
         with_base: The same of renderers with a fixer against the renderer below it, where that is not the baseline.
+        metrics: What the metrics are.
         notes: What a reader must know, such as policies that were paired although their names differ.
     """
 
     paired: Mapping[str, Mapping[str, Mapping[str, Any]]]
     notes: tuple[str, ...] = field(default=())
     with_base: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    metrics: MetricTable = field(default_factory=lambda: METRICS)
 
 
 def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, float] | None = None, listed: int = LISTED) -> Comparison:
@@ -48,8 +50,9 @@ def compare_within(run: Run, baseline: str | None = None, margins: Mapping[str, 
     if len(known) < 2:
         raise InputError(DOING, str(run.folder), f"only one renderer, {name}", "name a second run, or run two renderers")
     bases = {one: base for one, base in (run.info.get("bases") or {}).items() if one in known and base in known and name not in (one, base)}
-    found = _pairs(table, table, {other: name for other in known if other != name}, "", margins, listed)
-    return Comparison(found, with_base={} if baseline is not None else _pairs(table, table, bases, "", margins, listed))
+    found = _pairs(table, table, {other: name for other in known if other != name}, "", margins, run.table, listed)
+    with_base = {} if baseline is not None else _pairs(table, table, bases, "", margins, run.table, listed)
+    return Comparison(found, (), with_base, run.table)
 
 
 def compare_runs(
@@ -60,7 +63,8 @@ def compare_runs(
     A policy is paired with the policy of the same name; where the runs share none and have one each, with the other's.
 
     Raises:
-        InputError: The runs differ in preset or in a scene's content, share no scene, or a renderer or policy has no partner.
+        InputError: The runs differ in preset or in a scene's content, share no scene, a renderer or policy has no partner, or a metric is
+            another quantity in the other run.
     """
     both = f"{first.folder} and {second.folder}"
     presets = [str(run.summary.get("preset")) for run in (first, second)]
@@ -78,7 +82,8 @@ def compare_runs(
     if lone:
         raise InputError(DOING, f"renderers {lone} of {second.folder}", f"{first.folder} has {', '.join(there)}", "name one by --baseline")
     chosen = {name: other for name, other in partner.items() if other is not None}
-    return Comparison(_pairs(table, base, chosen, f"{first.folder}: ", margins, listed, partner_of), notes)
+    metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, DOING, both)
+    return Comparison(_pairs(table, base, chosen, f"{first.folder}: ", margins, metrics, listed, partner_of), notes, metrics=metrics)
 
 
 def _pairs(
@@ -87,6 +92,7 @@ def _pairs(
     partner: Mapping[str, str],
     prefix: str,
     margins: Mapping[str, float] | None,
+    metrics: MetricTable,
     listed: int,
     policy_of: Mapping[str, str] | None = None,
 ) -> dict[str, dict[str, Any]]:
@@ -98,6 +104,7 @@ def _pairs(
         partner: RENDERER of ``table`` -> renderer of ``base``.
         prefix: Of the partner's name.
         margins, listed: As for `compare_runs`.
+        metrics: What the metrics are.
         policy_of: POLICY of ``table`` -> policy of ``base``; None: the same.
     """
     out: dict[str, dict[str, Any]] = {}
@@ -108,9 +115,7 @@ def _pairs(
             if renderer in here and other in there:
                 variant = renderer if len(table.policies) == 1 else cell_name(renderer, policy)
                 out[variant] = {
-                    name: compare(
-                        here[renderer], there[other], name, prefix + other, (margins or {}).get(name, default_margin(name)), listed
-                    )
+                    name: compare(here[renderer], there[other], metrics.info(name), prefix + other, (margins or {}).get(name), listed)
                     for name in dict.fromkeys([*table.metrics, *base.metrics])
                 }
     return out

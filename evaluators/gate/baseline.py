@@ -13,10 +13,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.io.reading import read_json_object
 from alpasim_plugin.io.reading.files import as_shape, kind_of
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.sides import Row
 from evaluators.gate.rows import rows_of_run
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 
 SCHEMA_VERSION = 1
 DOING = "comparing with a stored baseline"

@@ -9,13 +9,16 @@ from alpasim_plugin.run_folder.sides import Row
 from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, worst
 from evaluators.gate.judge import Check, GateVerdict, judge
 from evaluators.gate.spec import GateSpec
+from evaluators.metrics import METRICS, MetricTable
 from evaluators.report.decision import MetricRow, metric_rows
 from evaluators.sequential.record import Decision
 
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
 
 
-def judge_decided(rows: Sequence[Row], spec: GateSpec, decision: Decision, stored: Sequence[Row] | None = None) -> GateVerdict:
+def judge_decided(
+    rows: Sequence[Row], spec: GateSpec, decision: Decision, stored: Sequence[Row] | None = None, known: MetricTable = METRICS
+) -> GateVerdict:
     """Judge rollout rows whose number was decided while they were driven.
 
     The intervals of `judge` are those of a fixed number of scenes, so its margins are replaced by the decision's verdicts; limits and
@@ -26,9 +29,10 @@ def judge_decided(rows: Sequence[Row], spec: GateSpec, decision: Decision, store
         spec: The gate whose margins were asked about.
         decision: What was decided.
         stored: Rows of a stored baseline, of the scenes and seeds that were driven; without it the baseline was driven, too.
+        known: What the metrics are.
     """
-    plain = judge(rows, spec, stored, decision["baseline"])
-    found = {row.metric: row for row in metric_rows(decision)}
+    plain = judge(rows, spec, stored, decision["baseline"], known)
+    found = {row.metric: row for row in metric_rows(decision, known)}
     checks = tuple(_decided(check, found[check.metric], spec, decision) if check.kind == "margin" else check for check in plain.checks)
     outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding or check.cause == "regression"]
     return replace(plain, outcome=worst([outcome_of_failures(plain.failures, spec.max_failed), *outcomes]), checks=checks)

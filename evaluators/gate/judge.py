@@ -15,7 +15,7 @@ from evaluators.aggregate.outcome import Cause, Outcome, outcome_of_failures, wo
 from evaluators.aggregate.paired import compare
 from evaluators.gate.rows import of_policy, policies_of
 from evaluators.gate.spec import GateSpec, MetricRule
-from evaluators.metrics import info
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
 
 Kind = Literal["margin", "limit"]
 Sides = Mapping[str, Side]  # RENDERER -> its rollouts
@@ -55,7 +55,9 @@ class GateVerdict:
         return {"outcome": self.outcome.as_dict(), "baseline": self.baseline, "failures": dict(self.failures), "checks": checks}
 
 
-def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "") -> GateVerdict:
+def judge(
+    rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "", known: MetricTable = METRICS
+) -> GateVerdict:
     """Judge rollout rows.
 
     Args:
@@ -63,30 +65,38 @@ def judge(rows: Sequence[Row], spec: GateSpec, stored: Sequence[Row] | None = No
         spec: The gate.
         stored: Rows of a stored baseline; without it the baseline is a renderer of the run itself.
         stored_name: How to call the stored baseline.
+        known: What the metrics are.
 
     Raises:
         InputError: A renderer that the gate names is not there, or nothing is left to judge.
     """
-    return judge_sides(_sides(rows), failures_of(rows), spec, None if stored is None else _sides(stored), stored_name)
+    return judge_sides(_sides(rows), failures_of(rows), spec, None if stored is None else _sides(stored), stored_name, known)
 
 
-def judge_table(table: RolloutTable, spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "") -> GateVerdict:
+def judge_table(
+    table: RolloutTable, spec: GateSpec, stored: Sequence[Row] | None = None, stored_name: str = "", known: MetricTable = METRICS
+) -> GateVerdict:
     """Judge rollouts in columns; see `judge`."""
     by_class = table.failures()
     failures = {"n_rollouts": table.n_rollouts, "n_failed": sum(by_class.values()), "by_class": by_class}
     sides = {policy: table.sides(policy) for policy in table.policies}
-    return judge_sides(sides, failures, spec, None if stored is None else _sides(stored), stored_name)
+    return judge_sides(sides, failures, spec, None if stored is None else _sides(stored), stored_name, known)
 
 
 def judge_sides(
-    sides: Mapping[str, Sides], failures: Mapping[str, Any], spec: GateSpec, stored: Mapping[str, Sides] | None, stored_name: str
+    sides: Mapping[str, Sides],
+    failures: Mapping[str, Any],
+    spec: GateSpec,
+    stored: Mapping[str, Sides] | None,
+    stored_name: str,
+    known: MetricTable = METRICS,
 ) -> GateVerdict:
     """Judge rollouts that are laid out by cell; see `judge`.
 
     Args:
         sides: POLICY -> RENDERER -> its rollouts, in order of appearance.
         failures: As `failures_of` gives them.
-        spec, stored_name: As for `judge`.
+        spec, stored_name, known: As for `judge`.
         stored: The same of a stored baseline.
     """
     checks: list[Check] = []
@@ -94,8 +104,8 @@ def judge_sides(
         there = here if stored is None else stored.get(policy, {})
         for renderer in _judged(here, spec, stored is not None):
             base = _baseline_name(renderer, here, there, spec, stored is not None)
-            for metric, rule in spec.metrics.items():
-                side = here[renderer]
+            for name, rule in spec.metrics.items():
+                metric, side = known.info(name), here[renderer]
                 if rule.margin is not None:
                     checks.append(_margin(side, there[base], (renderer, policy), base, metric, rule, spec))
                 if rule.max is not None or rule.min is not None:
@@ -148,33 +158,34 @@ def _baseline_name(renderer: str, here: Sides, there: Sides, spec: GateSpec, has
     return name
 
 
-def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: str, rule: MetricRule, spec: GateSpec) -> Check:
+def _margin(side: Side, base: Side, variant: tuple[str, str], name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec) -> Check:
     entry = compare(side, base, metric, name, rule.margin or 0.0)
     planned = entry["n_cells"] + entry["n_missing"]
     cause: Cause = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}[entry["verdict"]]  # type: ignore[assignment]
-    said = _paired_text(entry, metric, variant[0])
+    said = _paired_text(entry, metric.name, variant[0])
     if entry["n_scenes"] < spec.min_scenes:
         cause = "undecided"
         said += f"; {entry['n_scenes']} scene{'' if entry['n_scenes'] == 1 else 's'}, the gate asks for {spec.min_scenes}"
     elif cause != "regression" and entry["n_missing"] > spec.max_missing * planned:
         cause = "undecided"
         said += f"; {entry['n_missing']} of {planned} cells have no pair, the gate allows {spec.max_missing:.0%}"
-    return Check(*variant, metric, "margin", cause, said, entry, rule.must_decide)
+    return Check(*variant, metric.name, "margin", cause, said, entry, rule.must_decide)
 
 
-def _limit(side: Side, variant: tuple[str, str], metric: str, rule: MetricRule) -> Check:
-    values = side.values(metric)
+def _limit(side: Side, variant: tuple[str, str], metric: MetricInfo, rule: MetricRule) -> Check:
+    values = side.values(metric.name)
     known = values[np.isfinite(values)]
-    unit = info(metric).unit
     bounds = {"max": rule.max, "min": rule.min}
     limits = " and ".join(f"{kind} {value:g}" for kind, value in bounds.items() if value is not None)
     if not len(known):
-        text = f"{variant[0]}: {metric} has no valid value, its limit is {limits}"
-        return Check(*variant, metric, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
+        text = f"{variant[0]}: {metric.name} has no valid value, its limit is {limits}"
+        return Check(*variant, metric.name, "limit", "undecided", text, {"mean": None, **bounds}, rule.must_decide)
     mean = float(known.mean())
     broken = (rule.max is not None and mean > rule.max) or (rule.min is not None and mean < rule.min)
-    text = f"{variant[0]}: {metric} {_number(mean, unit)}, limit {limits}"
-    return Check(*variant, metric, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)})
+    text = f"{variant[0]}: {metric.name} {_number(mean, metric.unit)}, limit {limits}"
+    return Check(
+        *variant, metric.name, "limit", "regression" if broken else "pass", text, {"mean": mean, **bounds, "n_rollouts": len(known)}
+    )
 
 
 def _paired_text(entry: Mapping[str, Any], metric: str, renderer: str) -> str:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.schema import ROLLOUTS
 from alpasim_plugin.run_folder.sides import Row
+from evaluators.opening import Run
 
 
 def table_of_run(run: Run) -> RolloutTable:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.io.config import load_yaml, validate
 from alpasim_plugin.io.yaml_positions import Document
-from evaluators.metrics import info
+from evaluators.metrics import METRICS, MetricTable
 from evaluators.presets import PRESETS
 
 DOING = "reading a gate"
@@ -52,8 +52,12 @@ class GateSpec(_Strict):
     metrics: dict[str, MetricRule] = Field(min_length=1, description="Metric to rule.")
 
 
-def load_gate(path_or_name: str | Path) -> tuple[GateSpec, str]:
+def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[GateSpec, str]:
     """Read a gate file, or a shipped gate by name (``default``).
+
+    Args:
+        path_or_name: The file or the name.
+        known: The metrics that it may name: those of the run that it judges.
 
     Returns:
         The gate and the file it came from.
@@ -64,7 +68,7 @@ def load_gate(path_or_name: str | Path) -> tuple[GateSpec, str]:
     path = _locate(str(path_or_name))
     document = load_yaml(path, DOING)
     spec = validate(GateSpec, document, DOING)
-    _check_names(spec, document)
+    _check_names(spec, document, known)
     return spec, str(path)
 
 
@@ -83,10 +87,10 @@ def _locate(text: str) -> Path:
     raise InputError(DOING, text, "no such file", f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}")
 
 
-def _check_names(spec: GateSpec, document: Document) -> None:
+def _check_names(spec: GateSpec, document: Document, known: MetricTable) -> None:
     for name, rule in spec.metrics.items():
         try:
-            facts = info(name)
+            facts = known.info(name)
         except EvaluatorError as error:
             raise document.error(DOING, ("metrics", name), f"no metric {name!r}", "simrun list metrics prints the known ones") from error
         if rule.margin == 0.0 and facts.direction == "none":

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.run_folder.reader import Run
 from evaluators.aggregate.outcome import WORDS
-from evaluators.metrics import info
-from evaluators.report.ending import LABEL
-from evaluators.report.metric_info import in_percent
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.opening import Run
 from evaluators.report.numbers import decimals, fixed
+from evaluators.report.terminal import LABEL
 from evaluators.sequential.record import Decision, read_decision
 
 WORST_CASE = "any bound"
@@ -46,10 +45,10 @@ def verdict_line(decision: Decision) -> str:
     return _line("verdict", text + why)
 
 
-def metric_lines(decision: Decision) -> list[str]:
+def metric_lines(decision: Decision, known: MetricTable = METRICS) -> list[str]:
     """Return one line a metric, and one for the guarantee."""
     lines = []
-    for row in metric_rows(decision):
+    for row in metric_rows(decision, known):
         note = "" if row.binding else ", not binding"
         text = f"{row.metric}: {row.diff} ({row.interval}, margin {row.margin}{note}): {row.verdict}, e-values {row.evidence}"
         lines.append(_line("", text))
@@ -72,7 +71,7 @@ def guarantee(decision: Decision) -> list[str]:
     return [first, *(f"{', '.join(names)}: {kind}" for kind, names in kinds.items()), asked["rule"]]
 
 
-def metric_rows(decision: Decision) -> list[MetricRow]:
+def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[MetricRow]:
     """Return the table of the last look."""
     if not decision["looks"]:
         return []
@@ -80,7 +79,7 @@ def metric_rows(decision: Decision) -> list[MetricRow]:
     rows = []
     for name, one in decision["question"]["metrics"].items():
         now = last[name]
-        scale, unit, places = _print_as(name, [now["diff"], one["margin"], *now["interval"]])
+        scale, unit, places = _print_as(known.info(name), [now["diff"], one["margin"], *now["interval"]])
         ends = [None if v is None else fixed(scale * v, places, sign=True) for v in now["interval"]]
         tone = {"non-inferior": "better", "better": "better", "undecided": "unclear"}.get(now["verdict"], "worse")
         rows.append(
@@ -117,24 +116,28 @@ def section(run: Run) -> Section | None:
         return None
     title = verdict_line(decision)[LABEL:]
     return Section(
-        decision, title, guarantee(decision), metric_rows(decision), [chart(decision, name) for name in decision["question"]["metrics"]]
+        decision,
+        title,
+        guarantee(decision),
+        metric_rows(decision, run.table),
+        [chart(decision, run.table.info(name)) for name in decision["question"]["metrics"]],
     )
 
 
-def chart(decision: Decision, name: str) -> Any:
+def chart(decision: Decision, metric: MetricInfo) -> Any:
     """Draw the confidence sequence of a metric over scenes, with the margin."""
     import matplotlib as mpl
 
     from evaluators.report.charts import INK, MUTED, RC, VARIANT, Chart, new_axes, themed_svg
 
-    one = decision["question"]["metrics"][name]
+    name, one = metric.name, decision["question"]["metrics"][metric.name]
     looks = decision["looks"]
-    scale, unit, _ = _print_as(name, [])
+    scale, unit, _ = _print_as(metric, [])
     n = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
     diff, low, high = (scale * _series([_at(look["metrics"][name], k) for look in looks]) for k in range(3))
-    sign = -1.0 if info(name).direction == "higher" else 1.0
+    sign = -1.0 if metric.direction == "higher" else 1.0
     threshold = scale * sign * one["threshold"]
-    limits = [threshold, -threshold] if info(name).direction == "none" else [threshold]
+    limits = [threshold, -threshold] if metric.direction == "none" else [threshold]
     with mpl.rc_context(RC):
         figure, axes = new_axes()
         axes.fill_between(n, low, high, color=VARIANT[1], alpha=0.2, linewidth=0, step="post" if len(n) == 1 else None)
@@ -168,10 +171,10 @@ def _series(values: Sequence[float | None]) -> Any:
     return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
 
 
-def _print_as(name: str, values: Sequence[float | None]) -> tuple[float, str, int]:
+def _print_as(metric: MetricInfo, values: Sequence[float | None]) -> tuple[float, str, int]:
     """Return scale, unit and decimals in which a metric's differences are printed."""
-    unit = info(name).unit
-    if in_percent(name, unit):
+    unit = metric.unit
+    if metric.in_percent:
         return 100.0, " points", decimals(*(None if v is None else 100.0 * v for v in values))
     return 1.0, f" {unit}" if unit else "", decimals(*values)
 

@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Own, Rollout, Series, series_by_cell
+from evaluators.opening import Run
 
 COLLISION = ("collision_any", "collision_at_fault", "collision_front", "collision_lateral", "collision_rear")
 SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}
-SERIES = (*COLLISION, "offroad", "eval_relevant", "ego_x_m", "ego_y_m", "ego_yaw_rad", "lateral_offset_m")
+SERIES = (*COLLISION, "offroad", "eval_relevant", "ego_x_m", "ego_y_m", "ego_yaw_rad", "lateral_bias_m")
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,8 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.run_folder.reader import Run
-from evaluators.metrics import METRICS
+from evaluators.opening import Run
 from evaluators.report.events import COLLISION
-from evaluators.report.metric_info import HEADLINE, in_percent, ordered
 
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a failure's message
@@ -81,12 +79,10 @@ def rollout_block(run: Run) -> RolloutBlock:
         add(name, "u32", codes, values=values)
     add("state", "u8", _states(run, parents))
     add("wall_s", "f32", _rounded([r.wall_s for r in rollouts]), unit="s", percent=False, headline=False, flag=False)
-    for metric in ordered(run.metric_names):
+    for metric in run.table.ordered(run.metric_names):
         numbers = _rounded([r.metrics.get(metric) for r in rollouts])
-        facts = METRICS.get(metric)
-        unit = facts.unit if facts else ""
-        is_flag = bool(facts and facts.is_flag)
-        add(metric, "f32", numbers, unit=unit, percent=in_percent(metric, unit), headline=metric in HEADLINE, flag=is_flag)
+        facts = run.table.shown(metric)
+        add(metric, "f32", numbers, unit=facts.unit, percent=facts.in_percent, headline=facts.is_headline, flag=facts.is_flag)
     head = json.dumps({"rows": len(rollouts), "columns": header, "renderers": run.renderers}, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
     packed = gzip.compress(np.uint32(len(head)).tobytes() + head + b"".join(one.tobytes() for one in columns), compresslevel=9, mtime=0)

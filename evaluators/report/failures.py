@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import Run
 from evaluators.report.numbers import Cell, finite, fixed, interval, missing
 
 MAX_FAILURE_ROWS = 200

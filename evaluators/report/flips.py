@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from alpasim_plugin.run_folder.reader import Run, read_json
+from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import Run
 from evaluators.report.frames import inline_jpeg
 from evaluators.report.numbers import Cell, fixed, missing, short
 

@@ -13,8 +13,8 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.io.limits import SOURCE_BYTES
 from alpasim_plugin.io.reading import read_bytes
 from alpasim_plugin.io.reading.images import decode_image
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.opening import Run
 from evaluators.report.numbers import fixed
 
 MAX_WIDTH = 1600  # pixels of an inlined strip

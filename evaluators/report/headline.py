@@ -10,24 +10,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from alpasim_plugin.run_folder.reader import Run
-from evaluators.report.certificate import certificate_caution
+from alpasim_plugin.run_folder.shapes import pair_tables
+from evaluators.opening import Run
 from evaluators.report.fixers import fixer_cautions
-from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, ordered
 from evaluators.report.numbers import count_of, decimals, finite, fixed, interval, plural, short
-from evaluators.report.pairs import pair_tables
-from evaluators.report.plans import plan_warnings
+from evaluators.report.provenance import certificate_caution
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral", "broken"]
 
-WORDS = {
-    "collision_at_fault": "at-fault collisions",
-    "collision_any": "collisions",
-    "offroad": "off-road rollouts",
-    "lateral_distance_m": "lateral distance",
-    "route_distance_m": "route distance",
-    "progress": "progress",
-}
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 FEW_SCENES = 10  # below this an interval over scenes leans heavily on its assumptions
 
@@ -70,7 +60,7 @@ def find(run: Run) -> Finding:
     paired = pair_tables(run.summary)
     points = tuple(_paired_point(run, variant, pairs) for variant, pairs in paired)
     if points:
-        title = "; ".join(_clause(point) for point in points[:3])
+        title = "; ".join(_clause(run, point) for point in points[:3])
         title += f"; and {len(points) - 3} more" if len(points) > 3 else ""
         tones = {point.tone for point in points}
         order: tuple[Tone, ...] = ("worse", "mixed", "better", "unclear", "neutral")
@@ -110,21 +100,21 @@ def tone_of(entry: Mapping[str, Any], direction: str) -> Tone:
     return "worse" if (difference > 0) == (direction == "lower") else "better"
 
 
-def _clause(point: Point) -> str:
+def _clause(run: Run, point: Point) -> str:
     baseline = point.baseline
     if point.tone == "worse":
-        return f"{point.name} drives worse than {baseline} in {_listing(point.worse)}"
+        return f"{point.name} drives worse than {baseline} in {_listing(run, point.worse)}"
     if point.tone == "better":
-        return f"{point.name} drives better than {baseline} in {_listing(point.better)}"
+        return f"{point.name} drives better than {baseline} in {_listing(run, point.better)}"
     if point.tone == "mixed":
-        return f"{point.name} is worse than {baseline} in {_listing(point.worse)} and better in {_listing(point.better)}"
+        return f"{point.name} is worse than {baseline} in {_listing(run, point.worse)} and better in {_listing(run, point.better)}"
     if point.tone == "neutral":
         return f"{point.name} drives no worse than {baseline} by more than the margins"
     return f"no difference shown between {point.name} and {baseline}"
 
 
-def _listing(metrics: Sequence[str]) -> str:
-    words = [WORDS.get(m, m) for m in metrics]
+def _listing(run: Run, metrics: Sequence[str]) -> str:
+    words = [run.table.shown(m).words for m in metrics]
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
@@ -134,10 +124,10 @@ def _baseline(pairs: Mapping[str, Any]) -> str:
 
 def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     stats = run.summary.get("metrics", {}).get(variant, {})
-    lead = [m for m in HEADLINE if m in pairs and finite(pairs[m].get("diff")) is not None]
+    lead = [m for m in run.table.headline if m in pairs and finite(pairs[m].get("diff")) is not None]
     if "collision_at_fault" in lead and "collision_any" in lead:
         lead.remove("collision_any")
-    lead = lead or [m for m in ordered(pairs) if finite(pairs[m].get("diff")) is not None]
+    lead = lead or [m for m in run.table.ordered(pairs) if finite(pairs[m].get("diff")) is not None]
     tones = {m: tone_of(pairs[m], str(stats.get(m, {}).get("direction", "none"))) for m in lead}
     said = [m for m in lead if tones[m] in ("worse", "better")]
     kinds = {tones[m] for m in said}
@@ -147,7 +137,7 @@ def _paired_point(run: Run, variant: str, pairs: Mapping[str, Any]) -> Point:
     moved = [*said, *(m for m in lead if m not in said and m != "progress" and finite(pairs[m].get("diff")) != 0.0)]
     same = [m for m in lead if m not in moved and m != "progress"]
     parts = [_difference(run, variant, m, pairs[m], brief=bool(said) and tones[m] == "unclear") for m in moved]
-    parts += [f"no difference at all in {_listing(same)}"] if same else []
+    parts += [f"no difference at all in {_listing(run, same)}"] if same else []
     text = "; ".join(parts)
     worse, better = (tuple(m for m in said if tones[m] == kind) for kind in ("worse", "better"))
     return Point(
@@ -173,18 +163,19 @@ def _lead(run: Run, variant: str, pairs: Mapping[str, Any], metrics: Sequence[st
 
 
 def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], brief: bool) -> str:
-    here, there = (_level(run, name, metric) for name in (variant, str(entry.get("baseline"))))
+    here, there = (_level(run, name, metric) for name in (variant, _baseline_variant(run, variant, str(entry.get("baseline")))))
+    facts = run.table.shown(metric)
     if brief:
-        return f"{WORDS.get(metric, metric)}: {here} against {there}, undecided"
+        return f"{facts.words}: {here} against {there}, undecided"
     stats = run.summary.get("metrics", {}).get(variant, {}).get(metric, {})
     unit = str(stats.get("unit", ""))
-    scale, unit = (100.0, "points") if in_percent(metric, unit) else (1.0, unit)
+    scale, unit = (100.0, "points") if facts.in_percent else (1.0, unit)
     difference = float(entry["diff"]) * scale
     bounds = interval(entry.get("ci95"), float(entry["diff"]))
     ends = (bounds[0] * scale, bounds[1] * scale) if bounds else ()
     places = 1 if scale == 100.0 else decimals(difference, *ends, digits=3)
     tail = f"\u00a0{unit}" if unit else ""
-    text = f"{WORDS.get(metric, metric)}: {here} against {there} ({fixed(difference, places, sign=True)}{tail}"
+    text = f"{facts.words}: {here} against {there} ({fixed(difference, places, sign=True)}{tail}"
     if ends:
         text += f", 95\u00a0% interval {fixed(ends[0], places, sign=True)} to {fixed(ends[1], places, sign=True)}"
     needed = more_scenes_text(entry.get("more_scenes"))
@@ -192,6 +183,13 @@ def _difference(run: Run, variant: str, metric: str, entry: Mapping[str, Any], b
     if needed and margin is not None:
         text += f"; {needed} on the margin of {short(margin * scale, unit)}"
     return f"{text})"
+
+
+def _baseline_variant(run: Run, variant: str, baseline: str) -> str:
+    """Return the key of a variant's baseline in ``summary.json``: RENDERER, or with several policies RENDERER/POLICY of the same policy."""
+    if baseline in run.summary.get("metrics", {}):
+        return baseline
+    return next((f"{baseline}/{policy}" for policy in run.policies if variant.endswith(f"/{policy}")), baseline)
 
 
 def more_scenes_text(more: Any) -> str:
@@ -208,18 +206,18 @@ def _level(run: Run, variant: str, metric: str) -> str:
     mean, unit = finite(stats.get("mean")), str(stats.get("unit", ""))
     if mean is None:
         return "no valid value"
-    if is_rate(metric, unit):
+    if run.table.shown(metric).is_flag:
         counted = count_of(mean, int(stats.get("n_rollouts") or 0))
         return counted if counted else f"{short(100 * mean)}\u00a0%"
-    return f"{short(100 * mean)}\u00a0%" if in_percent(metric, unit) else short(mean, unit)
+    return f"{short(100 * mean)}\u00a0%" if run.table.shown(metric).in_percent else short(mean, unit)
 
 
 def _alone(run: Run, variant: str) -> str:
     stats = run.summary.get("metrics", {}).get(variant, {})
-    names = [m for m in HEADLINE if m in stats and m != "progress"]
+    names = [m for m in run.table.headline if m in stats and m != "progress"]
     if "collision_at_fault" in names and "collision_any" in names:
         names.remove("collision_at_fault")
-    return "; ".join(f"{WORDS.get(m, m)}: {_level(run, variant, m)}" for m in names) or "no metric"
+    return "; ".join(f"{run.table.shown(m).words}: {_level(run, variant, m)}" for m in names) or "no metric"
 
 
 def _cautions(run: Run) -> tuple[str, ...]:
@@ -241,3 +239,12 @@ def _cautions(run: Run) -> tuple[str, ...]:
     elif 1 < len(scenes) < FEW_SCENES:
         said.append(f"Only {len(scenes)} scenes: intervals over scenes are wide and lean on few values.")
     return tuple(said)
+
+
+def plan_warnings(summary: Mapping[str, Any]) -> list[str]:
+    """Say in one sentence each whose plans do not fit the vehicle; variants with the same sentence share it."""
+    by_text: dict[str, list[str]] = {}
+    for name, entry in (summary.get("plans") or {}).items():
+        if entry.get("warning"):
+            by_text.setdefault(str(entry["warning"]), []).append(name)
+    return [f"{', '.join(names)}: {text} (simrun check-policy tests units)" for text, names in by_text.items()]

@@ -15,28 +15,25 @@ from markupsafe import Markup
 
 from alpasim_plugin.io.atomic import write_text
 from alpasim_plugin.io.reading import parsing
-from alpasim_plugin.run_folder.reader import Run, reporting
+from alpasim_plugin.run_folder.reader import reporting
 from alpasim_plugin.run_folder.rows import Series
 from alpasim_plugin.run_folder.schema import AGAIN, DOING
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report import tables
 from evaluators.report.birdseye import SceneView, scene_view
-from evaluators.report.certificate import certificate
-from evaluators.report.charts import drift_charts
+from evaluators.report.charts import drift_charts, forest, speed_against_error
 from evaluators.report.decision import section
 from evaluators.report.events import COLLISION, read_series
 from evaluators.report.every_rollout import rollout_block
 from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, invalid_rows, ledger
-from evaluators.report.figures import forest, speed_against_error, strata_chart
-from evaluators.report.fixers import COLUMNS, fixer_rows
+from evaluators.report.fixers import COLUMNS, fixer_rows, speed
 from evaluators.report.flips import baseline_of, flip_rows
 from evaluators.report.frames import comparisons
 from evaluators.report.headline import find
 from evaluators.report.numbers import DASH, duration, plural
-from evaluators.report.provenance import provenance
-from evaluators.report.scene_table import SCENE_METRICS, scene_rows
-from evaluators.report.speed import speed
-from evaluators.report.strata import heads, strata, stratum_rows
+from evaluators.report.provenance import certificate, provenance
+from evaluators.report.strata import heads, strata, strata_chart, stratum_rows
+from evaluators.report.tables import SCENE_METRICS, scene_rows
 
 MAX_SCENE_PLOTS = 24
 OPEN_SCENE_PLOTS = 6
@@ -97,8 +94,8 @@ def context(run: Run) -> dict[str, Any]:
     looked_at = None if sample is None else interesting[: 2 * MAX_SCENE_PLOTS]
     views, no_view = scene_views(run, series if looked_at is None else read_series(run, looked_at), looked_at or interesting, variant_of)
     strips, no_strip = comparisons(run, interesting, MAX_STRIP_SCENES, STRIP_BUDGET_BYTES)
-    rows = tables.metric_rows(run.summary, run.invalid_reasons)
-    pairs = tables.pair_rows(run.summary)
+    rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
+    pairs = tables.pair_rows(run.summary, run.table)
     by_scene, more_scene_rows = scene_rows(run, interesting)
     failures, more_failures = failure_rows(run)
     headline = [row for row in rows if row.is_headline] or rows

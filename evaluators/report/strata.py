@@ -6,17 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Own, Rollout, series_by_cell
 from evaluators.aggregate.intervals import clustered
+from evaluators.metrics import METRICS
+from evaluators.opening import Run
+from evaluators.report.charts import GRID, MARKERS, N_COLOURS, RC, VARIANT, Chart, new_axes, themed_svg
 from evaluators.report.events import COLLISION
-from evaluators.report.metric_info import meaning
 from evaluators.report.numbers import Cell, fixed, missing, plural, short
 
-DISTANCE, OPACITY = "lateral_offset_m", "opacity_mean"
+DISTANCE, OPACITY = "lateral_bias_m", "opacity_mean"
 DISTANCE_EDGES_M = (0.25, 0.5, 1.0, 2.0)
 OPACITY_SHARES = (25, 50, 75)  # percentiles of the run's own frames: what is much covered depends on how much sky there is
 EVENTS = (("collision_at_fault", "at-fault collisions"), ("offroad", "off-road"))
@@ -92,7 +94,7 @@ def strata(run: Run, scenes: Sequence[str] | None = None) -> list[Strata]:
     found = []
     if steps:
         labels = [*_labels(DISTANCE_EDGES_M, "m"), NOT_BESIDE]
-        note = "Time, events and plans by how far the ego's rear axle was from the logged path at that moment."
+        note = "Time, events and plans by how far the ego's box centre was from the logged path at that moment."
         groups = [one.distance_bin() for one in steps]
         found.append(_split("By distance from the logged path", note, "distance from the path", "m", labels, steps, groups, run))
     covered = [one for one in steps if one.opacity is not None]
@@ -121,7 +123,7 @@ def stratum_rows(one: Strata) -> list[StratumRow]:
 def heads() -> list[tuple[str, str]]:
     """Give the heads of the columns with their meaning."""
     events = [(word, f"rollouts whose first {word.removesuffix('s')} event began there") for _, word in EVENTS]
-    return [("time driven", "scored steps of all rollouts"), *events, *((f"{name} (m)", meaning(name)) for name in VALUES)]
+    return [("time driven", "scored steps of all rollouts"), *events, *((f"{name} (m)", METRICS[name].help) for name in VALUES)]
 
 
 class _Steps:
@@ -222,3 +224,39 @@ def _labels(edges: Sequence[float], unit: str) -> list[str]:
     inner = [f"{a:g} to {b:g}{tail}" for a, b in pairwise(edges)]
     top = "1" if not unit and edges[-1] >= 1.0 else f"{edges[-1]:g}{tail} and more"  # no more than all of a picture can be covered
     return [f"below {edges[0]:g}{tail}", *inner, top]
+
+
+def strata_chart(one: Strata) -> Chart | None:
+    """Draw the steadiness of plans by stratum; None where it is known in fewer than two."""
+    name = VALUES[0]
+    known = [s for s in one.strata if s.label != NOT_BESIDE and any(name in b.means for b in s.bins)]
+    if len(known) < 2:
+        return None
+    variants = sorted({b.variant for s in known for b in s.bins})
+    with mpl.rc_context(RC | {"axes.grid.axis": "y"}):
+        figure, axes = new_axes()
+        for k, stratum in enumerate(known):
+            for b in stratum.bins:
+                if name not in b.means:
+                    continue
+                x = k + (variants.index(b.variant) + 1) / (len(variants) + 1) - 0.5
+                mean, low, high = b.means[name]
+                colour = VARIANT[b.variant % N_COLOURS]
+                if low is not None and high is not None:
+                    axes.plot([x, x], [max(low, 0.0), high], color=colour, linewidth=1.8)
+                axes.plot([x], [mean], MARKERS[b.variant % len(MARKERS)], color=colour, markersize=6)
+        for k in range(1, len(known)):
+            axes.axvline(k - 0.5, color=GRID, linewidth=0.8)
+        axes.set_xticks(range(len(known)), [_tick(s.label, one.unit) for s in known], fontsize=8.5)
+        axes.set_xlim(-0.5, len(known) - 0.5)
+        axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])  # the highest marker is whole
+        axes.set_ylabel("m between plans in a row")
+        axes.set_xlabel(f"{one.axis}, {one.unit}" if one.unit else one.axis)
+        axes.tick_params(length=0)
+        svg = themed_svg(figure)
+    return Chart(f"Steadiness of plans by {one.axis}", "Mean of plan_deviation; bars: 95 % over scenes, from three scenes on.", svg)
+
+
+def _tick(label: str, unit: str) -> str:
+    short_label = label.replace("\u00a0" + unit, "") if unit else label
+    return short_label.replace(" and more", "+").replace("below ", "< ").replace(" to ", "\u2013")

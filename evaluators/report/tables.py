@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from alpasim_plugin.run_folder.reader import Run
+import numpy as np
+
+from alpasim_plugin.run_folder.rows import Rollout
+from alpasim_plugin.run_folder.shapes import pair_tables
+from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.opening import Run
+from evaluators.report.events import COLLISION
 from evaluators.report.headline import more_scenes_text, tone_of
-from evaluators.report.metric_info import HEADLINE, in_percent, is_rate, meaning, ordered
 from evaluators.report.numbers import (
     ARROW_WORDS,
     ARROWS,
@@ -16,6 +21,7 @@ from evaluators.report.numbers import (
     Cell,
     count_of,
     decimals,
+    duration,
     finite,
     fixed,
     interval,
@@ -23,7 +29,6 @@ from evaluators.report.numbers import (
     plural,
     short,
 )
-from evaluators.report.pairs import pair_tables
 
 
 @dataclass(frozen=True)
@@ -70,48 +75,52 @@ class PairRow:
     hint: str = ""  # the margin, and how many more scenes would decide
 
 
-def metric_rows(summary: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None) -> list[MetricRow]:
+def metric_rows(
+    summary: Mapping[str, Any], reasons: Mapping[tuple[str, str], str] | None = None, known: MetricTable = METRICS
+) -> list[MetricRow]:
     """Lay out metrics x variants from ``summary.json``.
 
     Args:
         summary: Content of ``summary.json``.
         reasons: (renderer, metric) -> why it is invalid, for cells without a number.
+        known: What the metrics are.
     """
     variants = summary.get("metrics") or {}
     rows = []
-    for name in ordered(m for metrics in variants.values() for m in metrics):
+    for name in known.ordered(m for metrics in variants.values() for m in metrics):
         entries = [metrics.get(name) or {} for metrics in variants.values()]
         unit = next((str(e["unit"]) for e in entries if e.get("unit")), "")
         direction = next((str(e["direction"]) for e in entries if e.get("direction")), "none")
-        percent = in_percent(name, unit)
+        facts = known.shown(name)
+        percent = facts.in_percent
         reason_of = [(reasons or {}).get((variant, name), "") for variant in variants]
         places = 1 if percent else _places(entries)
-        cells = tuple(metric_cell(name, e, unit, places, why) for e, why in zip(entries, reason_of, strict=True))
-        spans, scale_text = _spans(entries, 100.0 if percent else 1.0, is_rate(name, unit), "%" if percent else unit)
+        cells = tuple(metric_cell(facts, e, places, why) for e, why in zip(entries, reason_of, strict=True))
+        spans, scale_text = _spans(entries, 100.0 if percent else 1.0, facts.is_flag, "%" if percent else unit)
         rows.append(
             MetricRow(
                 name=name,
-                meaning=meaning(name),
+                meaning=facts.help,
                 unit="%" if percent else unit,
                 arrow=ARROWS.get(direction, ""),
                 arrow_word=ARROW_WORDS.get(direction, "neither direction is better"),
                 cells=cells,
                 spans=spans,
-                is_headline=name in HEADLINE,
+                is_headline=facts.is_headline,
                 scale_text=scale_text,
             )
         )
     return rows
 
 
-def metric_cell(name: str, entry: Mapping[str, Any], unit: str, places: int, reason: str = "") -> Cell:
+def metric_cell(metric: MetricInfo, entry: Mapping[str, Any], places: int, reason: str = "") -> Cell:
     """Print a mean with both intervals and, for rates, its count."""
     mean = finite(entry.get("mean"))
     n_rollouts, n_scenes = int(entry.get("n_rollouts") or 0), int(entry.get("n_scenes") or 0)
     if mean is None:
         stated = reason or str(entry.get("reason") or "")
         return missing(stated or ("valid in no rollout" if entry else "not computed for this renderer"))
-    scale = 100.0 if in_percent(name, unit) else 1.0
+    scale = 100.0 if metric.in_percent else 1.0
     half = finite(entry.get("ci95"))
     clustered = interval(entry.get("ci95_clustered"))
     detail = "\u00b1\u00a0" + (fixed(half * scale, places) if half is not None else "\u2014")
@@ -129,7 +138,7 @@ def metric_cell(name: str, entry: Mapping[str, Any], unit: str, places: int, rea
         notes.append(f"no interval over scenes: {entry.get('ci95_clustered_reason') or 'it needs at least two scenes'}")
     if entry.get("note"):
         notes.append(str(entry["note"]))
-    count = count_of(mean, n_rollouts) if is_rate(name, unit) else ""
+    count = count_of(mean, n_rollouts) if metric.is_flag else ""
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, count, mean)
 
 
@@ -180,21 +189,21 @@ def _spans(entries: list[Mapping[str, Any]], scale: float, rate: bool, unit: str
     return tuple(spans), f"{fixed(low * scale, places)} to {fixed(high * scale, places)}{tail}"
 
 
-def pair_rows(summary: Mapping[str, Any]) -> list[PairRow]:
+def pair_rows(summary: Mapping[str, Any], known: MetricTable = METRICS) -> list[PairRow]:
     """Lay out the paired differences, headline metrics first within each variant; those with a fixer's own base come last."""
     rows = []
     for variant, pairs in pair_tables(summary):
-        for name in ordered(pairs):
+        for name in known.ordered(pairs):
             entry = pairs[name] or {}
             stats = {**((summary.get("metrics") or {}).get(variant, {}).get(name) or {}), **entry}  # older summaries: in metrics only
-            rows.append(_pair_row(variant, name, entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
+            rows.append(_pair_row(variant, known.shown(name), entry, str(stats.get("unit", "")), str(stats.get("direction", "none"))))
     return rows
 
 
-def _pair_row(variant: str, name: str, entry: Mapping[str, Any], unit: str, direction: str) -> PairRow:
+def _pair_row(variant: str, metric: MetricInfo, entry: Mapping[str, Any], unit: str, direction: str) -> PairRow:
     diff = finite(entry.get("diff"))
     bounds = interval(entry.get("ci95"), diff)
-    scale, unit = (100.0, "points") if in_percent(name, unit) else (1.0, unit)
+    scale, unit = (100.0, "points") if metric.in_percent else (1.0, unit)
     tail = f"\u00a0{unit}" if unit else ""
     note = _pair_note(entry)
     reason = str(entry.get("reason") or "")
@@ -221,7 +230,7 @@ def _pair_row(variant: str, name: str, entry: Mapping[str, Any], unit: str, dire
         ("non-inferior", "better"): "better",
     }.get((verdict, str(entry.get("difference"))), verdict)
     base, hint = str(entry.get("baseline") or "\u2014"), _hint(entry, scale, unit)
-    return PairRow(variant, base, name, meaning(name), diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
+    return PairRow(variant, base, metric.name, metric.help, diff_cell, bounds_cell, p_cell, verdict, tone, span, hint)
 
 
 def _hint(entry: Mapping[str, Any], scale: float, unit: str) -> str:
@@ -264,3 +273,99 @@ def columns(run: Run) -> list[Column]:
         done = [r for r in rollouts if r.ok]
         heads.append(Column(variant, len(done), len(rollouts) - len(done), len({r.scene for r in done})))
     return heads
+
+
+MAX_SCENE_ROWS = 600  # more are a page that loads and scrolls slowly
+TELLING_ROWS = 200  # shown of a larger run
+SCENE_METRICS = ("lateral_distance_m", "progress")
+
+
+@dataclass(frozen=True)
+class Chip:
+    """One rollout in the scene table: its seed and how it ended."""
+
+    text: str
+    state: str  # ok | collision | offroad | failed
+    title: str
+    folder: str | None
+    clip: str | None
+
+
+@dataclass(frozen=True)
+class SceneRow:
+    """One scene under one renderer and policy."""
+
+    scene: str
+    renderer: str
+    policy: str
+    variant: int
+    chips: tuple[Chip, ...]
+    collisions: Cell
+    offroad: Cell
+    values: tuple[Cell, ...]
+
+
+def scene_rows(run: Run, interesting: Sequence[str] = ()) -> tuple[list[SceneRow], int]:
+    """Lay out scenes x variants, in the order of the run; where there is no room for all, the most telling scenes first.
+
+    Args:
+        run: The run.
+        interesting: Its scenes, the most telling first.
+
+    Returns:
+        The rows, and how many more there are than are shown.
+    """
+    groups: dict[tuple[str, str, str], list[Rollout]] = {}
+    for rollout in run.rollouts:
+        groups.setdefault((rollout.scene, rollout.renderer, rollout.policy), []).append(rollout)
+    renderer_index = {name: i for i, name in enumerate(run.renderers)}
+    is_large = len(groups) > MAX_SCENE_ROWS
+    rank = {name: i for i, name in enumerate(interesting if interesting and is_large else run.scenes)}
+    keys = sorted(groups, key=lambda k: (rank[k[0]], renderer_index[k[1]], k[2]))
+    rows = [_scene_row(run, key, groups[key], renderer_index[key[1]]) for key in keys[: TELLING_ROWS if is_large else MAX_SCENE_ROWS]]
+    return rows, len(keys) - len(rows)
+
+
+def _scene_row(run: Run, key: tuple[str, str, str], rollouts: list[Rollout], variant: int) -> SceneRow:
+    done = [r for r in rollouts if r.ok]
+    chips = tuple(_chip(run, r) for r in sorted(rollouts, key=lambda r: r.seed))
+    return SceneRow(
+        *key,
+        variant=variant,
+        chips=chips,
+        collisions=_count(done, COLLISION),
+        offroad=_count(done, ("offroad",)),
+        values=tuple(_mean(run, done, name) for name in SCENE_METRICS),
+    )
+
+
+def _chip(run: Run, rollout: Rollout) -> Chip:
+    if not rollout.ok:
+        state, letter, said = "failed", " F", f"failed ({rollout.failure_class or 'unknown cause'})"
+    elif rollout.flag(*COLLISION):
+        state, letter, said = "collision", " C", "collision" + (" and off-road" if rollout.flag("offroad") else "")
+    elif rollout.flag("offroad"):
+        state, letter, said = "offroad", " O", "off-road"
+    else:
+        state, letter, said = "ok", "", "no collision, not off-road"
+    facts = [f"seed {rollout.seed}: {said}"]
+    facts += [f"{rollout.frames} frames"] if rollout.frames is not None else []
+    facts += [duration(rollout.wall_s)] if rollout.wall_s is not None else []
+    return Chip(f"{rollout.seed}{letter}", state, ", ".join(facts), run.href(rollout), run.href(rollout, "front.mp4"))
+
+
+def _count(done: list[Rollout], names: tuple[str, ...]) -> Cell:
+    known = [r for r in done if any(r.metrics.get(name) is not None for name in names)]
+    if not known:
+        return missing("no rollout finished" if not done else "the metric is valid in no rollout")
+    k = sum(r.flag(*names) for r in known)
+    return Cell(f"{k} of {len(known)}", sort=k / len(known), tone="worse" if k else "")
+
+
+def _mean(run: Run, done: list[Rollout], name: str) -> Cell:
+    values = [v for r in done if (v := r.metrics.get(name)) is not None]
+    if not values:
+        return missing("no rollout finished" if not done else "the metric is valid in no rollout")
+    mean = float(np.mean(values))
+    note = "" if len(values) == len(done) else f"valid in {len(values)} of {len(done)}"
+    return Cell(f"{fixed(100 * mean, 1)}\u00a0%" if run.table.shown(name).in_percent else short(mean, "m"), note, sort=mean)

@@ -16,6 +16,7 @@ from alpasim_plugin.io.lock import holder_of
 from alpasim_plugin.io.reading.files import as_shape, read_json_as
 from alpasim_plugin.run_folder.schema import CONTENTS, LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
 from alpasim_plugin.run_folder.shapes import RunInfo, Summary
+from evaluators.metrics import MetricTable
 
 DOING = "listing runs"
 CHECK = "simrun check RUN says what is damaged"
@@ -40,6 +41,11 @@ class RunEntry:
     state: State
     problem: str
     info: Mapping[str, Any]
+
+    @cached_property
+    def table(self) -> MetricTable:
+        """Give what the run's metrics are, as the run itself says."""
+        return MetricTable.of_run(self.info)
 
     @property
     def kind(self) -> str:

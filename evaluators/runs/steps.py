@@ -55,7 +55,7 @@ def step_rows(series: Series, line: Line) -> list[StepRow]:
 
 def pair_row(line: Line, step: Step) -> PairRow:
     """Return a step's numbers as the report prints them."""
-    (row,) = pair_rows({"paired": {line.renderer: {line.metric: step.entry}}})
+    (row,) = pair_rows({"paired": {line.renderer: {line.metric: step.entry}}}, step.after.table)
     return row
 
 

@@ -11,7 +11,6 @@ from rich.text import Text
 
 from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.escape import terminal as escape
-from evaluators.report.metric_info import in_percent
 from evaluators.report.numbers import DASH, decimals, finite, fixed, interval
 from evaluators.runs.choose import shown_folder
 from evaluators.runs.entry import RunEntry
@@ -87,7 +86,7 @@ def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
     mean, bounds = finite(found.get("mean")), interval(found.get("ci95_clustered"))
     if mean is None:
         return DASH
-    percent = in_percent(metric, str(found.get("unit") or ""))
+    percent = entry.table.shown(metric).in_percent
     scale, tail = (100.0, " %") if percent else (1.0, f" {found['unit']}" if found.get("unit") else "")
     places = 1 if percent else decimals(*(value * scale for value in (mean, *(bounds or ()))))
     spread = "" if bounds is None else f" ({fixed(bounds[0] * scale, places)} to {fixed(bounds[1] * scale, places)})"

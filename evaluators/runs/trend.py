@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
 from typing import Any
 
-from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.run_folder.schema import ROLLOUTS, ROLLOUTS_TABLE, columns_of
 from alpasim_plugin.run_folder.sides import RendererRows, Row
 from evaluators.aggregate.paired import compare
-from evaluators.aggregate.verdict import default_margin
-from evaluators.metrics import declare_from
 from evaluators.runs.changes import Change, changes
 from evaluators.runs.entry import CHECK, RunEntry, as_time
 
@@ -120,7 +117,7 @@ def trend(entries: Sequence[RunEntry], metrics: Sequence[str]) -> Trend:
         metrics: Which metrics.
 
     Raises:
-        InputError: A table of a run is damaged, or two runs declare a metric of the same name with other facts.
+        InputError: A table of a run is damaged, or a metric is not the same quantity in two runs that are compared.
     """
     usable, left_out = _usable(entries)
     groups: dict[Setting, list[RunEntry]] = {}
@@ -130,7 +127,6 @@ def trend(entries: Sequence[RunEntry], metrics: Sequence[str]) -> Trend:
     joined = {id(one): one for runs in groups.values() if len(runs) > 1 for one in runs}
     left_out += [(one, "no other run has its scenes, seeds, policy and preset") for one in usable if id(one) not in joined]
     by_commit = bool(joined) and all(as_time(one.project.get("committed_at")) is not None for one in joined.values())
-    _declare(joined.values())
     tables = _Tables(metrics)
     ordered = ((setting, sorted(runs, key=lambda one: _order(one, by_commit))) for setting, runs in groups.items() if len(runs) > 1)
     series = [_series(setting, runs, metrics, tables) for setting, runs in ordered]
@@ -168,15 +164,6 @@ def _settings(entry: RunEntry) -> list[Setting]:
     return [Setting(entry.kind, str(policy), str(info.get("preset")), scenes, seeds) for policy in info.get("policies") or ()]
 
 
-def _declare(entries: Iterable[RunEntry]) -> None:
-    for entry in entries:
-        try:
-            declare_from(entry.info)
-        except EvaluatorError as error:
-            do_this = "choose runs of one version of the metric, by --since or --commit"
-            raise InputError(DOING, f"{entry.folder}, {error.with_what}", "another run declares it with other facts", do_this) from error
-
-
 def _series(setting: Setting, runs: Sequence[RunEntry], metrics: Sequence[str], tables: _Tables) -> Series:
     renderers = dict.fromkeys(str(name) for one in runs for name in one.info.get("renderers") or ())
     lines = []
@@ -192,7 +179,8 @@ def _series(setting: Setting, runs: Sequence[RunEntry], metrics: Sequence[str], 
 
 def _step(before: RunEntry, after: RunEntry, metric: str, renderer: str, policy: str, tables: _Tables) -> Step:
     there, here = (tables.rows(one, renderer, policy) for one in (before, after))
-    entry = compare(here, there, metric, before.folder.name, default_margin(metric), listed=0)
+    known = after.table.joined(before.table, [metric], DOING, f"{before.folder} and {after.folder}")
+    entry = compare(here, there, known.info(metric), before.folder.name, listed=0)
     return Step(before, after, entry, changes(before, after, renderer, policy))
 
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, Bool
+from alpasim_plugin.core.types import F64, Bool, Direction
 from alpasim_plugin.run_folder.sides import Side
-from evaluators.metrics import info
 
 
 @dataclass(frozen=True)
@@ -33,9 +32,9 @@ class SceneDifferences:
         """Tell which scenes have a difference ``(n,)``."""
         return np.isfinite(self.diff)
 
-    def harm(self, metric: str) -> F64:
+    def harm(self, direction: Direction) -> F64:
         """Return the differences with the sign that makes positive worse; without a better side as they are."""
-        return -self.diff if info(metric).direction == "higher" else self.diff
+        return -self.diff if direction == "higher" else self.diff
 
 
 def scene_differences(candidate: Side, baseline: Side, metric: str, scenes: Sequence[str]) -> SceneDifferences:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Direction
-from evaluators.aggregate.verdict import default_margin
-from evaluators.metrics import difference_range, info
+from alpasim_plugin.core.types import Direction, MetricInfo
+from evaluators.metrics import METRICS, MetricTable
 from evaluators.sequential.asymptotic import FIRST_LOOK
 
 Asked = Literal["non-inferior", "better"]
@@ -30,7 +29,7 @@ class MetricQuestion:
     """The question about one metric.
 
     Attributes:
-        metric: Its name.
+        facts: The metric.
         margin: How much worse is accepted, or how much better is wanted, in the metric's unit.
         asked: ``non-inferior``: is the difference at most ``margin`` worse; ``better``: is it at least ``margin`` better.
         expected: Expected difference, positive is worse; None: see `distance`.
@@ -38,7 +37,7 @@ class MetricQuestion:
         method: How its e-process is made.
     """
 
-    metric: str
+    facts: MetricInfo
     margin: float
     asked: Asked
     expected: float | None
@@ -46,9 +45,14 @@ class MetricQuestion:
     method: Method
 
     @property
+    def metric(self) -> str:
+        """Give the metric's name."""
+        return self.facts.name
+
+    @property
     def direction(self) -> Direction:
         """Give the better side."""
-        return info(self.metric).direction
+        return self.facts.direction
 
     @property
     def threshold(self) -> float:
@@ -65,7 +69,7 @@ class MetricQuestion:
     @property
     def harm_bounds(self) -> tuple[float, float]:
         """Give the least and the greatest possible difference, positive is worse."""
-        low, high = difference_range(self.metric)
+        low, high = self.facts.difference_range
         return (-high, -low) if self.direction == "higher" else (low, high)
 
 
@@ -101,32 +105,40 @@ class Question:
 
 
 def metric_question(
-    metric: str, margin: float | None, asked: Asked, expected: float | None = None, binding: bool = True, method: Method | None = None
+    metric: str,
+    margin: float | None,
+    asked: Asked,
+    expected: float | None = None,
+    binding: bool = True,
+    method: Method | None = None,
+    known: MetricTable = METRICS,
 ) -> MetricQuestion:
     """Make the question about one metric.
 
     Args:
         metric: Its name.
-        margin: In its unit; None: `default_margin` for ``non-inferior``, 0 for ``better``.
+        margin: In its unit; None: the metric's own for ``non-inferior``, 0 for ``better``.
         asked: As in `MetricQuestion`.
         expected: Expected difference, candidate minus baseline in the metric's own sign.
         binding: As in `MetricQuestion`.
         method: None: betting where differences are bounded, else asymptotic.
+        known: The metrics that can be asked about.
 
     Raises:
         InputError: A negative margin, a metric without a better side for which none is possible, or betting on unbounded differences.
     """
-    direction = info(metric).direction
-    chosen = margin if margin is not None else default_margin(metric) if asked == "non-inferior" else 0.0
+    facts = known.info(metric)
+    direction = facts.direction
+    chosen = margin if margin is not None else facts.accepted if asked == "non-inferior" else 0.0
     if chosen < 0.0 or not math.isfinite(chosen):
         raise InputError(DOING, f"margin {chosen:g} for {metric}", "not a number from 0 up", "give how much worse is accepted, as 0.05")
     if direction == "none" and (asked == "better" or chosen == 0.0):
         found = "it has no better side" if asked == "better" else "it has no better side and a margin of 0"
         raise InputError(DOING, metric, found, "ask whether it is non-inferior, with a margin: the change to either side that is accepted")
-    low, high = difference_range(metric)
+    low, high = facts.difference_range
     bounded = math.isfinite(low) and math.isfinite(high)
     if method == "betting" and not bounded:
         raise InputError(DOING, f"--method betting for {metric}", "its differences have no bounds", "leave --method out")
     sign = -1.0 if direction == "higher" else 1.0
     harm = None if expected is None else sign * expected
-    return MetricQuestion(metric, chosen, asked, harm, binding, method or ("betting" if bounded else "asymptotic"))
+    return MetricQuestion(facts, chosen, asked, harm, binding, method or ("betting" if bounded else "asymptotic"))

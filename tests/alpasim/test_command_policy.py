@@ -20,8 +20,9 @@ from alpasim_plugin.alpasim.client.command import Command
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.run import split_policies
 from alpasim_plugin.core.errors import InputError, PolicyError
-from alpasim_plugin.core.types import Policy, RolloutLog
+from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import build, resolve
 from alpasim_plugin.process import subprocesses as children
 from alpasim_plugin.process.stdout import MOST_BYTES, parts_print_to_stderr, say

@@ -10,14 +10,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from evaluators import METRICS
 from tests.docs.test_commands import parse
-
-
-@pytest.fixture(autouse=True)
-def own_metrics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a template's metric be declared for its test alone."""
-    monkeypatch.setattr("evaluators.metrics.METRICS", dict(METRICS))
 
 
 def run_tests_of(file: Path) -> int:

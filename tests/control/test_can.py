@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Frame, Renderer, RenderRequest, Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.runtime.rollout import run_rollout
 from scenarios.load import load_scenario
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import LaneMap, RolloutLog, Trajectory
-from evaluators import PRESETS, preset, reduce_rollout, rollout_values, score
+from evaluators import METRICS, PRESETS, preset, reduce_rollout, rollout_values, score
 from evaluators.alpasim import EvalSettings, ScoredRollout, load_settings, over_sweeps, reduce_run, results_summary, scene_score
 from evaluators.alpasim.settings import Modifiers, SceneScoreSettings
 from evaluators.route import from_corridor, to_path
@@ -91,7 +93,7 @@ def test_settings_and_result_files_name_the_version():
     for one, shown in ((NOW, False), (LATER, True)):
         series = tuple(score(log, scene(TWO_LANES, log), one))
         black = next(s for s in series if s.name == "offroad")
-        series = (*series, black.__class__("img_is_black", black.t_us, 0 * black.value, black.valid, "max", "", "lower"))
+        series = (*series, replace(black, metric=METRICS["img_is_black"], value=0 * black.value))
         reduced = reduce_run([ScoredRollout("scene", "a", series)], one)
         summary = results_summary(reduced, {}, [{"rollout_id": "b"}], over_sweeps(reduced), SceneScoreSettings())
         assert ("left_corridor_laterally" in summary["score_criteria"]) == shown

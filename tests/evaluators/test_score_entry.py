@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.types import Box, LoggedPlan, Trajectory
-from evaluators import METRICS, MetricInfo, resolve_evaluators, score
+from evaluators import METRICS, MetricInfo, resolve_evaluators, rollout_values, score
 from evaluators.base import run_evaluator, series
-from evaluators.metrics import declare, info
+from evaluators.metrics import MetricTable
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
 
 
@@ -78,8 +79,7 @@ def test_every_series_states_unit_direction_and_reduction_as_declared():
     found = score(log, where)
     assert len({one.name for one in found}) == len(found)
     for one in found:
-        facts = info(one.name)
-        assert (one.unit, one.direction, one.aggregation) == (facts.unit, facts.direction, facts.aggregation)
+        assert one.metric == METRICS.info(one.name)
         assert one.t_us.shape == one.value.shape == one.valid.shape
         assert np.isfinite(one.value[one.valid]).all()
         assert np.isnan(one.value[~one.valid]).all()
@@ -131,12 +131,72 @@ def test_a_metric_given_twice_is_refused():
         score(log, where, evaluators=resolve_evaluators([f"{__name__}:Again"]))
 
 
-def test_a_metric_nobody_declared_is_refused_and_can_be_declared(monkeypatch):
+JERK = MetricInfo("m/s^3", "lower", "max", "largest jerk", label="jerk", margin=0.5, limits=(0.0, None))
+
+
+class Jerky:
+    metrics = {"jerk_max": JERK}  # noqa: RUF012 - as a plug-in writes it
+
+    def __call__(self, rollout, scene):
+        return [series("jerk_max", rollout.ego.t_us, 2.0)]
+
+
+class Undeclared:
+    def __call__(self, rollout, scene):
+        return [series("jerk_max", rollout.ego.t_us, 2.0)]
+
+
+def test_a_plugins_series_carries_what_its_evaluator_says():
+    log, where = bad()
+    found = {one.name: one for one in score(log, where, evaluators=resolve_evaluators([f"{__name__}:Jerky"]))}
+    assert found["jerk_max"].metric == replace(JERK, name="jerk_max")
+    assert rollout_values(list(found.values()))["jerk_max"].unit == "m/s^3"
+    assert "jerk_max" not in METRICS
+
+
+def test_a_metric_nobody_declared_is_refused():
+    log, where = bad()
     with pytest.raises(EvaluatorError, match="no evaluator declares it"):
-        info("jerk_max")
-    monkeypatch.setattr("evaluators.metrics.METRICS", dict(METRICS))
-    facts = MetricInfo("m/s^3", "lower", "max", "largest jerk")
-    declare("jerk_max", facts)
-    assert info("jerk_max") is facts
+        METRICS.info("jerk_max")
+    with pytest.raises(EvaluatorError, match="no evaluator declares it"):
+        score(log, where, evaluators=resolve_evaluators([f"{__name__}:Undeclared"]))
+
+
+def test_a_table_refuses_another_metric_under_a_name_that_it_holds():
     with pytest.raises(EvaluatorError, match="declared already with other facts"):
-        declare("offroad", facts)
+        METRICS.adding({"offroad": JERK})
+    assert METRICS.adding({"jerk": JERK}).adding({"jerk": JERK})["jerk"].accepted == 0.5
+
+
+def test_a_table_comes_back_from_a_run_folder_as_it_was():
+    table = METRICS.adding({"jerk": JERK})
+    stored = json.loads(json.dumps(table.as_dict(), allow_nan=False))
+    assert dict(MetricTable.of_run({"metrics": stored})) == dict(table)
+    assert dict(MetricTable.of_run({})) == dict(METRICS)
+    assert dict(MetricTable.of_run({"metrics": {"jerk": {**stored["jerk"], "of a later version": 1}}})) == dict(table)
+
+
+def test_two_runs_agree_on_unit_side_and_reduction_and_may_differ_in_words():
+    other = METRICS.adding({"jerk": replace(JERK, help="the greatest jerk", label="", margin=1.0)})
+    table = METRICS.adding({"jerk": JERK})
+    assert table.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help == "largest jerk"
+    assert METRICS.joined(other, ["jerk"], "comparing runs", "a and b")["jerk"].help == "the greatest jerk"
+    for change in ({"unit": "g"}, {"direction": "higher"}, {"aggregation": "mean"}):
+        other = METRICS.adding({"jerk": replace(JERK, **change)})
+        assert table.joined(other, ["offroad"], "comparing runs", "a and b")
+        with pytest.raises(InputError, match="a and b, metric 'jerk'"):
+            table.joined(other, ["jerk"], "comparing runs", "a and b")
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "differences"),
+    [
+        ("progress", (0.0, 1.0), (-1.0, 1.0)),
+        ("offroad", (0.0, 1.0), (-1.0, 1.0)),
+        ("lateral_distance_m", (0.0, np.inf), (-np.inf, np.inf)),
+        ("min_ade@3.0s(self)", (0.0, np.inf), (-np.inf, np.inf)),
+        ("lateral_bias_m", (-np.inf, np.inf), (-np.inf, np.inf)),
+    ],
+)
+def test_a_metric_knows_the_range_of_its_values_and_of_their_differences(name, values, differences):
+    assert (METRICS.info(name).value_range, METRICS.info(name).difference_range) == (values, differences)

@@ -66,7 +66,7 @@ def test_scenes_come_in_their_order_and_one_that_lacks_a_pair_has_no_difference(
     sides = by_renderer(rows)
     found = scene_differences(sides["b"], sides["a"], "progress", ["z", "y", "x"])
     assert found.diff == pytest.approx([np.nan, 0.1, -0.3], nan_ok=True)
-    assert found.harm("progress") == pytest.approx([np.nan, -0.1, 0.3], nan_ok=True)
+    assert found.harm("higher") == pytest.approx([np.nan, -0.1, 0.3], nan_ok=True)
     assert found.pairs.tolist() == [1, 1, 2]
     assert found.missing == 1
     assert found.within[2] == pytest.approx(0.08)

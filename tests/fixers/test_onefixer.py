@@ -12,8 +12,9 @@ import torch
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
 from alpasim_plugin.core.errors import InputError, RendererError
-from alpasim_plugin.core.types import Fixer, Frame
+from alpasim_plugin.core.types import Frame
 from alpasim_plugin.fixers import make_fixer
+from alpasim_plugin.plugins.interfaces import Fixer
 from tests.fixers.fixer_cases import (
     SIZE,
     busy_settings,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError, RendererError
-from alpasim_plugin.core.types import U8, BlockRule, Frame
+from alpasim_plugin.core.types import U8, Frame
 from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_fixer, read_bundle, save_bundle
 from alpasim_plugin.fixers.guard import render_share
@@ -22,6 +22,7 @@ from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives, PixelSample, pixel_losses
 from alpasim_plugin.nets.pixel_generator import PixelGenerator, PixelSizes
 from alpasim_plugin.nets.pixel_source import pixel_noise
+from alpasim_plugin.plugins.interfaces import BlockRule
 from tests.examples import first_of
 from tests.fixers.fixer_cases import SIZE, maps_of, moving_picture, pixels, small_settings
 

@@ -20,7 +20,7 @@ class Refused(Exception):
 
 def drive(path: Path, *overrides: str) -> None:
     """Load a scenario and drive three steps of it."""
-    from alpasim_plugin.core.types import Renderer
+    from alpasim_plugin.plugins.interfaces import Renderer
     from alpasim_plugin.runtime.rollout import run_rollout
     from policies import make_policy
     from scenarios.load import load_scenario

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Observation, Plan, Policy
+from alpasim_plugin.core.types import Observation, Plan
 from alpasim_plugin.log import read_asl
+from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.run_folder.schema import LOG_NAME
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder

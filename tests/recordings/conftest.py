@@ -7,9 +7,8 @@ import pytest
 
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import series_by_cell
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from tests.io.checksum_files import vouch_for
 from tests.report.make_run import Plan
 from tests.viewer.make_watched import make_watched

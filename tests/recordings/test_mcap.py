@@ -114,7 +114,7 @@ def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(
             if name != "timestamp":
                 series[name].append((t // 1000, value))
     assert dict(series) == watched.metrics("clean")
-    assert "lateral_offset_m" in series
+    assert "lateral_bias_m" in series
     assert "min_distance_to_obstacle_m" not in series  # never valid in this scene
 
 

@@ -202,7 +202,7 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         "ego_y_m": ego[:, 1],
         "ego_yaw_rad": np.arctan2(tangent[:, 1], tangent[:, 0]),
         "ego_speed_mps": np.full(plan.steps, 8.0),
-        "lateral_offset_m": offset,
+        "lateral_bias_m": offset,
         "opacity_mean": np.clip(0.995 - 0.04 * harm * np.abs(offset), 0, 1),
         "plan_deviation": 0.05 + 0.04 * harm * np.abs(offset),
         "collision_any": hit.astype(float),

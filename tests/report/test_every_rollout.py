@@ -13,8 +13,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from alpasim_plugin.run_folder.reader import Run
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report import every_rollout
 from evaluators.report.every_rollout import COLLIDED, FAILED, HAS_CLIP, HAS_FOLDER, LEFT_ROAD, rollout_block
 

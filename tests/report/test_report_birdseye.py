@@ -10,9 +10,8 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report.birdseye import path_data, scene_view
 from evaluators.report.events import events_of, read_series
 from tests.report.make_run import Plan, make_run
@@ -166,7 +165,7 @@ def test_edge_without_paint_gives_no_line() -> None:
 def test_one_far_rollout_does_not_flatten_the_offsets_of_the_others() -> None:
     x = np.linspace(0, 50, 51).tolist()
     near, far = Rollout("a", "p", "s", 0, "ok"), Rollout("a", "p", "s", 1, "ok")
-    series = {r.cell: series_of(x, [0.0] * 51, lateral_offset_m=[d] * 51) for r, d in ((near, 1.0), (far, 300.0))}
+    series = {r.cell: series_of(x, [0.0] * 51, lateral_bias_m=[d] * 51) for r, d in ((near, 1.0), (far, 300.0))}
     view = scene_view("s", scene(x, [0.0] * 51), [near, far], series, VARIANTS)
     assert view is not None
     assert view.offset is not None

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.run_folder.reader import Run
-from evaluators.opening import read_run
-from evaluators.report.ending import cost_text, ending_lines, next_command, next_line
+from evaluators.opening import Run, read_run
 from evaluators.report.headline import find
+from evaluators.report.terminal import cost_text, ending_lines, next_command, next_line
 from tests.docs.test_commands import parse
 from tests.report.make_run import Plan, make_run
 

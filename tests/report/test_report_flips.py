@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report import write_report
 from evaluators.report.flips import Flip, events, find_flips, flip_rows, in_words
 from tests.report.make_run import Plan, make_run

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from alpasim_plugin.run_folder.reader import Run
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from evaluators.report.headline import find, tone_of
 from tests.report.make_run import Plan, make_run
 
@@ -31,6 +30,18 @@ def test_worse_metric_is_named_with_counts_and_interval(usual_run: Path) -> None
     assert finding.tone == "worse"
     assert finding.title == "3dgs drives worse than clean in off-road rollouts"
     assert finding.points[0].text == "off-road rollouts: 3 of 12 against 0 of 12 (+25.0\u00a0points, 95\u00a0% interval +10.0 to +40.0)"
+
+
+def test_with_several_policies_a_renderer_is_compared_with_the_baseline_of_its_own_policy(usual_run: Path) -> None:
+    shares = {"clean/a": 0.0, "3dgs/a": 0.25, "clean/b": 0.5, "3dgs/b": 0.75}
+    metrics = {name: {"offroad": stats(share)} for name, share in shares.items()}
+    pairs = {name: {"offroad": pair(0.25, 0.1, 0.4, "worse")} for name in ("3dgs/a", "3dgs/b")}
+    run = with_summary(usual_run, metrics=metrics, paired=pairs)
+    found = find(dataclasses.replace(run, info={**run.info, "policies": ["a", "b"]}))
+    assert [point.text.split(" (")[0] for point in found.points] == [
+        "off-road rollouts: 3 of 12 against 0 of 12",
+        "off-road rollouts: 9 of 12 against 6 of 12",
+    ]
 
 
 def test_undecided_is_never_called_equal(usual_run: Path) -> None:

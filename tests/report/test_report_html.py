@@ -14,6 +14,7 @@ import pytest
 
 import evaluators.report.html as html
 from alpasim_plugin.core.errors import InfrastructureError
+from evaluators.metrics import METRICS
 from evaluators.opening import read_run
 from evaluators.report import write_report
 from evaluators.report.charts import Curve, line_chart
@@ -236,7 +237,7 @@ def test_disk_that_refuses_is_a_four_part_error_and_keeps_the_old_file(tmp_path:
 
 
 def test_charts_do_not_magnify_what_nobody_can_see(monkeypatch: pytest.MonkeyPatch) -> None:
-    from evaluators.report import figures
+    from evaluators.report import charts
 
     entry = {"direction": "lower", "unit": "m", "margin": 0.0, "diff": 1e-6, "ci95": [-1e-6, 3e-6]}
     limits: list[tuple[float, float]] = []
@@ -245,7 +246,7 @@ def test_charts_do_not_magnify_what_nobody_can_see(monkeypatch: pytest.MonkeyPat
         limits.append(figure.axes[0].get_xlim())
         return "<svg/>"
 
-    monkeypatch.setattr(figures, "themed_svg", keep)
-    figures.forest(SimpleNamespace(summary={"paired": {"3dgs": {"lateral_distance_m": entry}}}), {"3dgs": 0})  # type: ignore[arg-type]
+    monkeypatch.setattr(charts, "themed_svg", keep)
+    charts.forest(SimpleNamespace(summary={"paired": {"3dgs": {"lateral_distance_m": entry}}}, table=METRICS), {"3dgs": 0})  # type: ignore[arg-type]
     ((low, high),) = limits
     assert high - low >= 0.1

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluators.report import write_junit
-from evaluators.report.junit import clean
+from evaluators.report.ci import clean
 from tests.report.make_run import Plan, make_run
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.run_folder.scenes import scene_as_json
-from evaluators.report.road_users import road_users
+from evaluators.report.birdseye import road_users
 from scenarios.load import load_scenario
 
 

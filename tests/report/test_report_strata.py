@@ -7,14 +7,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import Rollout
-from evaluators.opening import read_run
+from evaluators.metrics import METRICS
+from evaluators.opening import Run, read_run
 from evaluators.report import write_report
-from evaluators.report.certificate import certificate
-from evaluators.report.figures import _line, forest, speed_against_error, strata_chart
+from evaluators.report.charts import _line, forest, speed_against_error
 from evaluators.report.headline import find
-from evaluators.report.strata import strata, stratum_rows
+from evaluators.report.provenance import certificate
+from evaluators.report.strata import strata, strata_chart, stratum_rows
 from tests.report.make_run import Plan, make_run
 
 STEP_US = 100_000
@@ -37,7 +37,7 @@ def run_of(folder: Path, rollouts: dict[str, dict[str, list[float]]], flags: dic
 
 def test_steps_are_counted_in_the_range_they_lie_in(tmp_path: Path) -> None:
     offset = [0.0, 0.24, -0.26, 0.49, -0.99, 1.0, 3.0, np.nan]
-    (found,) = strata(run_of(tmp_path, {"a": {"lateral_offset_m": offset, "eval_relevant": [1.0] * 8}}))
+    (found,) = strata(run_of(tmp_path, {"a": {"lateral_bias_m": offset, "eval_relevant": [1.0] * 8}}))
     seconds = {s.label: round(s.bins[0].seconds, 6) for s in found.strata}
     assert seconds == {
         "below 0.25\u00a0m": 0.2,
@@ -51,7 +51,7 @@ def test_steps_are_counted_in_the_range_they_lie_in(tmp_path: Path) -> None:
 
 def test_warm_up_and_what_follows_an_event_do_not_count_and_the_event_counts_where_it_began(tmp_path: Path) -> None:
     series = {
-        "lateral_offset_m": [0.0, 0.0, 0.0, 0.3, 0.6, 0.6, 0.6],
+        "lateral_bias_m": [0.0, 0.0, 0.0, 0.3, 0.6, 0.6, 0.6],
         "eval_relevant": [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0],
         "offroad": [1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0],
     }
@@ -66,7 +66,7 @@ def test_warm_up_and_what_follows_an_event_do_not_count_and_the_event_counts_whe
 def test_opacity_is_split_at_the_runs_own_quartiles_and_cameras_are_averaged(tmp_path: Path) -> None:
     n = 41
     opacity = np.linspace(0.6, 1.0, n)
-    run = run_of(tmp_path, {"a": {"lateral_offset_m": [0.0] * n, "opacity_mean": opacity.tolist(), "eval_relevant": [1.0] * n}})
+    run = run_of(tmp_path, {"a": {"lateral_bias_m": [0.0] * n, "opacity_mean": opacity.tolist(), "eval_relevant": [1.0] * n}})
     _, found = strata(run)
     assert sorted(round(s.bins[0].seconds, 6) for s in found.strata) == [1.0, 1.0, 1.0, 1.1]
     table = pq.read_table(tmp_path / "steps.parquet").to_pylist()
@@ -79,7 +79,7 @@ def test_opacity_is_split_at_the_runs_own_quartiles_and_cameras_are_averaged(tmp
 
 def test_means_are_over_scenes_and_have_an_interval_from_three_scenes_on(tmp_path: Path) -> None:
     def drive(value: float, n: int) -> dict[str, list[float]]:
-        return {"lateral_offset_m": [0.1] * n, "eval_relevant": [1.0] * n, "plan_deviation": [value] * n}
+        return {"lateral_bias_m": [0.1] * n, "eval_relevant": [1.0] * n, "plan_deviation": [value] * n}
 
     two = strata(run_of(tmp_path, {"a": drive(0.1, 10), "b": drive(0.4, 30)}))[0].strata[0].bins[0]
     assert two.means["plan_deviation"] == (pytest.approx(0.25), None, None)
@@ -92,7 +92,7 @@ def test_means_are_over_scenes_and_have_an_interval_from_three_scenes_on(tmp_pat
 
 
 def test_few_steps_give_a_dash_with_its_reason(tmp_path: Path) -> None:
-    run = run_of(tmp_path, {"a": {"lateral_offset_m": [0.1] * 9, "eval_relevant": [1.0] * 9, "plan_deviation": [0.1] * 9}})
+    run = run_of(tmp_path, {"a": {"lateral_bias_m": [0.1] * 9, "eval_relevant": [1.0] * 9, "plan_deviation": [0.1] * 9}})
     row = stratum_rows(strata(run)[0])[0]
     assert row.cells[3].missing
     assert row.cells[3].note == "fewer than 10 steps here have it"
@@ -120,8 +120,8 @@ def test_the_forest_turns_metrics_so_that_right_is_worse() -> None:
     run = Run(Path(), {"renderers": ["clean", "3dgs"]}, {"paired": {"3dgs": pairs}}, (), ())
     (chart,) = forest(run, {"3dgs": 1})
     assert "worse than the baseline" in chart.svg
-    _, better = _line("progress", 1, pairs["progress"])  # type: ignore[misc]
-    _, worse = _line("offroad", 1, pairs["offroad"])  # type: ignore[misc]
+    _, better = _line(METRICS["progress"], 1, pairs["progress"])  # type: ignore[misc]
+    _, worse = _line(METRICS["offroad"], 1, pairs["offroad"])  # type: ignore[misc]
     assert (better.centre, better.low, better.high, better.margin) == pytest.approx((-10.0, -15.0, -5.0, 2.0))
     assert (worse.centre, worse.low, worse.high) == pytest.approx((10.0, 5.0, 15.0))
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaluators.report import write_summary_md
-from evaluators.report.summary import CUT_NOTE, MAX_BYTES, cut, escape, table
+from evaluators.report.ci import CUT_NOTE, MAX_BYTES, cut, escape, table
 from tests.report.make_run import Plan, make_run
 
 

@@ -13,8 +13,8 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.run_folder.columns import RolloutTable
-from alpasim_plugin.run_folder.reader import read_run
 from alpasim_plugin.run_folder.schema import ROLLOUT_FILES, ROLLOUTS_TABLE, RUN_FILES, STEPS_TABLE, TableSchema, cell_name, rollout_folder
+from evaluators.opening import read_run
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 ROW = {"renderer": "clean", "policy": "p", "scene": "s", "seed": 0, "status": "ok", "path": "rollouts/x", "wall_s": 1.0, "frames": 3}

@@ -9,9 +9,8 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from alpasim_plugin.run_folder.reader import Run
 from alpasim_plugin.run_folder.rows import series_by_cell
-from evaluators.opening import read_run
+from evaluators.opening import Run, read_run
 from tests.report.make_run import Plan, make_run
 
 duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed: pip install duckdb")
@@ -70,11 +69,11 @@ def test_paired_differences_are_those_of_the_summary(repo: Path, run: Run) -> No
 
 
 def test_the_farthest_instant_is_that_of_the_series(repo: Path, run: Run) -> None:
-    series = series_by_cell(run.steps(["lateral_offset_m"]))
+    series = series_by_cell(run.steps(["lateral_bias_m"]))
     found = rows(repo, 2)
     assert len(found) == min(10, len(series))
     for row in found:
-        t_us, value = series[row["renderer"], "lane-camera", row["scene"], row["seed"]]["lateral_offset_m"]
+        t_us, value = series[row["renderer"], "lane-camera", row["scene"], row["seed"]]["lateral_bias_m"]
         at = abs(value).argmax()
         assert (row["most_m"], row["at_s"]) == pytest.approx((abs(value[at]), 1e-6 * t_us[at]))
 

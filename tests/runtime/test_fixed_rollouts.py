@@ -11,22 +11,11 @@ import pytest
 
 from alpasim_plugin import make_policy, run_rollout
 from alpasim_plugin.core.errors import FixerError, InputError, RendererError
-from alpasim_plugin.core.types import (
-    CameraSpec,
-    Frame,
-    Latency,
-    Observation,
-    Plan,
-    Rates,
-    Renderer,
-    RenderRequest,
-    Route,
-    Scenario,
-    SensorSpec,
-)
+from alpasim_plugin.core.types import CameraSpec, Frame, Latency, Observation, Plan, Rates, RenderRequest, Route, Scenario, SensorSpec
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.run_folder.schema import LOG_NAME
 from alpasim_plugin.runtime.recorder import Recorder

@@ -143,8 +143,8 @@ def test_what_is_not_valid_has_no_value_and_a_reason(small_run: Path) -> None:
     curves = only_cell(small_run, None)["drives"][0]["curves"]
     assert curves["min_distance_to_obstacle_m"]["v"] == [None]
     assert curves["min_distance_to_obstacle_m"]["why"] == "no other road user within 50 m"
-    assert len(curves["lateral_offset_m"]["v"]) == SMALL.steps
-    assert "why" not in curves["lateral_offset_m"]
+    assert len(curves["lateral_bias_m"]["v"]) == SMALL.steps
+    assert "why" not in curves["lateral_bias_m"]
     assert "ego_x_m" not in curves
 
 

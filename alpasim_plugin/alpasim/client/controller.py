@@ -18,8 +18,9 @@ from alpasim_plugin.alpasim.client.channel import Address, Service
 from alpasim_plugin.control.base import check_interval, check_plan, coast_to_stop
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.geometry import interpolate, inverse, offset_trajectory, trajectory_from_poses
-from alpasim_plugin.core.types import F64, Controller, EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 from alpasim_plugin.log.schema import T_rig_box, read_transform, wire_box, wire_dynamics, wire_pose, wire_trajectory
+from alpasim_plugin.plugins.interfaces import Controller
 from alpasim_plugin.wire import common_pb2, controller_pb2, physics_pb2
 
 OPTIONS = ("physics", "scene", "timeout_s")

@@ -12,7 +12,8 @@ from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.server.driving import Driving
 from alpasim_plugin.alpasim.server.status import answering
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Policy, Scenario
+from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.wire import api_version, common_pb2, egodriver_pb2
 
 DOING = "serving a policy"

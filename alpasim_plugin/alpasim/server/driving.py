@@ -16,9 +16,10 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import quat_from_yaw, se3, transform_points, wrap_angle, yaw_of
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
-from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Policy, Route, Scenario, Trajectory
+from alpasim_plugin.core.types import F64, CameraSpec, EgoState, Frame, Observation, Plan, Route, Scenario, Trajectory
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import increasing_times, read_camera, read_poses, wire_trajectory
+from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.wire import egodriver_pb2
 
 DOING = "driving for AlpaSim"

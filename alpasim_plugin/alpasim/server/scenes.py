@@ -10,8 +10,9 @@ from pathlib import Path
 
 from alpasim_plugin.alpasim.server.status import UnknownScene
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Renderer, Scenario
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.schema import wire_camera
+from alpasim_plugin.plugins.interfaces import Renderer
 from alpasim_plugin.plugins.parts import RendererSpec, build, complete
 from alpasim_plugin.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.wire import FRONT_WIDE, sensorsim_pb2

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.types import U8, CameraSpec, Fixer, Frame, Renderer, RenderRequest
+from alpasim_plugin.core.types import U8, CameraSpec, Frame, RenderRequest
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.loop import fixed_renderer
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.lab.bench.fixer_speed import Clip
+from alpasim_plugin.plugins.interfaces import Fixer, Renderer
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runtime.recorder import Recorder
 from alpasim_plugin.runtime.rollout import run_rollout

@@ -11,7 +11,7 @@ from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import RolloutLog, Scene
 from evaluators.aggregate.reduce import reduce_rollout
 from evaluators.base import score
-from evaluators.metrics import info
+from evaluators.metrics import METRICS
 from evaluators.presets import Preset
 from evaluators.presets import preset as find_preset
 
@@ -67,7 +67,7 @@ def conversion_table(rollouts: Sequence[Converted], presets: Sequence[str]) -> l
 
 
 def _row(metric: str, rollouts: Sequence[Converted], presets: Sequence[str]) -> MetricRow:
-    facts = info(metric)
+    facts = METRICS.info(metric)
     columns = [[one.values.get(name, {}).get(metric) for one in rollouts] for name in presets]
     # A metric that a preset does not have at all differs in nothing: there is no value to convert to.
     known = [any(metric in one.values.get(name, {}) for one in rollouts) for name in presets]

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import I64, U8, Fixer, Frame
+from alpasim_plugin.core.types import I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.lab.bench.map_error import MapShift
 from alpasim_plugin.lab.video_metrics import clip_quality
 from alpasim_plugin.lab.video_metrics.perceptual import ImageDistance
 from alpasim_plugin.lab.video_metrics.summary import TRUTH
+from alpasim_plugin.plugins.interfaces import Fixer
 from alpasim_plugin.plugins.parts import PartSpec
 
 RAW = "3dgs"  # the variant of the unfixed render

@@ -1,10 +1,10 @@
-"""Metrics of the judges, and the paper's own names, which need the user's weights; importing this module declares them."""
+"""Metrics of the judges, and the paper's own names, which need the user's weights."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from evaluators.metrics import MetricInfo, declare
+from evaluators.metrics import MetricInfo
 
 LANE_F1, LANE_XERR, LANE_JITTER, CUBOID_F1 = "lane_f1_syn", "lane_xerr_syn_m", "lane_jitter_syn_m", "cuboid_f1_syn"
 LANE_F1_30, LANE_XERR_30, LANE_JITTER_20 = "lane_f1_syn_30", "lane_xerr_syn_30_m", "lane_jitter_syn_20_m"
@@ -59,8 +59,6 @@ def of_seed(metric: str, seed: int) -> str:
 
 CLIP_FACTS |= {of_seed(name, 1): facts for name, facts in CLIP_FACTS.items()}
 SET_FACTS |= {of_seed(name, 1): SET_FACTS[name] for name in (FD_16, FD_CLIP)}
-for _name, _facts in {**CLIP_FACTS, **SET_FACTS, **EXTERNAL_FACTS}.items():
-    declare(_name, _facts)
 
 
 def paper_cells(values: Mapping[str, float | None]) -> dict[str, dict[str, float | str | None]]:

@@ -14,14 +14,13 @@ from alpasim_plugin.lab.paper.claims import behind
 from alpasim_plugin.lab.paper.measured import Difference, Measured
 from alpasim_plugin.lab.paper.published import Published
 from alpasim_plugin.lab.paper.tables import markdown_table, paper_against_ours
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.run_folder.sides import Row, by_renderer
 from evaluators.aggregate.intervals import Interval
 from evaluators.aggregate.paired import compare, paired_sides
 from evaluators.aggregate.summary import aggregate_sides
-from evaluators.aggregate.verdict import default_margin
-from evaluators.metrics import info
+from evaluators.report.ci import cell_text, metric_label
 from evaluators.report.numbers import plural
-from evaluators.report.summary import cell_text, metric_label
 from evaluators.report.tables import PairRow, metric_rows, p_text, pair_rows
 
 TABLE = "closed-loop"  # of the paper
@@ -88,7 +87,7 @@ class Driven(Measured):
             EvaluatorError: They share fewer than two rollouts.
         """
         self._shared(metric, first, second)
-        found = compare(self.sides[first], self.sides[second], metric, second, default_margin(metric))
+        found = compare(self.sides[first], self.sides[second], KNOWN.info(metric), second)
         low, high = found["ci95"] or (None, None)
         favours = {"better": 1, "worse": -1}.get(found["difference"], 0)
         return Difference(metric, first, second, found["diff"], low, high, found["p_value"], found["n_scenes"], favours)
@@ -136,7 +135,7 @@ def _panel(ax: Axes, driven: Driven, metric: str, scale: float) -> None:
     ax.set_yticks(range(len(driven.arms)), [""] * len(driven.arms))
     ax.set_ylim(len(driven.arms) - 0.5, -0.5)
     ax.set_xlabel(f"{metric}, %" if scale == 100.0 else metric)
-    ax.set_title(f"{info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
+    ax.set_title(f"{KNOWN.info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
     ax.grid(visible=True, axis="x", alpha=0.25)
     ax.spines[["top", "right"]].set_visible(False)
 

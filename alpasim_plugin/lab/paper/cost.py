@@ -14,8 +14,8 @@ from alpasim_plugin.lab.paper.claims import CLAIMS, OURS, within
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.tables import ARROWS, SET_DIGITS, difference_text, markdown_table
 from alpasim_plugin.lab.paper.verdict import contest_results
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.lab.video_metrics.table import DIGITS
-from evaluators.metrics import info
 
 METRICS = (FD_16, FVMD_LK, "psnr_db", "perceptual-syn")
 COLUMNS, DPI = 2, 110
@@ -133,7 +133,7 @@ def cost_section(cost: Cost, figure: str) -> str:
         for point in curve.points:
             values = [_value(measured, point.label, metric) for metric in shown]
             rows.append([curve.arm, str(curve.seed), point.stage, str(point.updates), _minutes(point.core_minutes), *values])
-    head = ["arm", "seed", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[info(m).direction]}" for m in shown)]
+    head = ["arm", "seed", "stage", "updates", "core-minutes", *(f"{m} {ARROWS[KNOWN.info(m).direction]}" for m in shown)]
     ends = "".join(
         f"- {cost.name(curve)}: {', '.join(f'{name} to {_minutes(end)}' for name, end in curve.ends.items())}\n" for curve in curves
     )
@@ -201,7 +201,7 @@ def plot_cost(cost: Cost, path: Path) -> None:
         ax.set_xlim(left=0)
         ax.set_xlabel("core-minutes")
         ax.set_ylabel("PSNR, dB" if metric == "psnr_db" else metric)
-        ax.set_title(f"{info(metric).direction} is better; dashed: a stage ends", fontsize=8, loc="right", color="0.4")
+        ax.set_title(f"{KNOWN.info(metric).direction} is better; dashed: a stage ends", fontsize=8, loc="right", color="0.4")
         ax.grid(visible=True, alpha=0.25)
         ax.spines[["top", "right"]].set_visible(False)
     handles, labels = panels[0].get_legend_handles_labels()

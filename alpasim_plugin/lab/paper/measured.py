@@ -14,8 +14,8 @@ from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.lab.learned_metrics.frechet import frechet_distance
 from alpasim_plugin.lab.learned_metrics.swapping import SwapTest, swap_test
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from evaluators.aggregate.intervals import Interval, t_interval
-from evaluators.metrics import info
 
 ALPHA = 0.05
 SWAPS = 2000  # of whole clips, where not all of them are taken; no p-value is below 1 / (SWAPS + 1)
@@ -109,7 +109,7 @@ class Measured:
             EvaluatorError: They share fewer than two clips.
         """
         clips = self._shared(metric, first, second)
-        better = {"higher": 1, "lower": -1}.get(info(metric).direction, 0)
+        better = {"higher": 1, "lower": -1}.get(KNOWN.info(metric).direction, 0)
         if metric in self.set_metrics:
             test = self._swap_test(metric, clips, *sorted((first, second)))
             difference = test.difference if first <= second else -test.difference
@@ -138,7 +138,7 @@ class Measured:
         """
         clips = self._shared(metric, arm)
         found = t_interval([self.values[arm][clip][metric] - bound for clip in clips], "clips")
-        better = {"higher": 1, "lower": -1}.get(info(metric).direction, 0)
+        better = {"higher": 1, "lower": -1}.get(KNOWN.info(metric).direction, 0)
         decided = found.low is not None and found.high is not None and not found.low < 0.0 < found.high
         favours = better * (1 if found.centre >= 0 else -1) if decided else 0
         return Difference(

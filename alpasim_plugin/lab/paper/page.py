@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from alpasim_plugin.core.errors import EvaluatorError
-from evaluators.metrics import info
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from evaluators.report.html import asset
 from evaluators.report.numbers import plural
 
@@ -72,7 +72,7 @@ def _data(clip: ShownClip, arms: Sequence[str]) -> dict[str, object]:
     for metric, by_arm in clip.curves.items():
         digits = DIGITS.get(metric, 3)
         lines = [_line(by_arm[arm], frames, digits + 2) if arm in by_arm else None for arm in arms]
-        curves.append({"title": metric, "unit": info(metric).unit, "digits": digits, "lines": lines})
+        curves.append({"title": metric, "unit": KNOWN.info(metric).unit, "digits": digits, "lines": lines})
     films = [[base64.b64encode(jpeg).decode() for jpeg in clip.films[arm]] for arm in arms]
     return {"name": clip.name, "frames": frames, "films": films, "curves": curves}
 

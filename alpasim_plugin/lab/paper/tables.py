@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from alpasim_plugin.lab.paper.measured import Difference, Measured
 from alpasim_plugin.lab.paper.published import PaperMetric, Published
 from alpasim_plugin.lab.paper.verdict import Judged, Result
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from alpasim_plugin.lab.video_metrics.table import DIGITS, SCALE
-from evaluators.metrics import info
 
 NOT_RUN = "not run"
 NO_COUNTERPART = "no counterpart here"
@@ -65,7 +65,7 @@ def differences(measured: Measured, arm: str, rivals: Sequence[str], metrics: Se
             there = measured.has(arm, metric) and measured.has(rival, metric)
             cells.append(difference_text(measured.difference(metric, arm, rival)) if there else NOT_RUN)
         rows.append([rival, *cells])
-    return markdown_table([f"{arm} minus", *(f"{m} {ARROWS.get(info(m).direction, '')}" for m in metrics)], rows)
+    return markdown_table([f"{arm} minus", *(f"{m} {ARROWS.get(KNOWN.info(m).direction, '')}" for m in metrics)], rows)
 
 
 def difference_text(found: Difference) -> str:

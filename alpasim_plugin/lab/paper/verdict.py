@@ -8,8 +8,8 @@ from typing import Literal
 
 from alpasim_plugin.lab.paper.claims import CLAIMS, CLOSE, Claim, Contest
 from alpasim_plugin.lab.paper.measured import ALPHA, Difference, Measured, beyond
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 from evaluators.aggregate.intervals import Interval
-from evaluators.metrics import info
 
 Outcome = Literal["for", "against", "open", "not measured"]
 Verdict = Literal["holds", "does not hold", "undecided at our scale", "not measured"]
@@ -115,7 +115,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 def _p_against(contest: Contest, found: Difference, measured: Measured) -> float | None:
     """Return the one-sided p-value that a contest goes against its claim."""
-    p_value, toward = found.p_value, found.difference * {"higher": 1, "lower": -1}.get(info(found.metric).direction, 0)
+    p_value, toward = found.p_value, found.difference * {"higher": 1, "lower": -1}.get(KNOWN.info(found.metric).direction, 0)
     if contest.relation == "close" and found.low is not None and found.high is not None:
         width = CLOSE * abs(measured.mean(contest.second, contest.metric).centre)
         p_value = beyond(Interval(found.difference, found.low, found.high), width, found.n)

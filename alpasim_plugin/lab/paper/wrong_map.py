@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from alpasim_plugin.lab.paper.measured import Measured
 from alpasim_plugin.lab.paper.tables import markdown_table
-from evaluators.metrics import info
+from alpasim_plugin.lab.video_metrics.facts import KNOWN
 
 DPI = 110
 METRICS = ("lane_f1_syn", "lane_xerr_syn_m", "cuboid_f1_syn", "fd_syn_16", "psnr_db", "perceptual-syn")
@@ -109,7 +109,7 @@ def plot(measured: Measured, shifts: Mapping[str, Shift], path: Path) -> None:
         ax.set_xticks(range(len(groups)), [f"{distance:.2f}" for distance in groups])
         ax.set_xlabel(f"{what} off by, m")
         ax.set_ylabel(metric)
-        ax.set_title(f"{info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
+        ax.set_title(f"{KNOWN.info(metric).direction} is better", fontsize=8, loc="right", color="0.4")
         ax.grid(visible=True, alpha=0.25)
         ax.spines[["top", "right"]].set_visible(False)
     handles: dict[str, Any] = {

@@ -1,9 +1,9 @@
-"""Metrics of the quality tables; importing this module declares them to `evaluators.metrics`."""
+"""Metrics of the quality tables."""
 
 from __future__ import annotations
 
-from alpasim_plugin.lab.learned_metrics.facts import CLIP_FACTS, EXTERNAL_FACTS
-from evaluators.metrics import MetricInfo, declare
+from alpasim_plugin.lab.learned_metrics.facts import CLIP_FACTS, EXTERNAL_FACTS, SET_FACTS
+from evaluators.metrics import METRICS, MetricInfo
 
 PSNR, SSIM, WARP, WARP_LATE, MS = "psnr_db", "ssim", "warp_l1", "warp_l1_late", "ms_per_frame"
 DRIFT = "drift_psnr_db"
@@ -34,5 +34,4 @@ FACTS: dict[str, MetricInfo] = {
 SOMETIMES = frozenset(
     {*CLIP_FACTS, *EXTERNAL_FACTS}
 )  # undefined on some clips, such as those without a vehicle; these are left out and counted
-for _name, _facts in FACTS.items():
-    declare(_name, _facts)
+KNOWN = METRICS.adding({**FACTS, **SET_FACTS})

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.lab.video_metrics.facts import FACTS, MS, SOMETIMES, WARP
+from alpasim_plugin.lab.video_metrics.facts import FACTS, KNOWN, MS, SOMETIMES, WARP
 from alpasim_plugin.run_folder.sides import by_renderer
 from evaluators.aggregate.intervals import t_interval
 from evaluators.aggregate.paired import compare
@@ -98,7 +98,7 @@ def _paired(rows: Sequence[Row], baseline: str) -> dict[str, dict[str, Any]]:
     for name, side in split.items():
         shared = [m for m in FACTS if all(any(m in row for row in s.rows) for s in (side, split[baseline]))]
         if name != baseline:
-            out[name] = {m: compare(side, split[baseline], m, baseline, 0.0) for m in shared}
+            out[name] = {m: compare(side, split[baseline], KNOWN[m], baseline, 0.0) for m in shared}
     return out
 
 

@@ -13,8 +13,8 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.plugins import interfaces
-from alpasim_plugin.plugins.interfaces import MetricInfo
 from alpasim_plugin.plugins.parts.loading import make_importable
 from alpasim_plugin.plugins.parts.source import code_digest
 

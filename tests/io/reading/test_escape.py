@@ -9,8 +9,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import MAX_PART, markdown, shorten, terminal, xml
-from evaluators.report.junit import write_junit
-from evaluators.report.summary import write_summary_md
+from evaluators.report.ci import write_junit, write_summary_md
 from tests.report.make_run import Plan, make_run
 
 HOSTILE = "a|b`c <img src=x>&amp; [l](javascript:1) \x1b[31m\x07 \u202e\u0000 *b* _i_\n# head"

@@ -1,0 +1,277 @@
+"""Files for a CI service: summary.md and junit.xml of a run, and the same of a gate."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from alpasim_plugin.core.escape import markdown as escape
+from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.escape import xml as clean
+from alpasim_plugin.io.atomic import write_text
+from alpasim_plugin.run_folder.reader import reporting
+from alpasim_plugin.run_folder.rows import Rollout
+from evaluators.gate.judge import Check, GateVerdict
+from evaluators.opening import Run, read_run
+from evaluators.report import tables
+from evaluators.report.failures import LEDGER_COLUMNS, failure_rows, ledger
+from evaluators.report.fixers import COLUMNS, fixer_rows, speed
+from evaluators.report.headline import find
+from evaluators.report.numbers import Cell, plural
+from evaluators.report.provenance import provenance
+
+MAX_BYTES = 1_000_000  # job pages refuse more than 1 MiB
+CUT_NOTE = "\n_Cut here: the full tables are in report.html and rollouts.parquet._\n"
+LEDGER_RATES = ("collision_at_fault", "collision_any", "offroad")
+LEDGER_NOTE = "Rates: least and greatest, had every missing rollout and every cut step been without, and with, the event."
+MAX_WITH_VALUES = 2000  # cases whose metric values are written, 2 KB each: CI servers refuse files of tens of megabytes
+SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
+MARKS = {"pass": "pass", "regression": "FAIL", "undecided": "undecided", "policy": "error", "infrastructure": "error", "evaluator": "error"}
+INTERVAL_NOTE = "\u00b1 is 1.96 \u03c3/\u221aN over rollouts; a to b is the 95 % interval with scenes as clusters."
+
+
+def write_summary_md(run_dir: Path | str) -> Path:
+    """Write ``summary.md`` into a run folder and return its path.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(run_dir)
+    path = run.folder / "summary.md"
+    with reporting(run):
+        text = summary_md(run)
+    write_text(path, cut(text), "writing a report")
+    return path
+
+
+def summary_md(run: Run) -> str:
+    """Render the summary as Markdown, of any length."""
+    finding = find(run)
+    parts = [f"## {escape(finding.title)}\n"]
+    parts += [f"- **{escape(finding.name_of(p))}**: {escape(p.text)}\n" for p in finding.points]
+    parts += [f"> {escape(caution)}\n" for caution in finding.cautions]
+    rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
+    if rows:
+        head = ["metric", *(f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})" for c in tables.columns(run))]
+        body = [[metric_label(r.name, r.unit, r.arrow), *(cell_text(c) for c in r.cells)] for r in rows]
+        parts.append(f"\n### Results, preset {escape(str(run.summary.get('preset')))}\n\n{table(head, body)}\n{INTERVAL_NOTE}\n")
+    pairs = tables.pair_rows(run.summary, run.table)
+    if pairs:
+        head = ["renderer", "metric", "difference", "95 % interval", "p", "verdict"]
+        for base in dict.fromkeys(p.baseline for p in pairs):
+            body = [[p.variant, p.metric, p.diff.text, p.interval.text, p.p_value.text, p.verdict] for p in pairs if p.baseline == base]
+            parts.append(f"\n### Paired differences from {escape(base)}\n\n{table(head, body)}")
+    fixed = fixer_rows(run.summary)
+    if fixed:
+        head = ["renderer", *(name for name, _ in COLUMNS)]
+        parts.append(f"\n### Fixers\n\n{table(head, [[row.renderer, *(c.text for c in row.cells)] for row in fixed])}")
+    times = speed(run)
+    if times.rows:
+        head = ["renderer", "ms per frame, median", "95th percentile", "frames/s", "first frame, ms", *times.stages]
+        body = [[r.renderer, *(c.text for c in r.cells), *(c.text for c in r.stages)] for r in times.rows]
+        parts.append(f"\n### Speed\n\n{table(head, body)}" + (f"{escape(times.pool)}\n" if times.pool else ""))
+    removed = ledger(run, LEDGER_RATES)
+    if removed:
+        head = ["renderer", *(name for _, name, _ in LEDGER_COLUMNS), *LEDGER_RATES]
+        body = [[r.renderer, *(_tally(c) for c in r.counts), *(c.text for c in r.bounds)] for r in removed]
+        parts.append(f"\n### Not in the numbers\n\n{table(head, body)}\n{LEDGER_NOTE}\n")
+    failures, more = failure_rows(run)
+    if failures:
+        head = ["class", "renderer", "policy", "scene", "seed", "what happened"]
+        body = [[*_key(f.rollout), "; ".join(f"{label}: {text}" for label, text in f.parts)] for f in failures]
+        parts.append(f"\n### Failures\n\n{table(head, body)}" + (f"{more} more in rollouts.parquet.\n" if more else ""))
+    command = provenance(run).command
+    parts.append(f"\n### Made with\n\n```\n{terminal(command).replace('```', '')}\n```\n")
+    return "".join(parts)
+
+
+def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """Render a Markdown table."""
+    lines = [head, ["---"] * len(head), *body]
+    return "".join("| " + " | ".join(cell if i == 1 else escape(cell) for cell in line) + " |\n" for i, line in enumerate(lines))
+
+
+def cut(text: str, limit: int = MAX_BYTES) -> str:
+    """Cut at the end of a line so that the text with its note stays within ``limit`` bytes of UTF-8."""
+    data = text.encode()
+    if len(data) <= limit:
+        return text
+    kept = data[: limit - len(CUT_NOTE.encode())]
+    return kept[: kept.rfind(b"\n") + 1].decode() + CUT_NOTE
+
+
+def _tally(cell: Cell) -> str:
+    return f"{cell.text} ({cell.note})" if cell.note and cell.text != "0" else cell.text
+
+
+def _key(rollout: Rollout) -> list[str]:
+    return [rollout.failure_class, rollout.renderer, rollout.policy, rollout.scene, str(rollout.seed)]
+
+
+def metric_label(name: str, unit: str, arrow: str) -> str:
+    """Print a metric with its unit and the direction that is better."""
+    return " ".join(part for part in (name, f"({unit})" if unit else "", arrow) if part)
+
+
+def cell_text(cell: Cell) -> str:
+    """Print a mean with its count and intervals, or why there is none."""
+    if cell.missing:
+        return f"{cell.text} ({cell.note})" if cell.note else cell.text
+    return f"{cell.text}{f' ({cell.count})' if cell.count else ''}, {cell.detail}" if cell.detail else cell.text
+
+
+def write_junit(run_dir: Path | str) -> Path:
+    """Write ``junit.xml`` into a run folder and return its path.
+
+    Raises:
+        InputError: The run folder is not complete enough to be read.
+    """
+    run = read_run(run_dir)
+    with reporting(run):
+        root = junit(run)
+    return _write_xml(run.folder / "junit.xml", root)
+
+
+def _write_xml(path: Path, root: ET.Element) -> Path:
+    ET.indent(root)
+    write_text(path, '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n", "writing a report")
+    return path
+
+
+def junit(run: Run) -> ET.Element:
+    """Build the document."""
+    failed = [r for r in run.rollouts if not r.ok]
+    counts = {
+        "tests": str(len(run.rollouts)),
+        "failures": "0",
+        "errors": str(len(failed)),
+        "skipped": "0",
+        "time": f"{sum(r.wall_s or 0.0 for r in run.rollouts):.3f}",
+    }
+    root = ET.Element("testsuites", {"name": "simrun", **counts})
+    suite = ET.SubElement(root, "testsuite", {"name": clean(_suite_name(run)), **counts})
+    if run.info.get("started_at"):
+        suite.set("timestamp", clean(str(run.info["started_at"])))
+    facts = {
+        "preset": run.summary.get("preset"),
+        "version": run.info.get("version"),
+        "key": run.info.get("key"),
+        "command": " ".join(str(word) for word in run.info.get("command") or []),
+    }
+    _properties(suite, {k: str(v) for k, v in facts.items() if v})
+    with_values = len(run.rollouts) <= MAX_WITH_VALUES
+    for rollout in run.rollouts:
+        _case(suite, rollout, with_values)
+    return root
+
+
+def _suite_name(run: Run) -> str:
+    """Return the suite or scenario that the command named, where it was one; a list of them has the name of the run's folder."""
+    asked = run.info.get("asked") or []
+    return str(asked[0]) if len(asked) == 1 else run.folder.resolve().name
+
+
+def _case(suite: ET.Element, rollout: Rollout, with_values: bool) -> None:
+    name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
+    case = ET.SubElement(
+        suite, "testcase", {"classname": clean(rollout.scene), "name": clean(name), "time": f"{rollout.wall_s or 0.0:.3f}"}
+    )
+    values = {m: "invalid" if v is None else repr(v) for m, v in rollout.metrics.items()} if rollout.ok and with_values else {}
+    _properties(case, {"path": rollout.path, **values} if rollout.path else values)
+    if not rollout.ok:
+        first = next((line for line in rollout.failure.splitlines() if line.strip()), "no message was recorded")
+        error = ET.SubElement(case, "error", {"type": clean(rollout.failure_class or "unknown"), "message": clean(first)})
+        error.text = clean(rollout.failure)
+
+
+def _properties(parent: ET.Element, values: dict[str, str]) -> None:
+    if values:
+        holder = ET.SubElement(parent, "properties")
+        for name, value in values.items():
+            ET.SubElement(holder, "property", {"name": clean(name), "value": clean(value)})
+
+
+def gate_md(verdict: GateVerdict, gate: str, run: str) -> str:
+    """Render a verdict as Markdown: heading, what led to it, every check.
+
+    Args:
+        verdict: What `judge` gave.
+        gate: Name or file of the gate.
+        run: Name or folder of the run.
+    """
+    head = f"## Gate: {verdict.outcome.title}\n\n"
+    head += f"Run {escape(run)}, gate {escape(gate)}, compared with {escape(verdict.baseline)}. Exit code {verdict.exit_code}.\n\n"
+    reasons = "".join(f"- {escape(reason)}\n" for reason in verdict.outcome.reasons) if verdict.outcome.cause != "pass" else ""
+    rows = [
+        [check.metric, _variant(check), MARKS[check.cause] + ("" if check.binding else " (not binding)"), check.kind, check.text]
+        for check in verdict.checks
+    ]
+    checks = "\n" + table(["metric", "renderer", "result", "rule", "numbers"], rows) if rows else ""
+    failures = verdict.failures
+    failed = f"\n{failures['n_failed']} of {failures['n_rollouts']} rollouts failed.\n" if failures["n_failed"] else ""
+    return head + reasons + checks + failed
+
+
+def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) -> list[Path]:
+    """Write ``gate.md`` and ``gate.junit.xml``; append the Markdown to the file that $GITHUB_STEP_SUMMARY names.
+
+    Raises:
+        InfrastructureError: The disk refused.
+    """
+    text = gate_md(verdict, gate, str(run.folder))
+    folder.mkdir(parents=True, exist_ok=True)
+    page = folder / "gate.md"
+    write_text(page, cut(text), "writing a report")
+    tests = _write_xml(folder / "gate.junit.xml", gate_junit(verdict, gate, run))
+    append_job_summary(text)
+    return [page, tests]
+
+
+def append_job_summary(text: str) -> Path | None:
+    """Append Markdown to the CI job's summary file, if $GITHUB_STEP_SUMMARY names one; the whole file stays below 1 MiB."""
+    named = os.environ.get(SUMMARY_VARIABLE)
+    if not named:
+        return None
+    path = Path(named)
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    before = before.rstrip("\n") + "\n\n" if before else ""
+    room = MAX_BYTES - len(before.encode())
+    if room > len(CUT_NOTE):
+        write_text(path, before + cut(text, room), "writing a report")
+    return path
+
+
+def gate_junit(verdict: GateVerdict, gate: str, run: Run) -> ET.Element:
+    """Build one suite of checks in front of the run's own suite of rollouts.
+
+    A check that is worse or over its limit is a failure of type ``regression``, one that is not decided a failure of type ``undecided``, or
+    skipped where it does not bind.
+    """
+    root = junit(run)
+    suite = ET.Element("testsuite", {"name": clean(f"gate {gate}")})
+    n_failures = n_skipped = 0
+    for check in verdict.checks:
+        names = {"classname": clean(f"gate.{_variant(check)}"), "name": clean(f"{check.metric} {check.kind}")}
+        case = ET.SubElement(suite, "testcase", names)
+        said = [key for key in ("diff", "ci95", "interval", "margin", "mean", "max", "min", "n_scenes") if key in check.entry]
+        _properties(case, {key: str(check.entry[key]) for key in said})
+        if check.cause == "pass":
+            continue
+        if check.cause == "undecided" and not check.binding:
+            ET.SubElement(case, "skipped", {"message": clean(check.text)})
+            n_skipped += 1
+            continue
+        ET.SubElement(case, "failure", {"type": check.cause, "message": clean(check.text)}).text = clean(check.text)
+        n_failures += 1
+    counts = {"tests": len(verdict.checks), "failures": n_failures, "errors": 0, "skipped": n_skipped}
+    for key, value in counts.items():
+        suite.set(key, str(value))
+        root.set(key, str(value + int(root.get(key, "0"))))
+    root.insert(0, suite)
+    return root
+
+
+def _variant(check: Check) -> str:
+    return f"{check.renderer}/{check.policy}"
