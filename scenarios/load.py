@@ -55,7 +55,7 @@ def load_scenario(path_or_name: str | Path, seed: int | None = None, overrides: 
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene, with the seed in its id. Seed 0 is the
             file as written, but for its ``variations`` and ``samples``.
         overrides: ``key=value`` with dotted keys, applied before validation.
-        source: Who reads a recorded log, as `alpasim_plugin.plugins.parts.resolve` takes it; None finds the source that recognises the path.
+        source: Who reads a recorded log, as `plugins.parts.resolve` takes it; None finds the source that recognises the path.
 
     Returns:
         The scenario. The same input and seed give a bit-identical one.

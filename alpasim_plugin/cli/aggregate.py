@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from rich.console import Console
 
+from alpasim_plugin.cli.options import Every, Json
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.io.atomic import write_json
 from alpasim_plugin.runtime.overall import aggregate_runs, joined_metrics
 from evaluators.report import render_table
@@ -26,15 +27,13 @@ Examples:
 
 
 def aggregate(
-    runs: Annotated[list[Path], typer.Argument(help="Finished run folders.")],
-    baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare against; by default the first run's.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Also write the numbers as JSON, in the form of summary.json.")] = None,
-    every: Annotated[bool, typer.Option("--all", help="Print every metric, not only the headline ones.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    runs: Annotated[tuple[Path, ...], Positional("Finished run folders.")],
+    baseline: Annotated[str | None, Flag("Renderer to compare against; by default the first run's.")] = None,
+    out: Annotated[Path | None, Flag("Also write the numbers as JSON, in the form of summary.json.")] = None,
+    every: Every = False,
+    as_json: Json = False,
 ) -> None:
     """Print means, intervals and verdicts over the rollouts of several runs; tables of millions of rows are streamed."""
-    del debug
     found = aggregate_runs(runs, baseline)
     if out is not None:
         write_json(out, found)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from alpasim_plugin.cli.options import Json, Run
 from alpasim_plugin.cli.progress import make_progress
 from alpasim_plugin.core.escape import terminal
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.run_folder.check import Inspection, inspect_run
 from alpasim_plugin.run_folder.schema import DERIVED, MANIFEST, RUN_INFO
 from alpasim_plugin.runtime.repair import repair_run
@@ -29,18 +30,16 @@ process writes it.
 
 
 def check(
-    run: Annotated[Path, typer.Argument(help="A run folder.")],
-    repair: Annotated[bool, typer.Option("--repair", help="Run or score damaged rollouts again, and make the tables again.")] = False,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Repair: worker processes; by default one per core.")] = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Repair: wait for a process that writes the folder.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    run: Run,
+    repair: Annotated[bool, Flag("Run or score damaged rollouts again, and make the tables again.")] = False,
+    workers: Annotated[int | None, Flag("Repair: worker processes; by default one per core.", min=1)] = None,
+    wait: Annotated[bool, Flag("Repair: wait for a process that writes the folder.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Read every file of a run folder, compare it with its digest, and say what is damaged.
 
     Nothing is written without `--repair`, so a read-only folder can be checked. With it, damaged rollouts alone are run or scored again.
     """
-    del debug
     before = inspect_run(run, full=True)
     after = before
     if repair and not before.whole:

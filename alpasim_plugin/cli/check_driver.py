@@ -9,7 +9,9 @@ import typer
 
 from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
 from alpasim_plugin.alpasim.client.preflight import LIMIT_S, DriveTimes, findings, outside_view, tolerances
+from alpasim_plugin.cli.options import Json, Overrides
 from alpasim_plugin.core.errors import PolicyError
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runtime.compose import make_renderer
 from alpasim_plugin.runtime.rollout import run_rollout
 from scenarios.load import load_scenario
@@ -24,20 +26,18 @@ Examples:
 
 
 def check_driver(
-    address: Annotated[str, typer.Argument(metavar="HOST:PORT", help="The driver, with options as after alpasim://.")],
-    scenario: Annotated[str, typer.Option("--scenario", help="What it drives through.")] = "smoke/curve",
-    renderer: Annotated[str, typer.Option("--renderer", help="Renderer of its frames.")] = "clean",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
-    limit_ms: Annotated[float, typer.Option("--limit-ms", min=0.1, help="Longest drive call; the challenge allows 100.")] = LIMIT_S * 1000,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    address: Annotated[str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")],
+    scenario: Annotated[str, Flag("What it drives through.")] = "smoke/curve",
+    renderer: Annotated[str, Flag("Renderer of its frames.")] = "clean",
+    overrides: Overrides = (),
+    limit_ms: Annotated[float, Flag("Longest drive call; the challenge allows 100.", min=0.1)] = LIMIT_S * 1000,
+    as_json: Json = False,
 ) -> None:
     """Check a driver before it is submitted: a rollout in AlpaSim's order of calls, its times, its plans, and what it must tolerate.
 
     Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
     """
-    del debug  # read from the command line by cli.main, before any option is parsed
-    scene = load_scenario(scenario, overrides=("timing.timeline=alpasim", *(overrides or ())))
+    scene = load_scenario(scenario, overrides=("timing.timeline=alpasim", *(overrides)))
     policy, times, failed = AlpasimPolicy(scene, address), DriveTimes(), None
     times.watch(policy.service)
     try:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from alpasim_plugin.cli.options import Json
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.process.stdout import parts_print_to_stderr
 from policies.conformance import check_policy as run_checks
 from scenarios.load import load_scenario
@@ -25,17 +27,15 @@ Exit codes: 0 every check passed; 1 the policy breaks its contract, or could not
 
 
 def check_policy(
-    policy: Annotated[str, typer.Argument(help="A policy's name, package.module:Class, or file.py:Class.")],
-    scenario: Annotated[str | None, typer.Option("--scenario", help="Scenario whose cameras it gets; by default one camera ahead.")] = None,
-    latency_limit_ms: Annotated[float, typer.Option("--latency-limit-ms", min=0.0, help="Longest median time of a plan.")] = 100.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    policy: Annotated[str, Positional("A policy's name, package.module:Class, or file.py:Class.")],
+    scenario: Annotated[str | None, Flag("Scenario whose cameras it gets; by default one camera ahead.")] = None,
+    latency_limit_ms: Annotated[float, Flag("Longest median time of a plan.", min=0.0)] = 100.0,
+    as_json: Json = False,
 ) -> None:
     """Drive a policy through painted situations and name every breach of its contract: shapes, frames, units, time, determinism.
 
     Nothing is rendered or scored; it takes seconds. Run it before the first drive.
     """
-    del debug
     with parts_print_to_stderr():
         report = run_checks(policy, None if scenario is None else load_scenario(scenario), latency_limit_ms)
     if as_json:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
+from alpasim_plugin.cli.options import Every, Json
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runtime.repair import use_run
 from evaluators.gate.across import Comparison, compare_runs, compare_within
 from evaluators.gate.spec import load_gate
@@ -34,15 +34,13 @@ SHOWN, NAMED = 10, 3  # lines about missing pairs; cells named in each
 
 
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="One run folder, or two: the second is compared with the first.")],
-    baseline: Annotated[str | None, typer.Option("--baseline", help="Renderer to compare with (of the first run).")] = None,
-    gate: Annotated[str | None, typer.Option("--gate", help="Take the margins from this gate file.")] = None,
-    every: Annotated[bool, typer.Option("--all", help="Print every metric, not only the headline ones.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    runs: Annotated[tuple[Path, ...], Positional("One run folder, or two: the second is compared with the first.")],
+    baseline: Annotated[str | None, Flag("Renderer to compare with (of the first run).")] = None,
+    gate: Annotated[str | None, Flag("Take the margins from this gate file.")] = None,
+    every: Every = False,
+    as_json: Json = False,
 ) -> None:
     """Print paired differences on shared scene-seed cells, with verdicts; cells without a pair are listed."""
-    del debug
     if len(runs) > 2:
         raise InputError("comparing runs", f"{len(runs)} folders", "more than two", "name one run, or two")
     for run in runs:

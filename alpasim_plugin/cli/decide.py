@@ -1,37 +1,37 @@
-"""``simrun decide``: drive scenes in random order until a question is decided."""
+"""``simrun decide``: drive scenes in random order until a question is decided. ``simrun gate --until-decided`` uses its parts."""
 
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from alpasim_plugin.cli.deciding import (
-    AUTO,
-    DOING,
-    What,
-    controls_of,
-    decide_into,
-    plan_of,
-    population_of,
-    print_end,
-    questions_of,
-    questions_of_gate,
-    side_of_baseline,
-)
-from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
-from alpasim_plugin.cli.report import report_line
-from alpasim_plugin.cli.run import check_preset, parse_seeds, split_overrides
+from alpasim_plugin.cli.options import Care, Json, Only, Quiet, RunFolder, What, Where, check_preset
+from alpasim_plugin.cli.progress import Lines, Silent, report_line
+from alpasim_plugin.cli.run import planned
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.runtime.certificate import Certify
-from alpasim_plugin.runtime.decide import Design
-from alpasim_plugin.runtime.executors.choice import parse_executor
-from alpasim_plugin.runtime.plan import RunOptions
-from evaluators.gate import load_gate
+from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.process.signals import Stopped
+from alpasim_plugin.run_folder.schema import slug
+from alpasim_plugin.runtime.decide import Decided, Design, execute_decision, key_of
+from alpasim_plugin.runtime.plan import RunOptions, RunPlan
+from evaluators.gate import GateSpec, check_made_alike, load_gate, read_baseline, rows_of_run
+from evaluators.gate.stored import StoredSide, stored_side
+from evaluators.opening import read_run
+from evaluators.report.decision import metric_lines, verdict_line
+from evaluators.sequential import control as variance
 from evaluators.sequential.asymptotic import FIRST_LOOK
-from evaluators.sequential.question import Question
+from evaluators.sequential.control import Control
+from evaluators.sequential.decision import State
+from evaluators.sequential.question import Method, MetricQuestion, Order, Population, Question, metric_question
+
+DOING = "planning a decision"
+AUTO = "auto:"
 
 EPILOG = """
 Examples:
@@ -55,109 +55,264 @@ Exit codes: 0 non-inferior (or better), 1 worse (or not better), 2 bad input or 
 """
 
 
+Alpha = Annotated[float, Flag("Chance of a wrong decision, over all looks.", min=1e-6, max=0.5)]
+Asked = Annotated[Population, Flag("The population that the scenes were drawn from, or the suite itself.")]
+Stored = Annotated[Path | None, Flag("Compare with this stored baseline, or this earlier run.")]
+
+
 def decide(
-    scenarios: Annotated[list[str], typer.Argument(help="Scenario or suite YAML, a folder of them, a shipped name, or a recorded log.")],
-    renderer: Annotated[
-        str,
-        typer.Option("--renderer", help="Baseline and renderer in question, comma-separated; with --baseline-file the latter alone."),
-    ],
-    policy: Annotated[str, typer.Option("--policy", help="The policy, as for `simrun run`.")] = "lane-camera",
+    what: Annotated[What, Only("scenarios", "renderer", "policy", "seeds", "overrides")],
+    options: Annotated[RunOptions, Only("preset", "images", "device", "baseline")],
+    design: Design,
+    where: Where,
+    care: Care,
     metric: Annotated[
-        list[str] | None,
-        typer.Option("--metric", metavar="NAME[=MARGIN]", help="What is asked about; repeatable or comma-separated. Default: the gate's."),
-    ] = None,
-    gate: Annotated[str, typer.Option("--gate", help="Gate whose margins are asked about where no --metric is named.")] = "default",
-    ask: Annotated[
-        Literal["non-inferior", "better"], typer.Option("--ask", help="At most MARGIN worse, or at least MARGIN better?")
-    ] = "non-inferior",
-    expect: Annotated[
-        float | None, typer.Option("--expect", help="Expected difference, which makes the decision fast. Default: that nothing changes.")
-    ] = None,
-    alpha: Annotated[float, typer.Option("--alpha", min=1e-6, max=0.5, help="Chance of a wrong decision, over all looks.")] = 0.05,
-    method: Annotated[
-        Literal["betting", "asymptotic"] | None, typer.Option("--method", help="Default: betting where differences are bounded.")
-    ] = None,
-    population: Annotated[
-        Literal["scenes", "suite"],
-        typer.Option("--population", help="The population that the scenes were drawn from, or the suite itself."),
-    ] = "scenes",
-    control: Annotated[
-        list[str] | None,
-        typer.Option("--control", metavar="family|RUN", help="With --population suite: take out known variance. Repeatable."),
-    ] = None,
-    order: Annotated[
-        Literal["random", "stratified"],
-        typer.Option("--order", help="With --population suite, stratified: between looks every family of scenes in proportion."),
-    ] = "random",
-    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Key of the order of scenes.")] = 0,
-    look_every: Annotated[int, typer.Option("--look-every", min=1, help="Scenes between looks.")] = 5,
-    first_look: Annotated[
-        int, typer.Option("--first-look", min=5, help="Scenes before the first look of asymptotic metrics.")
-    ] = FIRST_LOOK,
-    min_scenes: Annotated[
-        int | None, typer.Option("--min-scenes", min=2, help="Scenes before any decision. Default: the gate's, else 2.")
-    ] = None,
-    budget: Annotated[int | None, typer.Option("--budget", min=2, help="Most rollouts; then undecided. Default: all of the suite.")] = None,
-    seeds: Annotated[str, typer.Option("--seeds", help="Seeds of every scene, or auto:N: up to N, chosen by cost against variance.")] = "1",
-    scene_cost: Annotated[
-        float, typer.Option("--scene-cost", min=0.0, help="What a new scene costs (a reconstruction, say), in pairs of rollouts.")
-    ] = 0.0,
-    max_missing: Annotated[float, typer.Option("--max-missing", min=0.0, max=0.99, help="Share of pairs that may lack a value.")] = 0.0,
-    baseline: Annotated[
-        str | None,
-        typer.Option("--baseline", help="Renderer to compare against; by default the first, or with --baseline-file the one in question."),
-    ] = None,
-    baseline_file: Annotated[
-        Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline, or this earlier run.")
-    ] = None,
-    preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named after the command.")] = None,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Worker processes; the result does not depend on them.")] = None,
-    executor: ExecutorText = "local",
-    cores: Cores = None,
-    gpus: Gpus = None,
-    memory: MemoryGib = None,
-    store: StoreUrl = None,
-    images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Camera frames in rollout.asl.")] = "jpeg",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where renderers compute.")] = "cpu",
-    certify: Annotated[Certify, typer.Option("--certify", help="Repeat one rollout and compare bit for bit.")] = "one",
-    report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
-    wait: Annotated[bool, typer.Option("--wait", help="Wait for a process that writes the run folder; otherwise refuse.")] = False,
-    time_limit: Annotated[float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a rollout may take.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the end.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+        tuple[str, ...],
+        Flag("What is asked about; repeatable or comma-separated. Default: the gate's.", metavar="NAME[=MARGIN]"),
+    ] = (),
+    gate: Annotated[str, Flag("Gate whose margins are asked about where no --metric is named.")] = "default",
+    ask: Annotated[Literal["non-inferior", "better"], Flag("At most MARGIN worse, or at least MARGIN better?")] = "non-inferior",
+    expect: Annotated[float | None, Flag("Expected difference, which makes the decision fast. Default: that nothing changes.")] = None,
+    alpha: Alpha = 0.05,
+    method: Annotated[Method | None, Flag("Default: betting where differences are bounded.")] = None,
+    population: Asked = "scenes",
+    control: Annotated[tuple[str, ...], Flag("With --population suite: take out known variance. Repeatable.", metavar="family|RUN")] = (),
+    first_look: Annotated[int, Flag("Scenes before the first look of asymptotic metrics.", min=5)] = FIRST_LOOK,
+    min_scenes: Annotated[int | None, Flag("Scenes before any decision. Default: the gate's, else 2.", min=2)] = None,
+    baseline_file: Stored = None,
+    out: RunFolder = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Drive scenes in random order until it is decided whether a renderer is worse than another.
 
-    An interrupted decision continues when the same command is given again, and decides the same.
+    `--renderer` names the baseline and the one in question; with `--baseline-file` the latter alone. `--seeds auto:N` takes up to N seeds
+    of a scene, chosen by cost against variance. An interrupted decision continues when the same command is given again, and decides
+    the same.
     """
-    del debug
-    where = parse_executor(executor, cores, gpus, memory)
-    check_preset(preset)
+    check_preset(options.preset)
     spec = None if metric else load_gate(gate)[0]
     if spec is not None and (ask != "non-inferior" or expect is not None):
         raise InputError(DOING, f"--ask {ask}" if ask != "non-inferior" else "--expect", "no metric is named", "name it with --metric")
-    asked = questions_of(metric, ask, expect, method) if metric else questions_of_gate(spec)  # type: ignore[arg-type]
-    least = min_scenes or (spec.min_scenes if spec is not None else 2)
-    question = Question(asked, alpha, population_of(population, max_missing, f"--max-missing {max_missing:g}"), first_look, least)
-    is_auto = seeds.startswith(AUTO)
+    asked = questions_of(metric, ask, expect, method) if spec is None else questions_of_gate(spec)
+    least = min_scenes or (2 if spec is None else spec.min_scenes)
+    population = population_of(population, design.max_missing, f"--max-missing {design.max_missing:g}")
+    question = Question(asked, alpha, population, first_look, least)
+    is_auto = what.seeds.startswith(AUTO)
     if is_auto and population == "suite":
-        raise InputError(DOING, f"--seeds {seeds}", "the suite's mean is over the same seeds in every scene", "give a number of seeds")
-    design = Design(order, order_seed, look_every, budget, is_auto, scene_cost, max_missing=max_missing)
-    of_scene, of_fixer = split_overrides(overrides or ())
-    options = RunOptions(preset, images, "none", device, baseline, of_fixer)
-    what = What(scenarios, renderer, policy, parse_seeds(seeds.removeprefix(AUTO)), options, of_scene)
-    plan = plan_of(what, stored=baseline_file is not None)
-    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, baseline, max_missing)
-    decided = decide_into(
-        plan, question, design, controls_of(control or (), plan, question, order, stored), out, quiet or as_json, stored,
-        workers=workers, certificate=certify, report=report, wait=wait, limit_s=time_limit, executor=where, store=store,
-    )  # fmt: skip
+        found = "the suite's mean is over the same seeds in every scene"
+        raise InputError(DOING, f"--seeds {what.seeds}", found, "give a number of seeds")
+    how = where.arguments() | care.arguments()
+    plan = plan_of(replace(what, seeds=what.seeds.removeprefix(AUTO)), options, stored=baseline_file is not None)
+    stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, options.baseline, design.max_missing)
+    controls = controls_of(control, plan, question, design.order, stored)
+    decided = decide_into(plan, question, replace(design, auto_seeds=is_auto), controls, out, quiet or as_json, stored, **how)
     if as_json:
         print(json.dumps({"out": str(decided.run.root), "exit_code": decided.outcome.exit_code, "decision": decided.record}))
     else:
         print_end(decided)
         print(report_line(decided.run.root))
     raise typer.Exit(decided.outcome.exit_code)
+
+
+class LookLines(Lines):
+    """One line per finished rollout and one per look, on stderr."""
+
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Print a look."""
+        print(look_line(state, rollouts, ceiling), file=sys.stderr, flush=True)
+
+
+class SilentLooks(Silent):
+    """Say nothing."""
+
+    def looked(self, state: State, rollouts: int, ceiling: int) -> None:
+        """Ignore."""
+
+
+def look_line(state: State, rollouts: int, ceiling: int) -> str:
+    """Return one line for a look: scenes, and each metric's interval and verdict."""
+    parts = []
+    for one in state.metrics:
+        low, high = one.interval
+        ends = "no bound yet" if low is None and high is None else f"{_end(low)} to {_end(high)}"
+        parts.append(f"{one.metric} {ends} {one.answer}")
+    return f"look: {state.n_scenes} scenes, {rollouts} of at most {ceiling} rollouts: {'; '.join(parts)}"
+
+
+def _end(value: float | None) -> str:
+    return "unbounded" if value is None else f"{value:+.4g}"
+
+
+def plan_of(what: What, options: RunOptions, stored: bool = False) -> RunPlan:
+    """Plan all cells that may be driven.
+
+    Args:
+        what: Scenes, renderers, one policy.
+        options: Of the run.
+        stored: The baseline was driven earlier: one renderer is driven.
+
+    Raises:
+        InputError: Not two renderers (one, if stored) and one policy, or a scenario or part is invalid.
+    """
+    names = what.renderers
+    if stored:
+        if len(names) != 1:
+            found = f"{len(names)} renderers beside a stored baseline"
+            raise InputError(DOING, f"--renderer {what.renderer}", found, "name the one in question; the baseline is not driven again")
+        return planned(what, names, [what.policy], replace(options, baseline=None))
+    if len(names) != 2:
+        raise InputError(DOING, f"--renderer {what.renderer}", f"{len(names)} renderers", "name two: the baseline and the one in question")
+    baseline = options.baseline or names[0]
+    if baseline not in names:
+        raise InputError(DOING, f"--baseline {baseline}", f"the renderers are {', '.join(names)}", "name one of them")
+    return planned(what, names, [what.policy], replace(options, baseline=baseline))
+
+
+def side_of_baseline(path: Path, plan: RunPlan, baseline: str | None, max_missing: float) -> StoredSide:
+    """Read a stored baseline, or an earlier run's folder, and check it against what is about to be driven.
+
+    Args:
+        path: The baseline's file or folder.
+        plan: What may be driven, of one renderer.
+        baseline: Renderer whose rollouts are taken; None: the one that is driven.
+        max_missing: Share of the plan's scenes and seeds that it may lack.
+
+    Raises:
+        InputError: It was made with another preset, other weights or other scenes, or lacks rollouts that may be driven.
+    """
+    stored = read_baseline(path)
+    weights = {file: sha for part in plan.parts for file, sha in part.files.items()}
+    check_made_alike(stored, plan.options.preset, {name: one.content_hash for name, one in plan.scenarios.items()}, weights, path)
+    planned = {(cell.scene, cell.seed) for cell in plan.cells}
+    return stored_side(stored.rows, baseline or plan.renderers[0].name, plan.policies[0].name, planned, max_missing, path)
+
+
+def questions_of(metrics: Sequence[str], asked: Any, expected: float | None, method: Method | None) -> tuple[MetricQuestion, ...]:
+    """Read ``--metric NAME[=MARGIN]``, repeatable or comma-separated.
+
+    Raises:
+        InputError: A margin that is no number, or one metric twice.
+    """
+    found = []
+    for text in (part.strip() for item in metrics for part in item.split(",") if part.strip()):
+        name, _, margin = text.partition("=")
+        try:
+            value = float(margin) if margin else None
+        except ValueError:
+            raise InputError(DOING, f"--metric {text}", f"margin {margin!r} is no number", "write NAME=MARGIN, as progress=0.05") from None
+        found.append(metric_question(name, value, asked, expected, method=method))
+    names = [one.metric for one in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(DOING, f"--metric {twice[0]}", "named twice", "name every metric once")
+    return tuple(found)
+
+
+def questions_of_gate(spec: GateSpec) -> tuple[MetricQuestion, ...]:
+    """Return the questions that a gate's margins ask.
+
+    Raises:
+        InputError: The gate has no margin.
+    """
+    found = tuple(
+        metric_question(name, rule.margin, "non-inferior", binding=rule.must_decide)
+        for name, rule in spec.metrics.items()
+        if rule.margin is not None
+    )
+    if not any(one.binding for one in found):
+        raise InputError(DOING, "the gate", "no margin of it must be decided", "give it a metric with a margin, or judge a run without")
+    return found
+
+
+def controls_of(
+    texts: Sequence[str], plan: RunPlan, question: Question, order: Order, stored: StoredSide | None = None
+) -> dict[str, Control]:
+    """Read ``--control``: ``family``, or run folders.
+
+    Args:
+        texts: What was given.
+        plan: What may be driven.
+        question: What is to be decided.
+        order: Of the scenes.
+        stored: The baseline's side, where it was driven earlier.
+
+    Raises:
+        InputError: Controls for the population ``scenes``, families that the order takes out already, or one that cannot be had.
+    """
+    if not texts:
+        return {}
+    if question.population != "suite":
+        found = "the mean of a control over a population of scenes is not known"
+        raise InputError(DOING, f"--control {texts[0]}", found, "ask about the suite itself with --population suite, or leave it out")
+    if "family" in texts and order == "stratified":
+        found = "with --order stratified, families are taken out by the order"
+        raise InputError(DOING, "--control family", found, "leave out one of the two")
+    scenes, baseline = list(plan.scenarios), str(plan.options.baseline) if stored is None else stored.renderer
+    candidate = next(spec.name for spec in plan.renderers if stored is not None or spec.name != baseline)
+    paths = {cell.scene: cell.ref.path for cell in plan.cells}
+    out: dict[str, Control] = {}
+    for text in texts:
+        rows = None if text == "family" else rows_of_run(read_run(Path(text)))
+        for one in question.metrics:
+            made = variance.of_families(paths) if rows is None else variance.of_rows(rows, one.metric, scenes, candidate, baseline, text)
+            out[one.metric] = variance.join(out[one.metric], made) if one.metric in out else made
+    return out
+
+
+def decide_into(
+    plan: RunPlan,
+    question: Question,
+    design: Design,
+    controls: Mapping[str, Control],
+    root: Path | None,
+    quiet: bool,
+    stored: StoredSide | None = None,
+    **how: Any,
+) -> Decided:
+    """Drive until decided; an interruption says how to go on.
+
+    Args:
+        plan: From `plan_of`.
+        question: What is to be decided.
+        design: How scenes are drawn.
+        controls: From `controls_of`.
+        root: Run folder; None: named after the command.
+        quiet: No progress.
+        stored: The baseline's side, where it was driven earlier.
+        how: Further arguments of `execute_decision`.
+    """
+    plan = replace(plan, question=key_of(question, design, controls, stored))
+    folder = root or Path("runs", f"decide-{slug(next(iter(plan.scenarios)))}-{plan.command_key}")  # by the command alone
+    progress = SilentLooks() if quiet else LookLines()
+    try:
+        return execute_decision(
+            plan, question, design, folder, command=["simrun", *sys.argv[1:]], progress=progress, controls=controls, stored=stored, **how
+        )
+    except Stopped as stop:
+        stop.kept = f"finished rollouts are kept in {folder}; the same command continues and decides the same"
+        raise
+
+
+def population_of(text: Population, max_missing: float, allowed_by: str) -> Population:
+    """Check that a suite is asked about only where all its scenes count.
+
+    Args:
+        text: Which population.
+        max_missing: Share of pairs that may lack.
+        allowed_by: What says so, for the error.
+
+    Raises:
+        InputError: Pairs may be missing.
+    """
+    if text == "suite" and max_missing > 0.0:
+        found = "scenes without a pair would be left out of the suite that is asked about"
+        raise InputError(DOING, allowed_by, found, "leave it out, or ask with --population scenes")
+    return text
+
+
+def print_end(decided: Decided) -> None:
+    """Print verdict, numbers and guarantee."""
+    print(verdict_line(decided.record))
+    for line in metric_lines(decided.record):
+        print(line)

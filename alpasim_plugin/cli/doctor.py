@@ -7,11 +7,12 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import typer
 
+from alpasim_plugin.cli.options import Json
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.runtime.provenance import hardware, versions
 
@@ -19,11 +20,9 @@ EPILOG = "Example: `simrun doctor --json`"
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Test each part on a small case and report what works, what does not, and what to do."""
-    del debug
     checks: dict[str, Callable[[], str]] = {
         "rasteriser (cpu)": lambda: _raster("cpu"),
         "rasteriser (gsplat)": lambda: _raster("gsplat"),

@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import typer
-
-from alpasim_plugin.cli.export_recording import FORMATS, Asked, Exported, export_recording
+from alpasim_plugin.cli.options import Json, Overwrite, Quiet, refuse_existing
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.cli.rollout_folders import is_run
+from alpasim_plugin.cli.view import find_cell, is_run, narrowed
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.recordings.content import DOING as RECORDING
+from alpasim_plugin.recordings.content import Recording, collect
+from alpasim_plugin.recordings.mcap_file import require_mcap, write_mcap
+from alpasim_plugin.recordings.rerun_file import require_rerun, write_rrd
+from alpasim_plugin.run_folder.schema import CONTENTS
 from alpasim_plugin.runtime.export import Export, export_run, export_scenes
 from alpasim_plugin.runtime.repair import use_run
-from alpasim_plugin.viewer.cells import Wanted
+from alpasim_plugin.viewer.cells import Wanted, cells_of, check_wanted
+from alpasim_plugin.viewer.page_data import read_logs
+from evaluators.opening import read_so_far
 
 DOING = "exporting"
+FORMATS: dict[str, tuple[Callable[[], object], Callable[[Recording, Path], Mapping[str, int]]]] = {
+    "mcap": (require_mcap, write_mcap),
+    "rrd": (require_rerun, write_rrd),
+}
+NAMED = 4  # cells in the message that there are several
 
 EPILOG = """
 Examples:
@@ -38,20 +50,15 @@ Exit codes: 0 written; 2 no such run or rollout, several cells where one was nee
 
 def export(
     items: Annotated[
-        list[str],
-        typer.Argument(metavar="RUN|ROLLOUT|SCENARIO...", help="A run folder, the folder of a rollout, or scenarios (--alpasim)."),
+        tuple[str, ...], Positional("A run folder, the folder of a rollout, or scenarios (--alpasim).", metavar="RUN|ROLLOUT|SCENARIO...")
     ],
-    alpasim: Annotated[Path | None, typer.Option("--alpasim", metavar="DIR", help="Write AlpaSim run folders; new or empty.")] = None,
-    mcap: Annotated[Path | None, typer.Option("--mcap", metavar="FILE", help="Write a recording for Foxglove; extra [mcap].")] = None,
-    rrd: Annotated[Path | None, typer.Option("--rrd", metavar="FILE", help="Write a recording for Rerun; extra [rerun].")] = None,
-    scene: Annotated[str | None, typer.Option("--scene", help="Scene of the recording.")] = None,
-    policy: Annotated[str | None, typer.Option("--policy", help="Policy of the recording.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the recording.")] = None,
-    renderer: Annotated[list[str] | None, typer.Option("--renderer", help="Renderer in the recording; all by default. Repeatable.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the files that --mcap and --rrd name.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No line for each rollout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    wanted: Wanted,
+    alpasim: Annotated[Path | None, Flag("Write AlpaSim run folders; new or empty.", metavar="DIR")] = None,
+    mcap: Annotated[Path | None, Flag("Write a recording for Foxglove; extra [mcap].", metavar="FILE")] = None,
+    rrd: Annotated[Path | None, Flag("Write a recording for Rerun; extra [rerun].", metavar="FILE")] = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write a run for other tools: AlpaSim run folders and scenes, or one scene, policy and seed as a recording for Foxglove or Rerun.
 
@@ -60,17 +67,12 @@ def export(
 
     With `--mcap` or `--rrd`, camera frames, boxes, map, driven path, plans and metrics behind every renderer on one time line.
     """
-    del debug  # read from the command line by cli.main, before any option is parsed
-    files = dict(zip(FORMATS, (mcap, rrd), strict=True))
-    wanted = Wanted(
-        () if scene is None else (scene,), () if policy is None else (policy,), () if seed is None else (seed,), tuple(renderer or ())
-    )
-    if (alpasim is None) == (not any(files.values())):
+    files = {name: path for name, path in (("mcap", mcap), ("rrd", rrd)) if path is not None}
+    if (alpasim is None) == (not files):
         found = "nothing to write" if alpasim is None else "--alpasim beside --mcap or --rrd"
         raise InputError(DOING, " ".join(items), found, "give --alpasim DIR, or --mcap FILE and --rrd FILE")
     if alpasim is None:
-        asked = Asked(items, wanted, {name: path for name, path in files.items() if path is not None}, overwrite)
-        _print_recording(export_recording(asked, warn), as_json)
+        _print_recording(*export_recording(items, wanted, files, overwrite), as_json)
         return
     if not wanted.is_all:
         raise InputError(DOING, "--alpasim", "--scene, --policy, --seed or --renderer beside it", "leave them out: a run is exported whole")
@@ -85,14 +87,58 @@ def export(
     _print(done, as_json)
 
 
-def _print_recording(done: Exported, as_json: bool) -> None:
+def export_recording(
+    items: Sequence[str], asked: Wanted, files: Mapping[str, Path], overwrite: bool
+) -> tuple[Recording, list[dict[str, Any]]]:
+    """Write a recording of one scene, policy and seed, in each format that was asked for.
+
+    Args:
+        items: The run folder or the rollout's folder; one.
+        asked: Which cell of a run, and which renderers.
+        files: Format -> file.
+        overwrite: Replace files that are there.
+
+    Returns:
+        The recording, and for each file ``format``, ``file``, ``bytes``, ``messages``, and ``channels`` with the messages of each.
+
+    Raises:
+        InputError: Not one run or rollout, several cells, a file that is there already, a damaged log, or a library is not installed.
+        InfrastructureError: The disk refuses.
+    """
+    if len(items) > 1:
+        raise InputError(RECORDING, " ".join(items), "several items", "give one run folder, or the folder of one rollout")
+    for name, path in files.items():
+        refuse_existing(path, overwrite, RECORDING, "")
+        FORMATS[name][0]()  # the library, before anything is read
+    what = Path(items[0])
+    root, of_rollout = find_cell(what, RECORDING)
+    if (root / CONTENTS).exists():
+        use_run(root, warn)
+    run = read_so_far(root).run
+    wanted = narrowed(what, of_rollout, asked, RECORDING)
+    check_wanted(run, wanted)
+    cells = cells_of(run, wanted)
+    if len(cells) != 1:
+        some = "; ".join(cell.name for cell in cells[:NAMED]) + (f"; {len(cells) - NAMED} more" if len(cells) > NAMED else "")
+        found = f"{len(cells)} cells of scene, policy and seed: {some}" if cells else "no finished rollout that was asked for"
+        raise InputError(RECORDING, str(root), found, "choose one by --scene, --policy and --seed, or name a rollout's folder")
+    recording = collect(run, cells[0], read_logs(run, cells[0]))
+    written = []
+    for name, path in files.items():
+        counts = dict(FORMATS[name][1](recording, path))
+        facts = {"format": name, "file": str(path), "bytes": path.stat().st_size, "messages": sum(counts.values()), "channels": counts}
+        written.append(facts)
+    return recording, written
+
+
+def _print_recording(recording: Recording, files: Sequence[dict[str, Any]], as_json: bool) -> None:
     if as_json:
-        print(json.dumps({"recording": done.name, "files": list(done.files), "notes": list(done.notes)}))
+        print(json.dumps({"recording": recording.name, "files": files, "notes": list(recording.notes)}))
         return
-    for note in done.notes:
+    for note in recording.notes:
         print(f"note     {note}")
-    for one in done.files:
-        print(f"{one['format']:<8} {one['file']}  {one['bytes'] / 1e6:.1f} MB, {one['messages']} messages: {done.name}")
+    for one in files:
+        print(f"{one['format']:<8} {one['file']}  {one['bytes'] / 1e6:.1f} MB, {one['messages']} messages: {recording.name}")
 
 
 def _print(done: Export, as_json: bool) -> None:

@@ -9,8 +9,10 @@ from typing import Annotated
 
 import typer
 
+from alpasim_plugin.cli.options import Json, Run
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.plugins.parts import resolve, resolve_renderer
 from alpasim_plugin.run_folder.reader import read_json
 from alpasim_plugin.run_folder.schema import PROBE_JSON, slug
@@ -28,31 +30,26 @@ Examples:
 """
 PROBE_EPILOG = "Example: `simrun probe runs/us101 --cell clean/lane-camera/us101/0 --renderers clean,3dgs`"
 
-Run = Annotated[Path, typer.Argument(help="A run folder.")]
-Name = Annotated[str, typer.Option("--cell", help="RENDERER/POLICY/SCENE/SEED as in the tables, or the rollout's folder.")]
-Where = Annotated[str | None, typer.Option("--scenario", help="The rollout's scenario, if it has moved.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
+Name = Annotated[str, Flag("RENDERER/POLICY/SCENE/SEED as in the tables, or the rollout's folder.")]
+Moved = Annotated[str | None, Flag("The rollout's scenario, if it has moved.")]
 
 
 def fork(
     run: Run,
     cell: Name,
-    at: Annotated[float, typer.Option("--at", help="Seconds after the first frame at which the change takes effect.")],
-    renderer: Annotated[str | None, typer.Option("--renderer", help="Renderer after the change.")] = None,
-    policy: Annotated[str | None, typer.Option("--policy", help="Policy after the change; it has the history of observations.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the new parts.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder to write; by default one below RUN/forks/.")] = None,
-    video: Annotated[bool, typer.Option("--video", help="Write front.mp4 of the continuation.")] = False,
-    scenario: Where = None,
+    at: Annotated[float, Flag("Seconds after the first frame at which the change takes effect.")],
+    renderer: Annotated[str | None, Flag("Renderer after the change.")] = None,
+    policy: Annotated[str | None, Flag("Policy after the change; it has the history of observations.")] = None,
+    seed: Annotated[int | None, Flag("Seed of the new parts.", min=0)] = None,
+    out: Annotated[Path | None, Flag("Run folder to write; by default one below RUN/forks/.")] = None,
+    video: Annotated[bool, Flag("Write front.mp4 of the continuation.")] = False,
+    scenario: Moved = None,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Continue a logged rollout from an instant on with another renderer, policy or seed.
 
     Writes a run folder with the original and the continuation, scored and reported like any run.
     """
-    del debug
     _check_names([renderer] if renderer else [], policy)
     use_run(run, warn)
     past = find_rollout(run, cell, scenario)
@@ -79,16 +76,12 @@ def fork(
 def probe(
     run: Run,
     cell: Name,
-    renderers: Annotated[str, typer.Option("--renderers", help="Two or more, comma-separated; the first is the reference.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder to write; by default below RUN/probes/, where the report looks.")
-    ] = None,
-    scenario: Where = None,
+    renderers: Annotated[str, Flag("Two or more, comma-separated; the first is the reference.")],
+    out: Annotated[Path | None, Flag("Folder to write; by default below RUN/probes/, where the report looks.")] = None,
+    scenario: Moved = None,
     as_json: Json = False,
-    debug: Debug = False,
 ) -> None:
     """Query the policy at a logged rollout's poses behind several renderers and measure the distance between its plans."""
-    del debug
     names = tuple(name.strip() for name in renderers.split(",") if name.strip())
     _check_names(names, None)
     use_run(run, warn)

@@ -5,19 +5,28 @@ from __future__ import annotations
 import json
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
-from alpasim_plugin.cli.deciding import What, decide_into, plan_of, population_of, print_end, questions_of_gate, side_of_baseline
-from alpasim_plugin.cli.executor_options import Cores, ExecutorText, Gpus, MemoryGib, StoreUrl
+from alpasim_plugin.cli.decide import (
+    Alpha,
+    Asked,
+    Stored,
+    decide_into,
+    plan_of,
+    population_of,
+    print_end,
+    questions_of_gate,
+    side_of_baseline,
+)
+from alpasim_plugin.cli.options import Json, Only, What, Where
 from alpasim_plugin.cli.progress import make_progress, warn
-from alpasim_plugin.cli.run import parse_seeds
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.runtime.decide import Design
-from alpasim_plugin.runtime.executors.choice import parse_executor
 from alpasim_plugin.runtime.plan import RunOptions
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.runtime.self_test import run_self_test
@@ -34,8 +43,10 @@ from evaluators.gate import (
 )
 from evaluators.opening import read_run
 from evaluators.report.ci import write_gate_files
-from evaluators.sequential.question import Population, Question
+from evaluators.sequential.question import Question
 from evaluators.sequential.record import stopping_note
+
+DOING = "judging a run"
 
 EPILOG = """
 Examples:
@@ -55,75 +66,57 @@ Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken poli
 """
 
 
-def gate(
-    run: Annotated[Path | None, typer.Argument(help="A run folder; with --until-decided it is written.")] = None,
-    gate_file: Annotated[str, typer.Option("--gate", help="A gate file, or the name of a shipped gate.")] = "default",
-    baseline_file: Annotated[
-        Path | None, typer.Option("--baseline-file", help="Compare with this stored baseline, or this earlier run.")
-    ] = None,
-    approve: Annotated[Path | None, typer.Option("--write-baseline", help="Store the run as a baseline and stop.")] = None,
-    self_test: Annotated[bool, typer.Option("--self-test", help="Drive broken renderers; fail unless the gate catches each.")] = False,
-    until_decided: Annotated[bool, typer.Option("--until-decided", help="Drive --scenes until every binding margin is decided.")] = False,
-    scenes: Annotated[list[str] | None, typer.Option("--scenes", help="Until decided: a scenario, suite or folder. Repeatable.")] = None,
+@dataclass(frozen=True)
+class UntilDecided:
+    """What `--until-decided` is given beside the parts that it shares with `simrun decide`."""
+
+    until_decided: Annotated[bool, Flag("Drive --scenes until every binding margin is decided.")] = False
+    scenes: Annotated[tuple[str, ...], Flag("Until decided: a scenario, suite or folder. Repeatable.")] = ()
     renderer: Annotated[
-        str | None, typer.Option("--renderer", help="Until decided: baseline and renderer in question; with --baseline-file the latter.")
-    ] = None,
-    policy: Annotated[str, typer.Option("--policy", help="Until decided: the policy.")] = "lane-camera",
-    seeds: Annotated[str, typer.Option("--seeds", help="Until decided: seeds of every scene.")] = "1",
-    images: Annotated[Literal["none", "jpeg", "png"], typer.Option("--images", help="Until decided: frames in rollout.asl.")] = "jpeg",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="Until decided: override a scenario key.")] = None,
-    alpha: Annotated[float, typer.Option("--alpha", min=1e-6, max=0.5, help="Until decided: chance of a wrong decision.")] = 0.05,
-    population: Annotated[
-        Literal["scenes", "suite"],
-        typer.Option("--population", help="Until decided: the population that the scenes were drawn from, or the suite itself."),
-    ] = "scenes",
-    order: Annotated[
-        Literal["random", "stratified"], typer.Option("--order", help="Until decided: the order of scenes, as for `simrun decide`.")
-    ] = "random",
-    order_seed: Annotated[int, typer.Option("--order-seed", min=0, help="Until decided: key of the order of scenes.")] = 0,
-    budget: Annotated[int | None, typer.Option("--budget", min=2, help="Until decided: most rollouts.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Where gate.md and gate.junit.xml go; by default the run folder.")] = None,
-    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Self-test, until decided: worker processes.")] = None,
-    executor: ExecutorText = "local",
-    cores: Cores = None,
-    gpus: Gpus = None,
-    memory: MemoryGib = None,
-    store: StoreUrl = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+        str | None, Flag("Until decided: baseline and renderer in question; with --baseline-file the latter.", names="renderer")
+    ] = None
+    alpha: Alpha = 0.05
+    population: Asked = "scenes"
+
+
+def gate(
+    until: UntilDecided,
+    what: Annotated[What, Only("policy", "seeds", "overrides")],
+    options: Annotated[RunOptions, Only("images")],
+    design: Annotated[Design, Only("order", "order_seed", "budget")],
+    where: Where,
+    run: Annotated[Path | None, Positional("A run folder; with --until-decided it is written.")] = None,
+    gate_file: Annotated[str, Flag("A gate file, or the name of a shipped gate.", "--gate")] = "default",
+    baseline_file: Stored = None,
+    approve: Annotated[Path | None, Flag("Store the run as a baseline and stop.", "--write-baseline")] = None,
+    self_test: Annotated[bool, Flag("Drive broken renderers; fail unless the gate catches each.")] = False,
+    out: Annotated[Path | None, Flag("Where gate.md and gate.junit.xml go; by default the run folder.")] = None,
+    as_json: Json = False,
 ) -> None:
-    """Judge a run by a gate, or test the gate itself on deliberately broken renderers."""
-    del debug
-    where = parse_executor(executor, cores, gpus, memory)
+    """Judge a run by a gate, or test the gate itself on deliberately broken renderers.
+
+    With `--until-decided` it drives as `simrun decide` does; what says how to drive is for that alone.
+    """
+    how = where.arguments()
     if self_test:
         if run is not None or baseline_file is not None or approve is not None:
             raise InputError("testing a gate", "--self-test", "a run or baseline is named as well", "give --gate and --out only")
-        raise typer.Exit(_self_test(gate_file, out, workers, as_json))
+        raise typer.Exit(_self_test(gate_file, out, where.workers, as_json))
     if run is None:
-        raise InputError("judging a run", "simrun gate", "no run folder is named", "name one, or use --self-test")
-    driving = [
-        ("--scenes", bool(scenes)),
-        ("--renderer", renderer is not None),
-        ("--executor", not where.is_local),
-        ("--store", bool(store)),
-    ]
-    if not until_decided and (named := [name for name, is_given in driving if is_given]):
-        found_none = "nothing is driven without --until-decided"
-        raise InputError("judging a run", ", ".join(named), found_none, "add it, or leave them out")
-    if until_decided:
+        raise InputError(DOING, "simrun gate", "no run folder is named", "name one, or use --self-test")
+    if until.until_decided:
         if approve is not None:
-            raise InputError("judging a run", "--until-decided", "a baseline is to be written as well", "write it of a run that is driven")
-        if not scenes or renderer is None:
-            raise InputError(
-                "judging a run",
-                "--until-decided",
-                "no scenes or renderers",
-                "name them: --scenes SUITE --renderer A,B (one, with --baseline-file)",
-            )
-        what = What(scenes, renderer, policy, parse_seeds(seeds), RunOptions(images=images), tuple(overrides or ()))
-        how = {"workers": workers, "executor": where, "store": store}
-        design = Design(order, order_seed, budget=budget)
-        raise typer.Exit(_until_decided(run, gate_file, what, alpha, population, design, baseline_file, out, as_json, how))
+            raise InputError(DOING, "--until-decided", "a baseline is to be written as well", "write it of a run that is driven")
+        if not until.scenes or until.renderer is None:
+            do_this = "name them: --scenes SUITE --renderer A,B (one, with --baseline-file)"
+            raise InputError(DOING, "--until-decided", "no scenes or renderers", do_this)
+        what = replace(what, scenarios=until.scenes, renderer=until.renderer)
+        raise typer.Exit(_until_decided(run, gate_file, until, what, options, design, baseline_file, out, as_json, how))
+    driving = {
+        "--scenes": until.scenes, "--renderer": until.renderer, "--executor": not how["executor"].is_local, "--store": where.store,
+    }  # fmt: skip
+    if named := [name for name, is_given in driving.items() if is_given]:
+        raise InputError(DOING, ", ".join(named), "nothing is driven without --until-decided", "add it, or leave them out")
     use_run(run, warn)
     found = read_run(run)
     if approve is not None:
@@ -136,7 +129,7 @@ def gate(
     preset = str(found.summary.get("preset"))
     if spec.preset is not None and spec.preset != preset:
         wanted = f"preset {preset!r}, the gate {source} is for {spec.preset!r}"
-        raise InputError("judging a run", str(run), wanted, "score it with that preset")
+        raise InputError(DOING, str(run), wanted, "score it with that preset")
     stored = None
     if baseline_file is not None:
         stored = read_baseline(baseline_file)
@@ -153,9 +146,9 @@ def gate(
 def _until_decided(
     run: Path,
     gate_file: str,
+    until: UntilDecided,
     what: What,
-    alpha: float,
-    population: Population,
+    options: RunOptions,
     design: Design,
     baseline_file: Path | None,
     out: Path | None,
@@ -164,11 +157,11 @@ def _until_decided(
 ) -> int:
     """Drive until the gate's margins are decided, judge, write the gate's files, and return the exit code."""
     spec, source = load_gate(gate_file)
-    options = replace(what.options, preset=spec.preset or what.options.preset, baseline=spec.baseline)
-    plan = plan_of(replace(what, options=options), stored=baseline_file is not None)
+    options = replace(options, preset=spec.preset or options.preset, baseline=spec.baseline)
+    plan = plan_of(what, options, stored=baseline_file is not None)
     stored = None if baseline_file is None else side_of_baseline(baseline_file, plan, spec.baseline, spec.max_missing)
-    population = population_of(population, spec.max_missing, f"max_missing {spec.max_missing:g} of {source}")
-    question = Question(questions_of_gate(spec), alpha, population, min_scenes=spec.min_scenes)
+    population = population_of(until.population, spec.max_missing, f"max_missing {spec.max_missing:g} of {source}")
+    question = Question(questions_of_gate(spec), until.alpha, population, min_scenes=spec.min_scenes)
     design = replace(design, max_failed=spec.max_failed, max_missing=spec.max_missing)
     decided = decide_into(plan, question, design, {}, run, as_json, stored, **how)
     found = read_run(run)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
+from alpasim_plugin.cli.options import Json
+from alpasim_plugin.core.flags import Positional
 from alpasim_plugin.plugins.parts import names, unidentified
 from alpasim_plugin.plugins.parts.loading import load
 from alpasim_plugin.plugins.parts.resolve import declaration_of, note_of
@@ -19,12 +19,10 @@ Listed = Literal["renderers", "fixers", "policies", "controllers", "evaluators",
 
 
 def list_parts(
-    kind: Annotated[Listed, typer.Argument(help="What to list.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    kind: Annotated[Listed, Positional("What to list.")],
+    as_json: Json = False,
 ) -> None:
     """List renderers, fixers, policies, other parts, shipped scenarios or metrics, one a line with one line of help."""
-    del debug
     tables: dict[str, Callable[[], dict[str, str]]] = {
         "renderers": lambda: names("renderer"),
         "fixers": _fixers,

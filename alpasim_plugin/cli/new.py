@@ -11,9 +11,9 @@ from pathlib import Path
 from string import Template
 from typing import Annotated, Literal
 
-import typer
-
+from alpasim_plugin.cli.options import Json
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.io.atomic import write_text
 
 DOING = "writing a template"
@@ -36,14 +36,12 @@ Examples:
 
 
 def new(
-    kind: Annotated[Kind, typer.Argument(help="What to write.")],
-    name: Annotated[str, typer.Argument(help="Its name, as a file: lower case, digits and underscores.")],
-    folder: Annotated[Path, typer.Option("--folder", help="Where it goes.")] = Path("."),
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    kind: Annotated[Kind, Positional("What to write.")],
+    name: Annotated[str, Positional("Its name, as a file: lower case, digits and underscores.")],
+    folder: Annotated[Path, Flag("Where it goes.")] = Path("."),
+    as_json: Json = False,
 ) -> None:
     """Write a working policy, scenario, renderer, fixer or metric with a test, to begin from."""
-    del debug
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise InputError(DOING, f"name {name!r}", "not a name of a Python file", "use lower case, digits and underscores: my_policy")
     if not folder.is_dir():

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.cli.options import Json, Overrides, Overwrite, refuse_existing
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.run_folder.schema import slug
 from alpasim_plugin.runtime.preview import DOING, draw_preview
 from scenarios.load import load_scenario
@@ -23,22 +22,19 @@ Examples:
 
 
 def preview(
-    scenario: Annotated[str, typer.Argument(help="Scenario YAML, a shipped name, or a recorded log.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="PNG or HTML; by default SCENE.png here.")] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Scene seed; by default the file's.")] = None,
-    renderer: Annotated[str, typer.Option("--renderer", help="What renders the camera frames.")] = "clean",
-    frames: Annotated[int, typer.Option("--frames", min=2, max=12, help="Moments shown.")] = 5,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a scenario key: key=value. Repeatable.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that exists.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    scenario: Annotated[str, Positional("Scenario YAML, a shipped name, or a recorded log.")],
+    out: Annotated[Path | None, Flag("PNG or HTML; by default SCENE.png here.", also="-o")] = None,
+    seed: Annotated[int | None, Flag("Scene seed; by default the file's.", min=0)] = None,
+    renderer: Annotated[str, Flag("What renders the camera frames.")] = "clean",
+    frames: Annotated[int, Flag("Moments shown.", min=2, max=12)] = 5,
+    overrides: Overrides = (),
+    overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """Draw a scenario before it is driven: map, road users over time, and the camera along the recorded drive."""
-    del debug
-    loaded = load_scenario(scenario, seed, tuple(overrides or ()))
+    loaded = load_scenario(scenario, seed, overrides)
     path = out or Path(f"{slug(loaded.scene_id)}.png")
-    if path.exists() and not overwrite:
-        raise InputError(DOING, str(path), "it exists already", "name another --out, or pass --overwrite")
+    refuse_existing(path, overwrite, DOING, "")
     made = draw_preview(loaded, path, frames, renderer)
     if as_json:
         print(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,13 @@ class Bar:
 def warn(text: str) -> None:
     """Print a line on standard error."""
     print(text, file=sys.stderr, flush=True)
+
+
+def report_line(root: Path) -> str:
+    """Return the lines that say where a run's report is, or how to get it, and how to watch its drives."""
+    page, run = root / "report.html", shlex.quote(str(root))
+    report = f"report   {shlex.quote(str(page))}" if page.exists() else f"report   not written; simrun report {run}"
+    return f"{report}\nwatch    simrun view {run}"
 
 
 def make_progress(quiet: bool) -> Silent | Lines | Bar:

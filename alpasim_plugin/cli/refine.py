@@ -11,11 +11,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.cli.options import Json, Overwrite, Quiet, fixer_overrides
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.fixers import fixer_settings, make_fixer
 from alpasim_plugin.fixers.refine import UNLIKE, ChangeLimit
 from alpasim_plugin.plugins.interfaces import Fixer
@@ -25,7 +25,6 @@ from alpasim_plugin.runtime.refine import RefineFiles, RefineSummary, refine_vid
 LINE_EVERY_S = 10.0
 LARGE_CHANGE_DB = 30.0
 SCENE = "video"  # key of the noise, the same for every file: a renamed video gives the same result
-PREFIX = "fixer."
 
 EPILOG = """
 Examples:
@@ -39,29 +38,27 @@ Examples:
 
 
 def refine(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="A video of any size, rate and length, or a folder of PNG.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The refined video (MP4); a folder of PNG without a suffix.")],
-    opacity: Annotated[Path | None, typer.Option("--opacity", help="Grey, white where the input is reliable; in the input's form.")] = None,
-    sdmap: Annotated[Path | None, typer.Option("--sdmap", help="Semantic map (docs/semantic-map.md), in the input's form.")] = None,
-    fixer: Annotated[str, typer.Option("--fixer", help="A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer",
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="Override a setting: fixer.key=value. Repeatable.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixer's noise.")] = 0,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where the fixer computes.")] = "cpu",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Torch threads; by default one per core.")] = None,
-    compare: Annotated[Path | None, typer.Option("--compare", help="Also write input and result side by side.")] = None,
-    anyway: Annotated[bool, typer.Option("--anyway", help="Take whatever the fixer makes, however much it changes.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace results that exist.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the summary.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    source: Annotated[Path, Positional("A video of any size, rate and length, or a folder of PNG.", metavar="IN")],
+    out: Annotated[Path, Flag("The refined video (MP4); a folder of PNG without a suffix.", also="-o")],
+    opacity: Annotated[Path | None, Flag("Grey, white where the input is reliable; in the input's form.")] = None,
+    sdmap: Annotated[Path | None, Flag("Semantic map (docs/semantic-map.md), in the input's form.")] = None,
+    fixer: Annotated[str, Flag("A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer",
+    overrides: Annotated[tuple[str, ...], Flag("Override a setting: fixer.key=value. Repeatable.", "--set")] = (),
+    seed: Annotated[int, Flag("Seed of the fixer's noise.", min=0)] = 0,
+    device: Annotated[Literal["cpu", "cuda"], Flag("Where the fixer computes.")] = "cpu",
+    threads: Annotated[int | None, Flag("Torch threads; by default one per core.", min=1)] = None,
+    compare: Annotated[Path | None, Flag("Also write input and result side by side.")] = None,
+    anyway: Annotated[bool, Flag("Take whatever the fixer makes, however much it changes.")] = False,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Refine a video with a fixer, block by block, at any length in constant memory.
 
     Frame times, size and colours are kept; sound is dropped. The result gets its name once complete: an interrupted command leaves
     no file.
     """
-    del debug
-    settings = fixer_settings(fixer, fixer_overrides(overrides or ()))
+    settings = fixer_settings(fixer, fixer_overrides(overrides))
 
     def session() -> Fixer:
         made = make_fixer(fixer, settings, scene_id=SCENE, seed=seed, device=device, threads=threads)
@@ -99,18 +96,6 @@ def warnings(summary: RefineSummary) -> list[str]:
         said = f"PSNR {summary.psnr_db:.1f} dB, mean {summary.mean_levels:.1f} grey levels"
         return [f"warning: the fixer changed this video by much ({said}): compare with --compare before you use the result"]
     return []
-
-
-def fixer_overrides(texts: tuple[str, ...] | list[str]) -> list[str]:
-    """Return ``--set`` values without their prefix ``fixer.``.
-
-    Raises:
-        InputError: A value without this prefix.
-    """
-    for text in texts:
-        if not text.startswith(PREFIX):
-            raise InputError("reading --set", f"--set {text}", "not a key of the fixer", f"write --set {PREFIX}key=value")
-    return [text.removeprefix(PREFIX) for text in texts]
 
 
 def untrained_notice(label: str) -> str:

@@ -9,11 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from rich.console import Console
 
+from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing
 from alpasim_plugin.cli.progress import warn
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
 from evaluators.metrics import METRICS
 from evaluators.report.numbers import plural
 from evaluators.runs.choose import Choice, as_day, chosen, shown_folder
@@ -43,38 +44,31 @@ Exit codes: 0, also where nothing is found; 2 no such folder, no two runs to com
 
 
 def runs(
-    roots: Annotated[list[Path] | None, typer.Argument(metavar="ROOT...", help="Folders of run folders; by default runs.")] = None,
-    commit: Annotated[list[str] | None, typer.Option("--commit", help="Project's commit, its first digits. Repeatable.")] = None,
-    weights: Annotated[
-        list[str] | None, typer.Option("--weights", help="Weight file: the first digits of its SHA-256, or its name. Repeatable.")
-    ] = None,
-    renderer: Annotated[list[str] | None, typer.Option("--renderer", help="A renderer of the run; * and ? match. Repeatable.")] = None,
-    policy: Annotated[list[str] | None, typer.Option("--policy", help="A policy of the run; * and ? match. Repeatable.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", help="A scene or suite of the run; * and ? match. Repeatable.")] = None,
-    preset: Annotated[list[str] | None, typer.Option("--preset", help="Evaluator preset. Repeatable.")] = None,
-    state: Annotated[list[str] | None, typer.Option("--state", help=f"One of {', '.join(STATES)}. Repeatable.")] = None,
-    since: Annotated[str | None, typer.Option("--since", help="Begun at or after: 2026-03-01, 2026-03-01T18:00 (UTC), 7d, 12h.")] = None,
-    until: Annotated[str | None, typer.Option("--until", help="Begun before.")] = None,
-    last: Annotated[int | None, typer.Option("--last", min=1, help="The newest N of them.")] = None,
-    metric: Annotated[list[str] | None, typer.Option("--metric", help="Show this metric, by renderer. Repeatable.")] = None,
-    steps: Annotated[
-        bool, typer.Option("--steps", help="Compare each run with the comparable one before it, and name what changed.")
-    ] = False,
-    page: Annotated[Path | None, typer.Option("--trend", metavar="FILE", help="Write the same as an offline page.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file that --trend names.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    roots: Annotated[tuple[Path, ...], Positional("Folders of run folders; by default runs.", metavar="ROOT...")] = (),
+    commit: Annotated[tuple[str, ...], Flag("Project's commit, its first digits. Repeatable.")] = (),
+    weights: Annotated[tuple[str, ...], Flag("Weight file: the first digits of its SHA-256, or its name. Repeatable.")] = (),
+    renderer: Annotated[tuple[str, ...], Flag("A renderer of the run; * and ? match. Repeatable.")] = (),
+    policy: Annotated[tuple[str, ...], Flag("A policy of the run; * and ? match. Repeatable.")] = (),
+    scene: Annotated[tuple[str, ...], Flag("A scene or suite of the run; * and ? match. Repeatable.")] = (),
+    preset: Annotated[tuple[str, ...], Flag("Evaluator preset. Repeatable.")] = (),
+    state: Annotated[tuple[str, ...], Flag(f"One of {', '.join(STATES)}. Repeatable.")] = (),
+    since: Annotated[str | None, Flag("Begun at or after: 2026-03-01, 2026-03-01T18:00 (UTC), 7d, 12h.")] = None,
+    until: Annotated[str | None, Flag("Begun before.")] = None,
+    last: Annotated[int | None, Flag("The newest N of them.", min=1)] = None,
+    metric: Annotated[tuple[str, ...], Flag("Show this metric, by renderer. Repeatable.")] = (),
+    steps: Annotated[bool, Flag("Compare each run with the comparable one before it, and name what changed.")] = False,
+    page: Annotated[Path | None, Flag("Write the same as an offline page.", "--trend", metavar="FILE")] = None,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """List run folders: what was driven, with what, when, and how far it came; filtered, and with metrics side by side."""
-    del debug
     places = roots or [Path("runs")]
     now = datetime.now(UTC)
     choice = Choice(
-        tuple(commit or ()), tuple(weights or ()), tuple(renderer or ()), tuple(policy or ()), tuple(scene or ()), tuple(preset or ()),
-        _states(state or []), as_day(since, "--since", now) if since else None, as_day(until, "--until", now) if until else None,
+        commit, weights, renderer, policy, scene, preset,
+        _states(state), as_day(since, "--since", now) if since else None, as_day(until, "--until", now) if until else None,
     )  # fmt: skip
-    if page is not None and page.exists() and not overwrite:
-        raise InputError(DOING, f"--trend {page}", "it exists already", "name another file, or pass --overwrite")
+    refuse_existing(page, overwrite, DOING, "--trend")
     found = find_runs(places, bool(metric) or steps or page is not None)
     taken, lost = chosen(found, choice)
     taken = taken[:last]

@@ -10,18 +10,18 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.progress import describe
-from alpasim_plugin.cli.report import report_line
+from alpasim_plugin.cli.options import Evaluators, Json, Preset, Quiet, Report, Wait
+from alpasim_plugin.cli.progress import describe, report_line
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.run_folder.manifests import read_run_json
 from alpasim_plugin.runtime.known_scenes import KnownScenes
 from alpasim_plugin.runtime.score_logs import find_logs
 from alpasim_plugin.runtime.score_run import ScoreResult, execute_score
 from evaluators import preset as find_preset
-from evaluators import resolve_evaluators
+from evaluators import presets, resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.metrics import MetricTable
-from evaluators.presets import Preset
 from evaluators.report import render_table
 
 EPILOG = """
@@ -36,31 +36,23 @@ Examples:
 
 
 def score(
-    logs: Annotated[list[str], typer.Argument(help="Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes.")],
-    scene: Annotated[
-        list[str], typer.Option("--scene", help="The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable.")
-    ],
-    preset: Annotated[str, typer.Option("--preset", help="Evaluator preset.")] = "paper",
-    settings: Annotated[Path | None, typer.Option("--settings", help="AlpaSim's eval-config.yaml, with --preset alpasim.")] = None,
-    rails: Annotated[bool, typer.Option("--rails/--no-rails", help="Lanes by their rails, or their centres widened by 1.85 m.")] = True,
-    evaluators: Annotated[
-        list[str] | None, typer.Option("--evaluator", help="A further evaluator, package.module:Class. Repeatable.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; by default one below runs/ named by logs and preset.")] = None,
-    report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Write report.html now; `simrun report RUN` writes it later.")
-    ] = True,
-    wait: Annotated[bool, typer.Option("--wait", help="Wait for a process that writes the run folder; otherwise refuse.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, only the table.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    logs: Annotated[tuple[str, ...], Positional("Logs (.asl, AlpaSim's or ours), folders of them, or patterns in quotes.")],
+    scene: Annotated[tuple[str, ...], Flag("The logs' scene: .usdz, scenario YAML, recorded log, or a folder of them. Repeatable.")],
+    preset: Preset = "paper",
+    settings: Annotated[Path | None, Flag("AlpaSim's eval-config.yaml, with --preset alpasim.")] = None,
+    rails: Annotated[bool, Flag("Lanes by their rails, or their centres widened by 1.85 m.", "--rails/--no-rails")] = True,
+    evaluators: Evaluators = (),
+    out: Annotated[Path | None, Flag("Run folder; by default one below runs/ named by logs and preset.")] = None,
+    report: Report = True,
+    wait: Wait = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Score rollout logs, AlpaSim's or ours, without rendering; the files are those of a run.
 
     Rows name the log by its folder in the column `rollout`. With `--preset alpasim` AlpaSim's own aggregation and scene score are written
     to `aggregate/` as well. Nothing in a log is ever unpickled.
     """
-    del debug  # read from the command line by cli.main, before any option is parsed
     chosen = find_preset(preset)
     own = _settings(chosen, settings)
     if own is not None:
@@ -79,7 +71,7 @@ def score(
         KnownScenes(scene, rails),
         chosen,
         own,
-        resolve_evaluators(evaluators or ()),
+        resolve_evaluators(evaluators),
         out,
         ["simrun", *sys.argv[1:]],
         on_done,
@@ -90,7 +82,7 @@ def score(
     raise typer.Exit(result.exit_code)
 
 
-def _settings(preset: Preset, path: Path | None) -> EvalSettings | None:
+def _settings(preset: presets.Preset, path: Path | None) -> EvalSettings | None:
     """Return AlpaSim's settings where its preset is meant; its defaults where no file is given."""
     if preset.reproduces is not None:
         return EvalSettings() if path is None else load_settings(path)

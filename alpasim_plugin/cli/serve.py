@@ -7,11 +7,10 @@ import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.hosting import Host, Security, is_loopback
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.process.signals import Stopped
 
 DOING = "reading the options of simrun serve"
@@ -33,41 +32,40 @@ Exit codes: 0 stopped by a signal after running calls were answered; 2 wrong opt
 
 
 def serve(
-    listen: Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Address; port 0 takes a free one.")] = "127.0.0.1:50051",
-    renderer: Annotated[str, typer.Option("--renderer", help="Renderer or fixer as for `run`; identity hands on.")] = "onefixer",
-    scenes: Annotated[list[str] | None, typer.Option("--scenes", help="Folder, scene file or shipped name; repeatable.")] = None,
-    upstream: Annotated[str | None, typer.Option("--upstream", metavar="HOST:PORT", help="Renderer to stand in front of.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting of the fixer; repeatable.")] = None,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and fix.")] = "cpu",
-    threads: Annotated[int | None, typer.Option("--threads", min=1, help="Threads of renderer and fixer.")] = None,
-    workers: Annotated[int, typer.Option("--workers", min=1, max=256, help="Calls handled at a time; further ones wait.")] = 32,
-    history_mb: Annotated[int, typer.Option("--history-mb", min=16, help="Most memory of the histories, MiB.")] = 2048,
-    expiry_s: Annotated[float, typer.Option("--expiry-s", min=1.0, help="Histories unused for so long are forgotten.")] = 900.0,
-    kept_scenes: Annotated[int, typer.Option("--kept-scenes", min=1, help="Scenes that stay loaded.")] = 4,
-    reliability: Annotated[float | None, typer.Option("--reliability", min=0.0, max=1.0, help="Fixed trust in upstream frames.")] = None,
-    mask: Annotated[list[str] | None, typer.Option("--mask", metavar="CAMERA=FILE", help="Grey picture, white is trusted.")] = None,
-    upstream_image: Annotated[Literal["png", "as-asked"], typer.Option("--upstream-image", help="Format to ask the upstream for.")] = "png",
-    prefetch: Annotated[bool, typer.Option("--prefetch", help="Load all scenes before the port opens.")] = False,
-    drain_s: Annotated[float, typer.Option("--drain-s", min=0.0, help="At the end, wait so long for running calls.")] = 30.0,
-    tls_cert: Annotated[Path | None, typer.Option("--tls-cert", help="PEM certificate of this server.")] = None,
-    tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM key of this server.")] = None,
-    tls_client_ca: Annotated[Path | None, typer.Option("--tls-client-ca", help="Callers must show a certificate signed by it.")] = None,
-    token_file: Annotated[Path | None, typer.Option("--token-file", help="File with the token that callers must send.")] = None,
-    upstream_ca: Annotated[Path | None, typer.Option("--upstream-ca", help="Talk TLS to the upstream and trust this PEM.")] = None,
-    upstream_token_file: Annotated[Path | None, typer.Option("--upstream-token-file", help="File with the token for the upstream.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON line when the port is open, and one at the end.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Log every failed call with its traceback.")] = False,
+    listen: Annotated[str, Flag("Address; port 0 takes a free one.", metavar="HOST:PORT")] = "127.0.0.1:50051",
+    renderer: Annotated[str, Flag("Renderer or fixer as for `run`; identity hands on.")] = "onefixer",
+    scenes: Annotated[tuple[str, ...], Flag("Folder, scene file or shipped name; repeatable.")] = (),
+    upstream: Annotated[str | None, Flag("Renderer to stand in front of.", metavar="HOST:PORT")] = None,
+    set_: Annotated[tuple[str, ...], Flag("A setting of the fixer; repeatable.", "--set", metavar="KEY=VALUE")] = (),
+    device: Annotated[Literal["cpu", "cuda"], Flag("Where to render and fix.")] = "cpu",
+    threads: Annotated[int | None, Flag("Threads of renderer and fixer.", min=1)] = None,
+    workers: Annotated[int, Flag("Calls handled at a time; further ones wait.", min=1, max=256)] = 32,
+    history_mb: Annotated[int, Flag("Most memory of the histories, MiB.", min=16)] = 2048,
+    expiry_s: Annotated[float, Flag("Histories unused for so long are forgotten.", min=1.0)] = 900.0,
+    reliability: Annotated[float | None, Flag("Fixed trust in upstream frames.", min=0.0, max=1.0)] = None,
+    mask: Annotated[tuple[str, ...], Flag("Grey picture, white is trusted.", metavar="CAMERA=FILE")] = (),
+    upstream_image: Annotated[Literal["png", "as-asked"], Flag("Format to ask the upstream for.")] = "png",
+    prefetch: Annotated[bool, Flag("Load all scenes before the port opens.")] = False,
+    drain_s: Annotated[float, Flag("At the end, wait so long for running calls.", min=0.0)] = 30.0,
+    tls_cert: Annotated[Path | None, Flag("PEM certificate of this server.")] = None,
+    tls_key: Annotated[Path | None, Flag("PEM key of this server.")] = None,
+    tls_client_ca: Annotated[Path | None, Flag("Callers must show a certificate signed by it.")] = None,
+    token_file: Annotated[Path | None, Flag("File with the token that callers must send.")] = None,
+    upstream_ca: Annotated[Path | None, Flag("Talk TLS to the upstream and trust this PEM.")] = None,
+    upstream_token_file: Annotated[Path | None, Flag("File with the token for the upstream.")] = None,
+    as_json: Annotated[bool, Flag("Print one JSON line when the port is open, and one at the end.", "--json")] = False,
+    debug: Annotated[bool, Flag("Log every failed call with its traceback.")] = False,
 ) -> None:
     """Serve AlpaSim's renderer service: our renderer, or OneFixer in front of any other renderer.
 
     Frames of all rollouts may come over one connection in any order: each drive's history is found by what is asked (docs/alpasim.md).
     """
     logging.basicConfig(level=logging.INFO if debug else logging.WARNING, format="%(asctime)s %(levelname)s %(message)s")
-    masks = dict(parted(item, "--mask") for item in mask or ())
+    masks = dict(parted(item, "--mask") for item in mask)
     settings = Settings(
         renderer=renderer,
-        overrides=tuple(set_ or ()),
-        scenes=tuple(scenes or ()),
+        overrides=set_,
+        scenes=scenes,
         upstream=None if upstream is None else Upstream(upstream, upstream_ca, read_token(upstream_token_file)),
         device=device,
         threads=threads,
@@ -76,7 +74,6 @@ def serve(
         reliability=reliability,
         masks={camera: Path(file) for camera, file in masks.items()},
         upstream_png=upstream_image == "png",
-        kept_scenes=kept_scenes,
     )
     made = assemble(settings)
     if prefetch and made.shelf is not None:

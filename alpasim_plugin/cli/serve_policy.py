@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 
 from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, Security
 from alpasim_plugin.alpasim.server.one_policy import ADDRESS
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.interfaces import Policy
 from alpasim_plugin.plugins.parts import PartSpec, build, resolve
@@ -29,27 +29,22 @@ Examples:
 
 
 def serve_policy(
-    policy: Annotated[str, typer.Argument(help="Policy as for `run --policy`.")],
+    policy: Annotated[str, Positional("Policy as for `run --policy`.")],
     listen: Annotated[
-        str, typer.Option("--listen", metavar="HOST:PORT", envvar=ADDRESS, help="Address, or unix:PATH; port 0 takes a free one.")
+        str, Flag("Address, or unix:PATH; port 0 takes a free one.", metavar="HOST:PORT", variable=ADDRESS)
     ] = "127.0.0.1:50052",
-    scenes: Annotated[
-        list[str] | None, typer.Option("--scenes", help="Scenes by whose id a policy gets map and vehicle; without it, it gets neither.")
-    ] = None,
-    sessions: Annotated[int, typer.Option("--sessions", min=1, help="Sessions open at a time.")] = 64,
-    tls_cert: Annotated[Path | None, typer.Option("--tls-cert", help="PEM certificate of this server.")] = None,
-    tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM key of this server.")] = None,
-    drain_s: Annotated[float, typer.Option("--drain-s", min=0.0, help="At the end, wait so long for running calls.")] = 10.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON line when the port is open, and one at the end.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    scenes: Annotated[tuple[str, ...], Flag("Scenes by whose id a policy gets map and vehicle; without it, it gets neither.")] = (),
+    tls_cert: Annotated[Path | None, Flag("PEM certificate of this server.")] = None,
+    tls_key: Annotated[Path | None, Flag("PEM key of this server.")] = None,
+    drain_s: Annotated[float, Flag("At the end, wait so long for running calls.", min=0.0)] = 10.0,
+    as_json: Annotated[bool, Flag("Print one JSON line when the port is open, and one at the end.", "--json")] = False,
 ) -> None:
     """Serve a policy as AlpaSim's EgodriverService, so that AlpaSim's runtime drives it.
 
     Each session gets a policy of its own, made for the session's cameras, which must be pinholes.
     """
-    del debug  # read from the command line by cli.main, before any option is parsed
     spec = resolve("policy", policy)
-    service = DriverService(spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes or ()), sessions)
+    service = DriverService(spec.name, spec.digest, partial(_made, spec), scenario_finder(scenes))
     host = Host({"EgodriverService": service}, listen, Security(tls_cert, tls_key))
     what = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     try:

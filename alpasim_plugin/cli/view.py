@@ -7,13 +7,13 @@ import shlex
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from alpasim_plugin.cli.options import Json, Overwrite, refuse_existing
 from alpasim_plugin.cli.progress import warn
-from alpasim_plugin.cli.rollout_folders import find_cell, narrowed
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.process.signals import Stopped
-from alpasim_plugin.run_folder.schema import CONTENTS
+from alpasim_plugin.run_folder.manifests import read_manifest
+from alpasim_plugin.run_folder.schema import CONTENTS, MANIFEST, RUN_INFO
 from alpasim_plugin.runtime.repair import use_run
 from alpasim_plugin.viewer.cells import Wanted
 from alpasim_plugin.viewer.page import DEFAULT_MB, MB, Options
@@ -41,26 +41,20 @@ Exit codes: 0 the page is written, or the server was stopped by a signal; 2 no s
 
 
 def view(
-    what: Annotated[Path, typer.Argument(metavar="RUN|ROLLOUT", help="A run folder, or the folder of one of its rollouts.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The page; by default view.html in the run folder.")] = None,
-    serve: Annotated[str | None, typer.Option("--serve", metavar="HOST:PORT", help="Serve a running run on this machine instead.")] = None,
-    scene: Annotated[list[str] | None, typer.Option("--scene", help="Scene; repeatable.")] = None,
-    policy: Annotated[list[str] | None, typer.Option("--policy", help="Policy; repeatable.")] = None,
-    seed: Annotated[list[int] | None, typer.Option("--seed", help="Seed; repeatable.")] = None,
-    renderer: Annotated[list[str] | None, typer.Option("--renderer", help="Renderer; repeatable.")] = None,
-    camera: Annotated[str | None, typer.Option("--camera", help="Keep this camera alone.")] = None,
-    cells: Annotated[int | None, typer.Option("--cells", min=1, help="Most scene-policy-seed cells in the page.")] = None,
-    max_mb: Annotated[float, typer.Option("--max-mb", min=1.0, help="Size of the page, megabytes.")] = DEFAULT_MB,
-    width: Annotated[int, typer.Option("--width", min=64, max=4096, help="Frames wider than this are made smaller, pixels.")] = 512,
-    every: Annotated[int, typer.Option("--every", min=1, help="Keep every n-th camera frame.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that --out names.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    what: Annotated[Path, Positional("A run folder, or the folder of one of its rollouts.", metavar="RUN|ROLLOUT")],
+    asked: Wanted,
+    out: Annotated[Path | None, Flag("The page; by default view.html in the run folder.", also="-o")] = None,
+    serve: Annotated[str | None, Flag("Serve a running run on this machine instead.", metavar="HOST:PORT")] = None,
+    camera: Annotated[str | None, Flag("Keep this camera alone.")] = None,
+    cells: Annotated[int | None, Flag("Most scene-policy-seed cells in the page.", min=1)] = None,
+    max_mb: Annotated[float, Flag("Size of the page, megabytes.", min=1.0)] = DEFAULT_MB,
+    width: Annotated[int, Flag("Frames wider than this are made smaller, pixels.", min=64, max=4096)] = 512,
+    every: Annotated[int, Flag("Keep every n-th camera frame.", min=1)] = 1,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
 ) -> None:
     """Replay rollouts in a browser: cameras side by side, a map from above, metrics over time, events; offline, or of a running run."""
-    del debug
     root, of_rollout = find_cell(what, DOING)
-    asked = Wanted(tuple(scene or ()), tuple(policy or ()), tuple(seed or ()), tuple(renderer or ()))
     wanted = narrowed(what, of_rollout, asked, DOING)
     options = Options(int(max_mb * MB), Fineness(every, width), camera)
     if serve is not None:
@@ -78,8 +72,7 @@ def view(
     if not so_far.run.rollouts:
         raise InputError(DOING, str(root), "no rollout has finished", "wait for the first, or watch with --serve 8000")
     path = out or root / PAGE
-    if out is not None and out.exists() and not overwrite:
-        raise InputError(DOING, str(out), "it exists already", "name another --out, or pass --overwrite")
+    refuse_existing(out, overwrite, DOING, "--out")
     made = write_page(so_far.run, path, wanted, options, cells)
     if as_json:
         shown = [{"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown]
@@ -97,3 +90,38 @@ def _serve(root: Path, address: str, wanted: Wanted, options: Options, as_json: 
             server.serve_forever()
         except Stopped:  # how a server ends
             return
+
+
+def is_run(what: Path) -> bool:
+    """Tell whether a folder is a run folder."""
+    return (what / RUN_INFO).exists() or (what / CONTENTS).exists()
+
+
+def find_cell(what: Path, doing: str) -> tuple[Path, Wanted | None]:
+    """Return the run folder of a run or a rollout, and which rollouts to show if a rollout was named.
+
+    Raises:
+        InputError: Neither.
+    """
+    if is_run(what):
+        return what, None
+    if (what / MANIFEST).exists():
+        manifest, _ = read_manifest(what)
+        root = next((folder for folder in what.resolve().parents if (folder / RUN_INFO).exists()), None)
+        if root is not None:
+            return root, Wanted((str(manifest["scene"]),), (str(manifest["policy"]),), (int(manifest["seed"]),))
+    found = "no run.json and no manifest.json" if what.is_dir() else "no such folder"
+    raise InputError(doing, str(what), found, "give a folder that simrun run wrote, or RUN/rollouts/RENDERER/POLICY/SCENE/SEED")
+
+
+def narrowed(what: Path, rollout: Wanted | None, asked: Wanted, doing: str) -> Wanted:
+    """Return which rollouts to show: all that was asked for of a run, of a rollout's cell the renderers that were.
+
+    Raises:
+        InputError: More than renderers is asked for beside a rollout.
+    """
+    if rollout is None:
+        return asked
+    if asked.scenes or asked.policies or asked.seeds:
+        raise InputError(doing, str(what), "--scene, --policy or --seed beside a rollout, which has one of each", "name its run folder")
+    return Wanted(rollout.scenes, rollout.policies, rollout.seeds, asked.renderers)

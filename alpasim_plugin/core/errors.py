@@ -6,6 +6,7 @@ Every failure that a user can meet is a `SimrunError`. Its class sets the proces
 
 from __future__ import annotations
 
+import traceback
 from typing import ClassVar
 
 from alpasim_plugin.core.escape import shorten, terminal
@@ -84,3 +85,23 @@ class EvaluatorError(SimrunError):
 
     exit_code: ClassVar[int] = 5
     failure_class: ClassVar[str] = "evaluator"
+
+
+class InternalError(SimrunError):
+    """The program itself failed: an exception that nothing has foreseen, of ours or of a plug-in."""
+
+    exit_code: ClassVar[int] = 70
+    failure_class: ClassVar[str] = "internal"
+
+    @classmethod
+    def of(cls, error: BaseException, command: str) -> InternalError:
+        """Return the error for an exception, which says where it was raised.
+
+        Args:
+            error: What was raised.
+            command: The command that ran.
+        """
+        frames = traceback.extract_tb(error.__traceback__)
+        where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+        do_this = "run the command with --debug and report the traceback to whoever maintains that file"
+        return cls("running a command", command, f"{type(error).__name__}: {error}{where}", do_this)

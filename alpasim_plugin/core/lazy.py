@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from alpasim_plugin.core.errors import InputError
@@ -42,13 +39,3 @@ def require_library(module: str, doing: str, with_what: str, do_this: str) -> An
         return import_module(module)
     except ImportError as error:
         raise InputError(doing, with_what, f"the library {module.partition('.')[0]} cannot be imported: {error}", do_this) from error
-
-
-def installed(group: str) -> Mapping[str, EntryPoint]:
-    """Return what the installed packages register in a group of entry points, by name."""
-    return _installed(group, tuple(sys.path))
-
-
-@lru_cache(maxsize=64)
-def _installed(group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=group)}

@@ -1,6 +1,6 @@
 """The interfaces of the replaceable parts. Required members are abstract; every other member is optional and has its default here.
 
-A part may inherit from its interface or only look like it: `alpasim_plugin.plugins.parts.build` adds the defaults of the optional members that it
+A part may inherit from its interface or only look like it: `plugins.parts.build` adds the defaults of the optional members that it
 does not define, so that the loop never has to ask whether a member is there. docs/extending.md shows one part of every kind.
 """
 

@@ -12,9 +12,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.plugins.parts import digest
 from alpasim_plugin.process.subprocesses import end_children
@@ -65,14 +66,18 @@ class Design:
         max_missing: Share of pairs of a metric that may lack.
     """
 
-    order: Order = "random"
-    order_seed: int = 0
-    look_every: int = 5
-    budget: int | None = None
+    order: Annotated[
+        Order, Flag("With --population suite, stratified: between looks every family of scenes in proportion.")
+    ] = "random"
+    order_seed: Annotated[int, Flag("Key of the order of scenes.", min=0)] = 0
+    look_every: Annotated[int, Flag("Scenes between looks.", min=1)] = 5
+    budget: Annotated[int | None, Flag("Most rollouts; then undecided. Default: all of the suite.", min=2)] = None
     auto_seeds: bool = False
-    scene_cost: float = 0.0
+    scene_cost: Annotated[
+        float, Flag("What a new scene costs (a reconstruction, say), in pairs of rollouts.", min=0.0)
+    ] = 0.0
     max_failed: float = 0.0
-    max_missing: float = 0.0
+    max_missing: Annotated[float, Flag("Share of pairs that may lack a value.", min=0.0, max=0.99)] = 0.0
 
 
 @dataclass(frozen=True)

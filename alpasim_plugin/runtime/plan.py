@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.plugins.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
 from alpasim_plugin.plugins.parts.loading import COMMAND
@@ -27,15 +28,15 @@ LOOP, SCORING = "alpasim_plugin.runtime.rollout", "alpasim_plugin.runtime.scorin
 class RunOptions:
     """Everything except the cells that determines a run's results."""
 
-    preset: str = "paper"
-    images: Literal["none", "jpeg", "png"] = "jpeg"  # camera frames in rollout.asl
-    video: Literal["none", "failures", "all"] = "none"
-    device: Literal["cpu", "cuda"] = "cpu"
-    baseline: str | None = None
+    preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = "paper"
+    images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = "jpeg"
+    video: Annotated[Literal["none", "failures", "all"], Flag("Write front.mp4.")] = "none"
+    device: Annotated[Literal["cpu", "cuda"], Flag("Where renderers compute.")] = "cpu"
+    baseline: Annotated[str | None, Flag("Renderer to compare against; by default the first.", names="renderer")] = None
     fixer: tuple[str, ...] = ()  # KEY=VALUE of the fixers' settings
-    controller: str | None = None  # None: each policy's own
-    evaluators: tuple[str, ...] = ()  # package.module:Class of evaluators in addition to the registered ones
-    traffic: str | None = None  # HOST:PORT of a traffic service; None: the scenario's own road users
+    controller: Annotated[str | None, Flag("Controller that tracks the plans; by default the policy's.", names="controller")] = None
+    evaluators: Annotated[tuple[str, ...], Flag("A further evaluator, package.module:Class. Repeatable.", "--evaluator")] = ()
+    traffic: Annotated[str | None, Flag("AlpaSim's traffic service moves the other road users.", metavar="HOST:PORT")] = None
 
 
 @dataclass(frozen=True)

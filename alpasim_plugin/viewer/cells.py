@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.run_folder.rows import Rollout
 from evaluators.opening import Run
 from evaluators.report.flips import Flip, baseline_of, events, find_flips, in_words
@@ -76,10 +77,10 @@ class WatchedCell:
 class Wanted:
     """What was asked for; an empty tuple is everything. A scene may be named as when it was driven: smoke/curve is smoke-curve."""
 
-    scenes: tuple[str, ...] = ()
-    policies: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = ()
-    renderers: tuple[str, ...] = ()
+    scenes: Annotated[tuple[str, ...], Flag("Scene to show. Repeatable.", "--scene")] = ()
+    policies: Annotated[tuple[str, ...], Flag("Policy to show. Repeatable.", "--policy")] = ()
+    seeds: Annotated[tuple[int, ...], Flag("Seed to show. Repeatable.", "--seed")] = ()
+    renderers: Annotated[tuple[str, ...], Flag("Renderer to show; all by default. Repeatable.", "--renderer")] = ()
 
     @property
     def is_all(self) -> bool:

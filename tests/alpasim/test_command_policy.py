@@ -18,7 +18,7 @@ import pytest
 
 from alpasim_plugin.alpasim.client.command import Command
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.cli.run import split_policies
+from alpasim_plugin.cli.options import split_policies
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import read_asl

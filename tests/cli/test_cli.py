@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.cli.main import main, run_command
-from alpasim_plugin.cli.run import parse_seeds
+from alpasim_plugin.cli.options import parse_seeds
 from alpasim_plugin.core.errors import InputError
 
 GOOD = ["--renderer", "clean", "--policy", "log-replay"]

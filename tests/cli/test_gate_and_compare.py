@@ -176,6 +176,15 @@ def test_a_gate_for_another_preset_and_bad_usage_are_refused(runs, tmp_path, cap
 # --- compare ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("verb", ["compare", "aggregate"])
+def test_other_metrics_than_those_of_the_headline_are_printed_on_demand(verb, runs, capsys):
+    assert run_command([verb, str(runs["good"])]) == 0
+    few = capsys.readouterr().out
+    assert run_command([verb, str(runs["good"]), "--all"]) == 0
+    every = capsys.readouterr().out
+    assert len(every.splitlines()) > len(few.splitlines())
+
+
 def test_compare_within_a_run_is_the_paired_block_of_its_summary(runs, capsys):
     assert run_command(["compare", str(runs["bad"]), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["paired"]["onefixer"]["lateral_distance_m"]

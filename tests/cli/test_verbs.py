@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 
-from alpasim_plugin.cli.main import VERBS, make_app
+from alpasim_plugin.cli.main import GROUPS, make_app, verbs
+
+REPO = Path(__file__).resolve().parents[2]
+OWN = [verb for group in GROUPS.values() for verb in group]
+MOST_VERBS, MOST_OPTIONS = 30, 250
 
 
 def verbs_below(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -22,31 +29,48 @@ def verbs_below(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tupl
         yield path, command
 
 
-ALL = dict(item for verb in VERBS for item in verbs_below(typer.main.get_command(make_app(verb))))
+ALL = dict(item for verb in verbs() for item in verbs_below(typer.main.get_command(make_app(verb))))
+CORE = {path: command for path, command in ALL.items() if path[0] in OWN}
 
 
-def test_all_verbs_are_walked_over() -> None:
-    assert {path[0] for path in ALL} == set(VERBS)
-    assert {("train", "fixer"), ("train", "pairs-sheet"), ("bench", "quality")} <= set(ALL)
+def options_of(command: Any) -> list[str]:
+    """Return the long name of every option of a command; of one with two states the second, which is not the default."""
+    names = [[name for name in (*parameter.opts, *parameter.secondary_opts) if name.startswith("--")] for parameter in command.params]
+    return [found[-1] for found in names if found and found[0] != "--help"]
 
 
 @pytest.mark.parametrize("path", sorted(ALL), ids=" ".join)
 def test_every_verb_takes_json_and_debug_and_shows_an_example(path: tuple[str, ...]) -> None:
-    command = ALL[path]
-    options = {name for parameter in command.params for name in parameter.opts}
-    assert {"--json", "--debug"} <= options
-    assert f"simrun {' '.join(path)}" in (command.epilog or "") or command.hidden or path == ("run",)
+    assert {"--json", "--debug"} <= set(options_of(ALL[path]))
+    assert f"simrun {' '.join(path)}" in (ALL[path].epilog or "") or ALL[path].hidden or path == ("run",)
 
 
-def test_the_listing_shows_each_verb_with_the_first_line_of_its_own_help() -> None:
-    listed: Any = typer.main.get_command(make_app(None))
-    assert list(listed.commands) == list(VERBS)
-    for verb in VERBS:
-        own: Any = typer.main.get_command(make_app(verb))
-        first = (own.commands[verb].help or "").split("\n\n")[0].replace("\n", " ").strip()
-        assert listed.commands[verb].help == first, verb
+def test_the_core_has_few_verbs_and_options() -> None:
+    assert len(CORE) <= MOST_VERBS
+    assert sum(len(options_of(command)) for command in CORE.values()) <= MOST_OPTIONS
+
+
+@cache
+def written(folder: str, ending: str) -> str:
+    """Return the text of all files of a folder, but for this one."""
+    return "\n".join(path.read_text(encoding="utf-8") for path in sorted((REPO / folder).rglob(f"*{ending}")) if path != Path(__file__))
+
+
+@pytest.mark.parametrize(("folder", "ending"), [("tests", ".py"), ("docs", ".md")])
+def test_every_option_of_the_core_is_in_a_test_and_on_a_page(folder: str, ending: str) -> None:
+    named = sorted({option for command in CORE.values() for option in options_of(command)})
+    absent = [option for option in named if not re.search(rf"{re.escape(option)}(?![\w-])", written(folder, ending))]
+    assert absent == []
 
 
 def test_a_listing_loads_no_numerical_library() -> None:
     code = "import sys; from alpasim_plugin.cli.main import run_command; run_command(['--help']); print('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip().endswith("False")
+
+
+def test_the_listing_shows_every_verb_with_the_first_line_of_its_own_help() -> None:
+    listed: Any = typer.main.get_command(make_app(None))
+    assert set(listed.commands) == set(verbs())
+    for verb in verbs():
+        own: Any = typer.main.get_command(make_app(verb))
+        assert listed.commands[verb].help == (own.commands[verb].help or "").splitlines()[0], verb

@@ -12,9 +12,11 @@ SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
 STEP = re.compile(r"^\s*- run: (.*)$", re.M)
 # What is not run from an empty folder, and why; the first rule that fits counts.
-NO_COMMAND = (r"──", r"--split test(?= |$)")  # a picture of the order of commands; a record from before there were two test splits
+# A picture of the order of commands; a record from before there were two test splits; what writes into the reader's own shell files.
+NO_COMMAND = (r"──", r"--split test(?= |$)", r"-completion$")
 NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"──", "a picture of the order of commands"),
+    (r"-completion$", "writes into the shell's own files: tests/cli/test_entry.py asks for the scripts"),
     (r"gate --self-test", "eight minutes; tests/runtime/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda|--on h200", "needs weights of 4 GB, or a GPU"),
     (

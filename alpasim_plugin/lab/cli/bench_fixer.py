@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.bench.fixer import bench_fixer
 from alpasim_plugin.lab.bench.fixer_rows import Bench, BenchOptions, Row

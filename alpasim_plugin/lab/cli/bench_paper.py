@@ -77,7 +77,7 @@ def paper(
     only: Annotated[str, typer.Option("--only", help=f"Comma-separated protocols: {', '.join(PROTOCOLS)}.")] = ",".join(BY_DEFAULT),
     clips: Annotated[int | None, typer.Option("--clips", min=2, help="At most so many clips a protocol, evenly chosen.")] = None,
     frames: Annotated[int | None, typer.Option("--frames", min=2, help="First frames of a clip; as in the paper by default.")] = None,
-    judges: Annotated[str | None, typer.Option("--judges", help="Ask the judges of these training seeds, as 0,1 (docs/lab/judges.md).")] = None,
+    judges: Annotated[str | None, typer.Option("--judges", help="Ask the judges of these seeds, as 0,1 (docs/lab/judges.md).")] = None,
     judge_folder: Annotated[Path | None, typer.Option("--judge-folder", help="Folder of judges that you froze.")] = None,
     weights: Annotated[Path | None, typer.Option("--metric-weights", help=f"Folder of metric weights; also {FOLDER_VARIABLE}.")] = None,
     reasons: Annotated[Path | None, typer.Option("--reasons", help="JSON, claim number -> a paragraph on why it comes out so.")] = None,

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
-from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.lab.bench.block_speed import BlockTimes, measure_blocks

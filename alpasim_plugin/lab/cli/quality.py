@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
-from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.bundle import bundle_fixer
 from alpasim_plugin.lab.bench.judged import Judging

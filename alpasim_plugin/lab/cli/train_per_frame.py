@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import torch
 import typer
 
-from alpasim_plugin.cli.refine import fixer_overrides
+from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import difflib
 import inspect
-import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.installed import installed, installed_names
 from alpasim_plugin.io.config import apply_overrides, validate
 from alpasim_plugin.io.yaml_positions import Document
 from alpasim_plugin.plugins.interfaces import Declaration
@@ -47,9 +44,10 @@ def entries(kind: KindName) -> Mapping[str, Entry]:
     Raises:
         InputError: Two packages claim one name.
     """
-    here = os.path.realpath(os.getcwd())
-    # A folder that was received from somebody may hold a distribution's metadata, which make no installed package.
-    return _entries(kind, tuple(folder for folder in sys.path if folder and os.path.realpath(folder) != here))
+    found = {name: Entry(name, target, help_text) for name, (target, help_text) in BUILTIN[kind].items()}
+    taken = {name: entry.target for name, entry in found.items()}
+    others = installed_names(KINDS[kind].group, taken, kind)
+    return found | {name: Entry(name, target, f"from {target}") for name, target in others.items()}
 
 
 def find(kind: KindName, name: str) -> Entry:
@@ -65,33 +63,6 @@ def find(kind: KindName, name: str) -> Entry:
     hint = f"did you mean {near[0]!r}? " if near else ""
     do = f"{hint}known: {', '.join(known)}; or name one of your own as package.module:Class"
     raise InputError(f"looking up a {kind}", f"name {name!r}", f"no {kind} has that name", do)
-
-
-@lru_cache(maxsize=64)
-def _entries(kind: KindName, path: tuple[str, ...]) -> Mapping[str, Entry]:
-    """Read the table; scanning the installed packages takes tens of milliseconds and changes only with the import path."""
-    found = {name: Entry(name, target, help_text) for name, (target, help_text) in BUILTIN[kind].items()}
-    for point in _entry_points(KINDS[kind].group, path):
-        other = found.get(point.name)
-        if other is not None and other.target != point.value:
-            raise InputError(
-                f"loading {kind} plugins",
-                f"entry point {point.name!r} = {point.value!r}",
-                f"the name is taken by {other.target}",
-                "uninstall one of the two packages or rename its entry point",
-            )
-        found[point.name] = Entry(point.name, point.value, f"from {point.value}")
-    return found
-
-
-def _entry_points(group: str, path: tuple[str, ...]) -> Iterator[EntryPoint]:
-    """Yield the entry points of a group; of two distributions of one name the first on the path counts."""
-    seen = set[str]()
-    for one in distributions(path=list(path)):
-        points = one.entry_points.select(group=group)
-        if points and one.name not in seen:  # the name takes long to read
-            seen.add(one.name)
-            yield from points
 
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said

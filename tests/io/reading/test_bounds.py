@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alpasim_plugin.cli.run import parse_seeds
+from alpasim_plugin.cli.options import parse_seeds
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.io import limits as bounds

@@ -1,6 +1,6 @@
 """The causal video arms of the paper's comparison: OmniDreams, Self-Forcing, One-Forcing, ArtiFixer.
 
-Shares and rates are the papers': U is OneFixer's updates, and a rate is relative to OneFixer's. Where they are not published, docs/lab/arms.md
+Shares and rates are the papers': U is OneFixer's updates, a rate is relative to OneFixer's. Where they are not published, docs/lab/arms.md
 has the choice.
 """
 

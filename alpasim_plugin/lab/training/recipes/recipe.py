@@ -1,7 +1,7 @@
 """What a recipe is: stages of training, each with an objective, a share of the updates, initial weights and trained parts.
 
 An objective is a frozen configuration that makes a `Task`: batches and a loss over named parts (``dit``, ``vae``, and parts that only the
-training has). The framework (`alpasim_plugin.lab.training.fixer_run`) trains, resumes, and writes the bundle and the card of every stage. A new
+training has). The framework (`lab.training.fixer_run`) trains, resumes, and writes the bundle and the card of every stage. A new
 system needs an objective where its loss is new, and a `Recipe` in the registry.
 """
 

@@ -1,0 +1,258 @@
+"""How the program begins and ends: plug-in verbs, what no part of it has foreseen, lost outputs, signals during imports, a Tab."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from alpasim_plugin.cli import main
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InternalError
+
+PLUGIN = '''
+import errno, os, signal
+from typing import Annotated
+
+import typer
+
+EPILOG = "Example: `simrun greet`"
+
+
+def greet(name: str = "you") -> None:
+    """Greet somebody.
+
+    With a line more.
+    """
+    print("hello", name)
+
+
+def fails() -> None:
+    """Fail in a way that nobody has foreseen."""
+    raise ValueError("seven")
+
+
+def hungry() -> None:
+    """Ask for more memory than there is."""
+    raise MemoryError("of 1 TB")
+
+
+def full() -> None:
+    """Write on a full disk."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/somewhere/file")
+
+
+several = typer.Typer(help="Do several things.")
+
+
+@several.command("one")
+def one() -> None:
+    """Do one thing."""
+    print("one done")
+
+
+@several.command("two")
+def two() -> None:
+    """Do two things."""
+    print("two done")
+'''
+SIGNALLED = """
+import os, signal
+
+os.kill(os.getpid(), signal.SIGINT)
+"""
+VERBS = {
+    **{name: f"greeting:{name}" for name in ("greet", "fails", "hungry", "full", "several")},
+    "slow-import": "signalled:command", "no-source": "nowhere.at.all:command",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a folder of the import path in which a package with verbs is installed."""
+    folder = tmp_path_factory.mktemp("packages")
+    (folder / "greeting.py").write_text(PLUGIN)
+    (folder / "signalled.py").write_text(SIGNALLED)
+    install(folder, VERBS)
+    return folder
+
+
+def install(folder: Path, verbs: dict[str, str]) -> None:
+    info = folder / "greeting-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("\n".join(["[simrun.commands]", *(f"{name} = {target}" for name, target in verbs.items())]))
+
+
+def simrun(packages: Path, *words: str, **more: object) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(packages), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-m", "alpasim_plugin.cli.main", *words]
+    given = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | more
+    return subprocess.run(command, env=environment, text=True, check=False, **given)  # type: ignore[call-overload,no-any-return]
+
+
+def four_parts(text: str) -> dict[str, str]:
+    parts = dict(line.strip().split(": ", 1) for line in text.strip().splitlines())
+    assert list(parts) == ["error", "with", "found", "do"], text
+    return parts
+
+
+# --- verbs of installed packages ------------------------------------------------------------------------------------------
+
+
+def test_a_verb_of_an_installed_package_runs_and_is_listed_by_its_docstring_without_being_imported(packages: Path) -> None:
+    done = simrun(packages, "greet", "--name", "Ada")
+    assert (done.stdout, done.returncode) == ("hello Ada\n", 0)
+    assert simrun(packages, "several", "two").stdout == "two done\n"
+    shown = simrun(packages, "--help").stdout  # slow-import would end it
+    assert "From installed packages" in shown
+    assert "Greet somebody." in shown
+    assert "With a line more" not in shown
+    assert "Do several things." in shown
+    assert "from nowhere.at.all:command" in shown
+    own = simrun(packages, "greet", "--help").stdout
+    assert "With a line more." in own
+    assert "Example: simrun greet" in own
+    assert "--debug" in own
+
+
+def test_a_package_that_claims_a_verb_of_ours_is_refused(tmp_path: Path) -> None:
+    install(tmp_path, {"gate": "greeting:greet"})
+    done = simrun(tmp_path, "list", "renderers")
+    assert done.returncode == 2
+    assert "the name is taken by alpasim_plugin.cli.gate:gate" in four_parts(done.stderr)["found"]
+
+
+def test_a_verb_of_an_extra_that_is_not_installed_says_which_brings_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(main, "verbs", lambda: {"run": "alpasim_plugin.cli.run:run"})
+    assert run_command(["train", "fixer"]) == 2
+    assert "alpasim-onefixer[lab]" in four_parts(capsys.readouterr().err)["do"]
+
+
+# --- what nothing has foreseen --------------------------------------------------------------------------------------------
+
+
+def test_an_exception_that_is_not_ours_has_four_parts_and_an_exit_code_of_its_own(packages: Path) -> None:
+    done = simrun(packages, "fails")
+    assert done.returncode == InternalError.exit_code == 70
+    parts = four_parts(done.stderr)
+    assert parts["with"] == "simrun fails"
+    assert parts["found"].startswith("ValueError: seven at ")
+    assert "greeting.py:" in parts["found"]
+    assert "--debug" in parts["do"]
+    traced = simrun(packages, "fails", "--debug")
+    assert traced.returncode == 70
+    assert "Traceback" in traced.stderr
+    assert 'raise ValueError("seven")' in traced.stderr
+
+
+def test_with_json_it_is_one_document(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def broken(args: list[str]) -> int:
+        raise RecursionError("too deep")
+
+    monkeypatch.setattr(main, "_run", broken)
+    assert run_command(["list", "renderers", "--json"]) == 70
+    document = json.loads(capsys.readouterr().out)
+    assert document["exit_code"] == 70
+    assert document["error"]["failure_class"] == "internal"
+    assert document["error"]["found"].startswith("RecursionError: too deep")
+
+
+@pytest.mark.parametrize(("verb", "found"), [("hungry", "out of memory: of 1 TB"), ("full", "No space left on device: /somewhere/file")])
+def test_too_little_memory_or_disk_is_a_failure_of_the_machine(packages: Path, verb: str, found: str) -> None:
+    done = simrun(packages, verb)
+    assert done.returncode == 4
+    assert four_parts(done.stderr)["found"] == found
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no device that is always full")
+@pytest.mark.parametrize("words", [["list", "scenarios"], ["list", "scenarios", "--json"], ["--version"], ["--help"]])
+def test_a_full_disk_under_the_output_is_seen_even_at_the_very_end(packages: Path, words: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = simrun(packages, *words, stdout=full)
+    assert done.returncode == 4
+    if "--json" not in words:
+        assert four_parts(done.stderr)["found"].startswith("No space left on device")
+
+
+@pytest.mark.parametrize("words", [["list", "scenarios"], ["list", "scenarios", "--json"], ["--help"], ["report", "--help"]])
+def test_a_reader_that_has_gone_is_no_failed_gate(packages: Path, words: list[str]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = simrun(packages, *words, stdout=writer)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_an_interrupt_during_imports_leaves_without_a_traceback(packages: Path) -> None:
+    done = simrun(packages, "slow-import")
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [(["--rendrer", "clean", "smoke/straight"], "--renderer"), (["list", "renderes"], "'renderers'"), (["list", "--workers"], "--workers")],
+)
+def test_an_error_of_usage_has_four_parts_too(words: list[str], found: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(words) == 2
+    parts = four_parts(capsys.readouterr().err)
+    assert found in parts["found"]
+    assert "--help" in parts["do"]
+    assert run_command([*words, "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["exit_code"] == 2
+
+
+def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("simrun ")
+    assert run_command(["--version", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["version"]
+
+
+# --- a Tab ----------------------------------------------------------------------------------------------------------------
+
+
+def offered(packages: Path, *words: str) -> list[str]:
+    """Return what bash gets for the last of the words."""
+    environment = {
+        "COMP_WORDS": "\n".join(["simrun", *words]), "COMP_CWORD": str(len(words)), "_SIMRUN_COMPLETE": "complete_bash",
+    }  # fmt: skip
+    code = "import os, sys; os.environ.update(%r); sys.argv = ['simrun']; from alpasim_plugin.cli.main import main; main()"
+    path = os.pathsep.join([str(packages), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-c", code % environment]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "among"),
+    [
+        (["chec"], ["check", "check-driver", "check-policy"]),
+        (["gree"], ["greet"]),
+        (["--re"], ["--renderer", "--resume"]),
+        (["--renderer", "clean,one"], ["clean,onefixer"]),
+        (["--policy", "lane-camera", "smoke/c"], ["smoke/curve"]),
+        (["several", "t"], ["two"]),
+    ],
+)
+def test_a_tab_offers_verbs_options_and_names(packages: Path, words: list[str], among: list[str]) -> None:
+    assert set(among) <= set(offered(packages, *words))
+
+
+def test_no_name_with_a_colon_is_offered(packages: Path) -> None:
+    assert not any(":" in name for name in offered(packages, "--policy", ""))
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_program_gives_each_shell_a_script(packages: Path, shell: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_SIMRUN_COMPLETE", f"source_{shell}")
+    assert "_SIMRUN_COMPLETE" in simrun(packages).stdout
