@@ -27,6 +27,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     A + "control": (),
     A + "wire": (),
     A + "log": (A + "wire",),
+    A + "alpasim.client": (A + "world", A + "control", A + "wire", A + "log"),  # parts that are a service's
     A + "run_folder": (A + "log",),
     "evaluators": (A + "run_folder",),
     A + "viewer": (A + "log", A + "run_folder", "evaluators"),

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from alpasim_plugin.fixers.bundle import FixerFactory
 from alpasim_plugin.fixers.settings import BundleKind, Part, Positive, Unit, WeightedSettings, check_steps, counted_steps
 from alpasim_plugin.nets import schedule
 
 if TYPE_CHECKING:
-    from alpasim_plugin.block_fixers.onefixer import OneFixer
+    pass
 
 CLEAR = "clear"  # the appearance of the render: the identity
 STYLES = (CLEAR, "night", "fog", "snow")
@@ -171,25 +170,3 @@ class OneFixerSettings(LatentFixerSettings):
         if self.holes == "everywhere" and not self.render_input:
             raise ValueError("holes 'everywhere' without render_input | the network would see nothing of the render: set render_input true")
         return self
-
-
-def _session(settings: OneFixerSettings, scene_id: str, seed: int, device: str, threads: int | None) -> OneFixer:
-    from alpasim_plugin.block_fixers.onefixer import OneFixer  # loads torch
-
-    return OneFixer(settings, scene_id, seed, device, threads)
-
-
-blocks = FixerFactory(
-    OneFixerSettings,
-    _session,
-    {
-        "onefixer-dit-tiny": "one-step causal transformer on latents, block by block, for a CPU at 256x144",
-        "onefixer-dit-s": "one-step causal transformer on latents, block by block, for a small GPU",
-        "onefixer-2b": "one-step causal transformer at the size of OmniDreams single view; needs its weights",
-        "omnidreams": "arm of the comparison: diffusion forcing from the mixed source; to be trained",
-        "self-forcing": "arm of the comparison: distilled on its own rollouts; to be trained",
-        "one-forcing": "arm of the comparison: Self-Forcing with an adversarial head; to be trained",
-        "artifixer-pre": "arm of the comparison: opacity in every block, long blocks; to be trained",
-        "artifixer": "arm of the comparison: artifixer-pre, distilled; to be trained",
-    },
-)

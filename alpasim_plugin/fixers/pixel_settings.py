@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from alpasim_plugin.fixers.bundle import FixerFactory
 from alpasim_plugin.fixers.settings import (
     BundleKind,
     Part,
@@ -20,7 +19,7 @@ from alpasim_plugin.fixers.settings import (
 )
 
 if TYPE_CHECKING:
-    from alpasim_plugin.fixers.pixel_fixer import PixelFixer
+    pass
 
 
 class PixelSizesSettings(Part):
@@ -83,12 +82,3 @@ class PixelFixerSettings(WeightedSettings):
         if parts:
             raise ValueError(f"weights.{parts[0]} | a generator in pixels has one file: give weights.bundle")
         return self
-
-
-def _session(settings: PixelFixerSettings, scene_id: str, seed: int, device: str, threads: int | None) -> PixelFixer:
-    from alpasim_plugin.fixers.pixel_fixer import PixelFixer  # loads torch
-
-    return PixelFixer(settings, scene_id, seed, device, threads)
-
-
-per_frame = FixerFactory(PixelFixerSettings, _session)

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from alpasim_plugin.gaussians.files import read_gaussians as read_gaussians
     from alpasim_plugin.gaussians.files.ply import read_ply as read_ply
     from alpasim_plugin.gaussians.files.ply import write_ply as write_ply
+    from alpasim_plugin.gaussians.raster.output import RasterOutput as RasterOutput
     from alpasim_plugin.gaussians.raster.prepared import PreparedCloud as PreparedCloud
     from alpasim_plugin.gaussians.raster.prepared import prepare as prepare
-    from alpasim_plugin.gaussians.raster.rasterize import RasterOutput as RasterOutput
     from alpasim_plugin.gaussians.raster.rasterize import rasterize as rasterize
     from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared as rasterize_prepared
 

@@ -19,8 +19,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.processes import ProcessName, this_process
 from alpasim_plugin.io.atomic import disk_error, temporary_path
-from alpasim_plugin.process.processes import ProcessName, this_process
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 POLL_S = 0.1

@@ -21,7 +21,8 @@ from alpasim_plugin.core.types import F64, Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import scaled_camera
-from alpasim_plugin.gaussians.raster.rasterize import Backend, RasterOutput
+from alpasim_plugin.gaussians.raster.output import RasterOutput
+from alpasim_plugin.gaussians.raster.rasterize import Backend
 from alpasim_plugin.gaussians.scene.builder import build_scene, with_background
 from alpasim_plugin.gaussians.scene.degrade import GHOST, Surrogate, log_actors, log_times
 from alpasim_plugin.gaussians.scene.log_views import LogView, SkyMask

@@ -20,7 +20,8 @@ def rasterise() -> None:
 def fit() -> None:
     """Take the gradient of one Gaussian's image."""
     # Imported on use: it loads torch.
-    from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+    from alpasim_plugin.gaussians.raster.gradient_types import Splats
+    from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 
     splats = Splats.from_cloud(_cloud())
     splats.means.requires_grad_(True)

@@ -13,9 +13,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from alpasim_plugin.core.processes import is_running
 from alpasim_plugin.io.atomic import atomic_file, write_bytes
 from alpasim_plugin.io.lock import one_writer
-from alpasim_plugin.process.processes import is_running
 from alpasim_plugin.run_folder.schema import KEYS, LOCK, ROLLOUTS, ROLLOUTS_TABLE, STEPS, STEPS_NAME, STEPS_TABLE, VALID
 
 GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.process.processes import resident_mb
+from alpasim_plugin.core.processes import resident_mb
 from evaluators.aggregate.paired import paired
 from evaluators.gate import GateVerdict, judge, judge_table, load_gate, rows_of_run, table_of_run
 from evaluators.gate.across import compare_within

@@ -12,7 +12,8 @@ import torch
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians import PinholeCamera
 from alpasim_plugin.gaussians.raster import rasterize_gsplat
-from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.gradient_types import Splats
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_gsplat import rasterize_gradient_gsplat
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from tests.gaussians.gaussian_scenes import camera, random_cloud, random_rigid

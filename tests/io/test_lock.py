@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.processes import this_process
 from alpasim_plugin.io import lock
 from alpasim_plugin.io.lock import one_writer
-from alpasim_plugin.process.processes import this_process
 
 HOLDER = """
 import errno, sys, time

@@ -35,10 +35,10 @@ from alpasim_plugin.gaussians.constants import (
     TILE,
 )
 from alpasim_plugin.gaussians.raster.binning import depth_order, fill_tiles, gather_and_count, tile_offsets
+from alpasim_plugin.gaussians.raster.output import F32, Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import nodes_in_view, project_node
 from alpasim_plugin.gaussians.raster.raster_kernels import raster_tiles
-from alpasim_plugin.gaussians.raster.rasterize import F32, Background, RasterOutput, background_image
 
 
 class Buffers(threading.local):

@@ -21,11 +21,11 @@ from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, FAR_M, NEAR_M
-from alpasim_plugin.gaussians.raster.rasterize import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.sh import SH_SIZES
 
 if TYPE_CHECKING:
-    from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, Splats
+    from alpasim_plugin.gaussians.raster.gradient_types import GradientOutput, Splats
 
 _DOING = "rendering Gaussians with gsplat"
 
@@ -161,7 +161,10 @@ def rasterize_gradient_gsplat(splats: Splats, camera: PinholeCamera, background:
     Raises:
         RendererError: gsplat does not work on that device.
     """
-    from alpasim_plugin.gaussians.raster.rasterize_gradient import GradientOutput, ScreenStatistics  # which imports this module
+    from alpasim_plugin.gaussians.raster.gradient_types import (
+        GradientOutput,
+        ScreenStatistics,  # which imports this module
+    )
 
     device = str(splats.means.device)
     gsplat = require_gsplat(device)

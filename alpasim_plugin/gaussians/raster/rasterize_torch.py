@@ -15,7 +15,7 @@ from torch import Tensor
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import ALPHA_MAX, ALPHA_MIN, EPS2D_PX2, EXTENT_MAX_SIGMA, FAR_M, NEAR_M, TRANSMITTANCE_STOP
-from alpasim_plugin.gaussians.raster.rasterize import Background, RasterOutput, background_image
+from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.sh import C0, sh_terms
 
 _TILE_PX = 16

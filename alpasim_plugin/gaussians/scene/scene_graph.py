@@ -21,8 +21,9 @@ from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, ShFrame, prepare
-from alpasim_plugin.gaussians.raster.rasterize import Backend, RasterOutput, rasterize
+from alpasim_plugin.gaussians.raster.rasterize import Backend, rasterize
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.scene.sky import Sky
 

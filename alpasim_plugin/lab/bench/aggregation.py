@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import alpasim_plugin.lab.video_metrics.facts  # noqa: F401  declares: the process that aggregates then knows the metrics that this one knows
-from alpasim_plugin.process.processes import resident_mb
+from alpasim_plugin.core.processes import resident_mb
 from alpasim_plugin.process.subprocesses import end_with_parent, spawn_context
 from alpasim_plugin.run_folder.columns import RolloutTable
 from evaluators.aggregate.summary import aggregate, aggregate_sides

@@ -15,8 +15,8 @@ import torch
 from alpasim_plugin.block_fixers.onefixer import OneFixer
 from alpasim_plugin.block_fixers.pipeline import TIMED, StageClock, no_clock
 from alpasim_plugin.block_fixers.settings import OneFixerSettings
+from alpasim_plugin.core.processes import resident_mb
 from alpasim_plugin.core.types import F32, I64, U8, Bool, Frame
-from alpasim_plugin.process.processes import resident_mb
 
 MB = 1e6
 

@@ -13,8 +13,8 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, prepare
-from alpasim_plugin.gaussians.raster.rasterize import RasterOutput
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
 from alpasim_plugin.lab.bench.raster_roofline import RasterWork, measure_core

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.gradient_types import Splats
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_torch import GaussianTensors, rasterize_tensors
 from alpasim_plugin.lab.bench.raster import SKY, driving_camera, driving_like_scene
 

@@ -9,13 +9,11 @@ from pydantic import Field, field_validator, model_validator
 
 from alpasim_plugin.block_fixers.settings import LatentFixerSettings, latent_kind
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.fixers.bundle import FixerFactory
 from alpasim_plugin.fixers.settings import BundleKind, Part, Positive, Unit, check_no_blocks, check_steps, counted_steps
 from alpasim_plugin.nets.schedule import TABLE
 
 if TYPE_CHECKING:
-    from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer
-    from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer
+    pass
 
 LATENT_FRAMES = 4  # of every latent but a clip's first
 
@@ -172,36 +170,3 @@ class NoiseWindowSettings(MaplessSettings):
         if self.stride_frames > self.window_frames:
             raise ValueError(f"stride_frames {self.stride_frames} with windows of {self.window_frames} | frames between would be missing")
         return self
-
-
-def _image_session(settings: RenderStepSettings, scene_id: str, seed: int, device: str, threads: int | None) -> ImageFixer:
-    from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer  # loads torch
-
-    return ImageFixer(settings, scene_id, seed, device, threads)
-
-
-def _window_session(settings: NoiseWindowSettings, scene_id: str, seed: int, device: str, threads: int | None) -> ImageFixer | WindowFixer:
-    """Make a session of single frames, or, where a window has more, of a whole clip."""
-    from alpasim_plugin.lab.image_fixers.image_fixer import ImageFixer  # loads torch
-    from alpasim_plugin.lab.image_fixers.window_fixer import WindowFixer
-
-    return (WindowFixer if settings.is_offline else ImageFixer)(settings, scene_id, seed, device, threads)
-
-
-image = FixerFactory(
-    RenderStepSettings,
-    _image_session,
-    {
-        "difix": "arm of the comparison: DiFix3D+, one step from the render, frame by frame; to be trained",
-        "harmonizer": "arm of the comparison: DiffusionHarmonizer, one step from the render, frame by frame; to be trained",
-        "harmonizer-temporal": "arm of the comparison: DiffusionHarmonizer, looking at its last four outputs; to be trained",
-    },
-)
-windows = FixerFactory(
-    NoiseWindowSettings,
-    _window_session,
-    {
-        "gsfix3d": "arm of the comparison: GSFix3D, eight steps from noise, frame by frame; to be trained",
-        "3dgs-enhancer": "arm of the comparison: 3DGS-Enhancer, eight steps from noise in windows; recorded clips only; to be trained",
-    },
-)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_PER_FRAME = "alpasim_plugin.fixers.pixel_settings:per_frame"
+_PER_FRAME = "alpasim_plugin.fixers.per_frame:per_frame"
 _BROKEN = "alpasim_plugin.renderers.broken:"
 
 BUILTIN: dict[str, dict[str, tuple[str, str]]] = {

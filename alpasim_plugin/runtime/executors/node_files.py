@@ -22,10 +22,10 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.processes import is_running
 from alpasim_plugin.io.atomic import disk_error, write_bytes
 from alpasim_plugin.io.checksums import sha256_of
 from alpasim_plugin.plugins.parts.source import OWN_ROOT
-from alpasim_plugin.process.processes import is_running
 from alpasim_plugin.renderers.cache import cached
 from alpasim_plugin.run_folder.writer import remove_left_overs
 from alpasim_plugin.runtime.executors.base import Node

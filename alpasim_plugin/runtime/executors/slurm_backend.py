@@ -23,8 +23,8 @@ from typing import Any, TypeVar
 
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.lazy import require_library
+from alpasim_plugin.core.processes import is_running, started_of
 from alpasim_plugin.io.atomic import write_bytes
-from alpasim_plugin.process.processes import is_running, started_of
 from alpasim_plugin.process.subprocesses import safe_path
 from alpasim_plugin.runtime.executors.assignment import Assignment
 from alpasim_plugin.runtime.executors.base import Backend, Died, Done, Event, Faulty, Place, Rules
